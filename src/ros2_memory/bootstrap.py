@@ -106,26 +106,47 @@ def build_reader(
     Raises:
         ConfigError: it is refused.
     """
-    options: dict[str, object] = {"large": large}
-    if cache_mb is not None:
-        options["cache_mb"] = cache_mb
-    return cast("BagReader", instantiated(settings.storage, **options))
+    given = settings.reader
+    reader = instantiated(
+        settings.storage,
+        custom_msg_paths=given.custom_msg_paths,
+        cache_mb=given.chunk_cache_mb if cache_mb is None else cache_mb,
+        max_chunk_mb=given.max_chunk_mb,
+        large=large,
+    )
+    return cast("BagReader", reader)
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
-    """Returns the recorder that the configuration chooses.
+    """Returns the recorder that the configuration chooses, which is not `recorder=none`.
 
-    `collaborators` are arguments of its constructor that are not plain values.
+    `collaborators` are arguments of its constructor that are no settings.
 
     Raises:
         ConfigError: it is refused.
     """
-    return cast("Recorder", instantiated(settings.recorder, **collaborators))
+    from ros2_memory.recorder.sessions import Required
+
+    recording = settings.recording
+    recorder = instantiated(
+        settings.recorder,
+        bag_dir=recording.bag_dir,
+        topics_file=recording.topics_file,
+        split_duration_s=recording.split_duration_s,
+        session_duration_s=recording.session_duration_s,
+        use_sim_time=recording.use_sim_time,
+        queue_mb=recording.queue_mb,
+        required=[Required(each.topic, each.min_hz) for each in recording.required],
+        min_free_gb=settings.retention.min_free_gb,
+        latched_topics=settings.data.tf_static_topics,
+        **collaborators,
+    )
+    return cast("Recorder", recorder)
 
 
-def instantiated(node: AdapterNode, **collaborators: object) -> object:
-    """Returns the adapter of a section; `collaborators` are arguments that are no plain values."""
-    return get_class(node.target)(**{**node.arguments, **collaborators})
+def instantiated(node: AdapterNode, **arguments: object) -> object:
+    """Returns the adapter of a section, from its own values and further arguments."""
+    return get_class(node.target)(**node.arguments, **arguments)
 
 
 def retention_limits(settings: Settings) -> RetentionLimits:
@@ -546,7 +567,7 @@ def _definitions_of(settings: Settings) -> list[tuple[str, int, int]]:
     """Returns what tells the configured message definitions apart: paths, sizes and mtimes."""
     return [
         (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
-        for folder in settings.storage.custom_msg_paths
+        for folder in settings.reader.custom_msg_paths
         for path in sorted(directories.files_below(Path(folder), ".msg"))
     ]
 

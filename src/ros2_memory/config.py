@@ -423,7 +423,7 @@ class LoggingSettings:
 
 @section
 class AdapterNode:
-    """An adapter's class, and the plain values for its constructor.
+    """An adapter's class, and the values for its constructor that only this adapter takes.
 
     Each adapter that may be built has a subclass. They are the allow-list, since Hydra would build
     whatever a `_target_` names.
@@ -442,9 +442,6 @@ class McapNode(AdapterNode):
     """`storage=mcap`: single MCAP files."""
 
     target: Literal["ros2_memory.storage.mcap_reader.McapReader"] = Field(alias="_target_")
-    custom_msg_paths: tuple[Folder, ...]
-    cache_mb: Count
-    max_chunk_mb: Mebibytes
 
 
 @section
@@ -452,9 +449,6 @@ class Rosbag2Node(AdapterNode):
     """`storage=rosbag2`: recordings of either plugin; `unpack_max_mb` bounds temporary files."""
 
     target: Literal["ros2_memory.storage.rosbag2_reader.Rosbag2Reader"] = Field(alias="_target_")
-    custom_msg_paths: tuple[Folder, ...]
-    cache_mb: Count
-    max_chunk_mb: Mebibytes
     unpack_max_mb: Count
 
 
@@ -463,17 +457,8 @@ class Ros2BagNode(AdapterNode):
     """`recorder=ros2bag`: a supervised `ros2 bag record`."""
 
     target: Literal["ros2_memory.recorder.ros2bag.Ros2BagRecorder"] = Field(alias="_target_")
-    bag_dir: AnyPath
-    topics_file: ConfigFile
-    split_duration_s: Count
-    session_duration_s: Positive
-    use_sim_time: Flag
-    queue_mb: Mebibytes
-    min_free_gb: Tolerance
     setup_files: Annotated[tuple[AnyPath, ...], BeforeValidator(_listed)]
-    latched_topics: tuple[Text, ...]
     repeat_latched: tuple[Text, ...]
-    required: RequiredTopics
     chunk_bytes: Annotated[int, Field(strict=True, ge=1024)]
 
 

@@ -63,8 +63,7 @@ def validated(
         model: a class of the configuration.
         data: the composed configuration, interpolations resolved.
         config_dirs: the folders in which a path that begins with `config/` is looked for.
-        source: returns who set the key of a dot-path, as a phrase that follows "set". A key that
-            is set as another one, whose value is refused, is not reported again.
+        source: returns who set the key of a dot-path, as a phrase that follows "set".
         adapters: the classes of sections that are chosen by their `_target_`.
 
     Raises:
@@ -75,12 +74,7 @@ def validated(
         return TypeAdapter(model).validate_python(data, context=config_dirs)
     except ValidationError as error:
         faults = [(_dot_path(fault, nodes), fault) for fault in error.errors(include_url=False)]
-    as_refused = tuple(f", as {_setting(key)}" for key, _fault in faults)
-    lines = [
-        f"{_sentence(model, key, fault, nodes)} (set {source(key)})"
-        for key, fault in faults
-        if not source(_setting(key)).endswith(as_refused)
-    ]
+    lines = [f"{_sentence(model, key, fault, nodes)} (set {source(key)})" for key, fault in faults]
     raise ConfigError("\n".join(lines))
 
 
@@ -128,11 +122,6 @@ def _dot_path(fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
     """Returns a fault's dot-path, without Pydantic's marks for union members and mapping keys."""
     key = ".".join(str(part) for part in fault["loc"] if part not in {*nodes, "[key]"})
     return f"{key}._target_" if fault["type"].startswith("union_tag") else key
-
-
-def _setting(key: str) -> str:
-    """Returns a fault's section and key, without what lies deeper."""
-    return ".".join(key.split(".")[:2])
 
 
 def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, type]) -> str:

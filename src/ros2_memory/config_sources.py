@@ -57,7 +57,6 @@ class Sources:
     """Returns, called with a key such as `server.port`, who set it: a phrase that follows "set".
 
     Args:
-        folder: the configuration directory.
         overrides: the assignments of variables and overrides; later wins.
         appended: by key, the variable that appends to what is set otherwise.
     """
@@ -67,7 +66,7 @@ class Sources:
     appended: Mapping[str, str]
 
     def __call__(self, key: str) -> str:
-        """Returns who set a key; for a file also the key that it takes its value from."""
+        """Returns who set a key."""
         for override in reversed(self.overrides):
             path, override_path = f"{key}.", f"{override.key}."
             is_related = path.startswith(override_path) or override_path.startswith(path)
@@ -90,10 +89,8 @@ class Sources:
     def _file(self, key: str) -> str:
         for default in reversed(self._composed.defaults if self._composed else ()):
             path = self.folder / f"{default.config_path}.yaml"
-            found, value = _lookup(path, default.package or "", key)
-            if found:
-                link = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
-                return f"in {path}{f', as {link[1]}' if link else ''}"
+            if _sets(path, default.package or "", key):
+                return f"in {path}"
         return f"in {self.folder}"
 
     @cached_property
@@ -163,11 +160,6 @@ def parse_overrides(
     command_line: Sequence[str], given: Mapping[str, str], folder: Path
 ) -> list[Override]:
     """Returns the assignments of variables and of the command line; later wins.
-
-    Args:
-        command_line: assignments in Hydra's grammar.
-        given: the environment, without empty variables.
-        folder: the configuration directory.
 
     Raises:
         ConfigError: one of them is not an assignment, holds a token, or names no option of a group.
@@ -247,15 +239,15 @@ def _override_of(text: str, source: str, options: Mapping[str, Sequence[str]]) -
     return Override(key, f"++{text}" if changes and not is_group else text, source)
 
 
-def _lookup(path: Path, section: str, key: str) -> tuple[bool, object]:
-    """Returns whether a file, which holds the keys of a section, sets a key, and to what."""
+def _sets(path: Path, section: str, key: str) -> bool:
+    """Returns whether a file, which holds the keys of a section, sets a key."""
     try:
         content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, YAMLError):
-        return False, None
+        return False
     content = {section: content} if section else content
     for part in key.split("."):
         if not isinstance(content, dict) or part not in content:
-            return False, None
+            return False
         content = content[part]
-    return True, content
+    return True

@@ -308,8 +308,8 @@ def configured_keys() -> set[str]:
         own = yaml.safe_load((ROOT / "config" / file).read_text(encoding="utf-8"))
         keys |= {
             f"{group}.{inner}.{name}" if inner else f"{group}.{name}"
-            for name, value in (own[inner] if inner else own).items()
-            if name != "_target_" and not str(value).startswith("${")
+            for name in (own[inner] if inner else own)
+            if name != "_target_"
         }
     return keys
 

@@ -67,7 +67,6 @@ class TestEnvironment:
             [f"reader.custom_msg_paths=['{one}']"], {"ROS_VISION_INTERFACES_PATH": str(two)}
         )
         assert settings.reader.custom_msg_paths == (one, two)
-        assert settings.storage.arguments["custom_msg_paths"] == (one, two)
 
     def test_an_empty_variable_counts_as_unset(self) -> None:
         names = ("MCP_PORT", "MEMORY_BAG_DIR", "MEMORY_DEPLOYMENT", "MEMORY_CONFIG_DIR")
@@ -231,15 +230,9 @@ class TestPresets:
 
 class TestAdapters:
     def test_the_node_carries_what_the_constructor_takes(self) -> None:
-        overrides = ["storage=rosbag2", "reader.chunk_cache_mb=7", "reader.max_chunk_mb=9"]
-        settings = load_settings(overrides, {})
+        settings = load_settings(["storage=rosbag2", "storage.unpack_max_mb=7"], {})
         assert settings.storage.target == ROSBAG2
-        assert settings.storage.arguments == {
-            "custom_msg_paths": (),
-            "cache_mb": 7,
-            "max_chunk_mb": 9,
-            "unpack_max_mb": 1024,
-        }
+        assert settings.storage.arguments == {"unpack_max_mb": 7}
 
     @pytest.mark.parametrize("target", ["os.system", NONE])
     def test_a_class_that_is_not_listed_is_refused(self, target: str) -> None:
@@ -252,4 +245,4 @@ class TestAdapters:
 
     def test_an_argument_that_it_does_not_take_is_refused(self) -> None:
         said = refusal("storage.unpack_max_mb=3")
-        assert "_target_, custom_msg_paths, cache_mb, max_chunk_mb" in said
+        assert said.startswith("storage.unpack_max_mb: unknown key; use one of: _target_ (")

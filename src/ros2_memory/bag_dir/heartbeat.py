@@ -54,43 +54,15 @@ class RecorderState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """One heartbeat of the recorder.
+    """One heartbeat of the recorder; `docs/reference/files.md` says what its fields mean.
 
     Attributes:
-        pid: process id of the recorder.
-        updated: wall clock time of this heartbeat.
-        state: what the recorder is doing, `since` (wall clock time).
         recordings: what is being written, as directories relative to the bag directory with
             forward slashes; two during a rotation.
-        bytes_written: by all recordings since the recorder started.
-        subscribed: topics subscribed to; `silent` ones of them have sent no message.
-        last_error: the last fault, as a sentence; `last_error_at` is when, where it is known, and
-            `recovered` whether recording has gone on since.
-        interval_s: seconds between two heartbeats.
-        restarts: how often `ros2 bag record` had to be started again.
-        missing: topics configured by name that no publisher has offered since the start.
         unknown_types: topics that are offered, and not recorded: `ros2 bag record` does not know
             their type. It names one topic of each such type.
-        unheard: topics of which nothing has come in 30 s, though they are offered; `advice` says
-            what to look at.
-        fell_silent: topics that came regularly until now, are offered, and do not come.
-        required_missing: why topics of `recording.required` are not recorded as required.
-        age_held: which bags stay though their dates are too old, because the clock may be wrong;
-            None if there are none.
         lost: how many messages of each topic are known to be missing of the last hour; topics
             without a counter, or a regular header stamp, are not in it.
-        cut_short: topics whose queues hold less than 2 s, for want of `recording.queue_mb`.
-        held_back: which splits are not served since `recording.exclude_when` could not be applied,
-            and why, as a sentence; else None.
-        failing_rules: why rules of `recording.exclude_when` cannot be evaluated, a sentence each.
-        unshipped: which bags were deleted before they were shipped, where `retention` requires
-            that, since the recorder started, as a sentence; else None.
-        listed: what its list of topics has, entries and then exclusions; empty where not known.
-        list_refused: why a changed list of topics is not used, as a sentence; else None.
-        waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
-        counted_bytes: what the budget counts, by the last pass of retention; None before.
-        state_bytes: how much of that is no recording: `.episodic` and logs.
-        process: what tells the process from another of the same id (see `process_of`).
     """
 
     __pydantic_config__ = ConfigDict(defer_build=True)

@@ -76,8 +76,6 @@ class JsonLog(Generic[_T]):
     """A log in the bag directory, whose rows are of one dataclass.
 
     Args:
-        name: the path of the file in the bag directory.
-        row: the dataclass.
         most_bytes: of a longer file only the end is read.
         is_brief: whether fields that have their default are not written.
     """
@@ -184,8 +182,6 @@ class JsonDocument(Generic[_T]):
     """A document in the bag directory, which holds one value of a dataclass.
 
     Args:
-        name: the path of the file in the bag directory.
-        content: the dataclass.
         is_ascii: whether other characters are escaped, as paths need that are not UTF-8.
         most_bytes: a longer file is not read.
 

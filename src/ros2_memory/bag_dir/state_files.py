@@ -383,10 +383,7 @@ class Receipt:
 
     Attributes:
         bag: its path below the bag directory.
-        bag_id: its id in the lake.
         size: of its file when it was shipped (bytes).
-        sha256: of its file, in hexadecimal.
-        lake: the id of the lake.
         at: when it was committed (ns).
     """
 
@@ -510,12 +507,10 @@ class Erasure:
     an erasure that was interrupted can be finished.
 
     Attributes:
-        topics: by name.
         windows: of log time, half-open, in order and apart.
         latched: those of the topics whose messages go also where they were published in a window
             and received again later, as each recording receives them.
         files: the bags that hold some, by their paths in the bag directory, with all hard links.
-        counts: what they hold.
     """
 
     topics: tuple[str, ...]
@@ -558,8 +553,6 @@ class ConditionInterval:
     """An interval in which a topic's condition kept its value, in one recording.
 
     Attributes:
-        first: log time of the first message of it.
-        last: log time of the last message of it.
         holds: whether the condition held; None: a message could not be read.
         lasts: the topic is latched: it says nothing while nothing changes.
     """
@@ -586,7 +579,6 @@ class RecordingScreen:
         done: nothing of it is held back any more.
         start: log time of its first message; None before one was read.
         end: log time of its last message that was read; None likewise.
-        files: its closed files, by name.
         heard: for each rule the values of its topic, in the order in which they were written.
         unclear: spans of log time in which the clock was set back, so that no order is known.
     """
@@ -710,10 +702,7 @@ class RuleRecord:
     """The state of one rule.
 
     Attributes:
-        fired: how often it fired.
-        moments: how many moments that made.
         refused: how often it fired and no bag was kept.
-        last_fired: log time at which it fired last.
         problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
         always_since: since when it has matched without an end, where that is long; else None.
         begun: log times at which its moments of the last hour began.
@@ -756,7 +745,6 @@ class TriggerState:
         searched: until which log time (excluded) the newest recordings were searched.
         before: a recording; it and all that were listed before it were searched, or lie before the
             rules. None if there is none.
-        latched: by topic.
     """
 
     rules: dict[str, RuleRecord] = field(default_factory=dict)

@@ -152,9 +152,7 @@ def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]
 def parse_arguments(given: Sequence[str], schemas: Mapping[str, JsonObject]) -> dict[str, object]:
     """Parses the arguments of a tool: one JSON object, or `key=value` each.
 
-    Args:
-        given: the words of the command line.
-        schemas: the JSON schemas of the tool's arguments: what is taken as text is not parsed.
+    What `schemas`, the JSON schemas of the tool's arguments, take as text is not parsed.
 
     Raises:
         InvalidArgumentsError: a word is neither.

@@ -53,16 +53,12 @@ def config_show(
 
 
 def _print_sources(values: Mapping[str, JsonValue], source: Sources) -> None:
-    """Prints a row for each group's choice and for each key: its name, who set it, its value.
-
-    A key of a group that only takes over another key's value names that one as its source.
-    """
+    """Prints a row for each group's choice and for each key: its name, who set it, its value."""
     print_line(f"# files are those of {source.folder}")
     chosen = {group: source.choice(group) for group in GROUPS}
     rows: list[JsonValue] = []
     for key, (value, who) in (chosen | {key: (values[key], source(key)) for key in values}).items():
-        file, link, named_key = who.partition(", as ")
-        set_by = f"as {named_key}" if link else file.replace(f"in {source.folder}/", "")
+        set_by = who.replace(f"in {source.folder}/", "")
         text = value if isinstance(value, str) else json.dumps(value)
         rows.append({"key": key, "set": set_by, "value": text})
     print_reply(rows)

@@ -324,9 +324,7 @@ def parse_duration(text: str) -> float | None:
 def parse_time(text: str, now: float) -> float:
     """Returns the Unix seconds of a time as people write it; see `TIMES`.
 
-    Args:
-        text: the time.
-        now: what "ago", "today" and a time of day count from, in Unix seconds.
+    `now` is what "ago", "today" and a time of day count from, in Unix seconds.
 
     Raises:
         InvalidArgumentsError: the text is no time.

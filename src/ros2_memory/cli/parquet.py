@@ -82,13 +82,9 @@ class Dataset:
 
     Args:
         root: the folder; partitions that exist already are refused.
-        reader: decodes messages.
-        extractor: extracts their values and poses.
         robot: the name of a further partition, so that many robots share a dataset.
 
     Attributes:
-        rows: how many were written.
-        files: how many.
         undecoded: the types of messages of which rows have no value.
     """
 

@@ -45,11 +45,7 @@ class Offered:
     """A topic that is offered, and how it came while it was measured.
 
     Attributes:
-        topic: its name.
-        type: its message type, as `nav_msgs/msg/Odometry`.
         latched: whether all of its publishers are transient local.
-        messages: how many came.
-        hz: how many come in a second.
         payload_bytes: the mean size of a message.
     """
 
@@ -68,10 +64,7 @@ class Disk:
     Attributes:
         ratio: compressed bytes of a byte.
         fixed_bytes: what a file of no message has: definitions, and metadata.
-        split_s: length of one file.
-        session_s: length of one recording.
         columns_share: what is stored beside the bags, as a part of them.
-        budget_bytes: what may be used of the disk.
         keep_days: after so many days bags are deleted in any case.
     """
 

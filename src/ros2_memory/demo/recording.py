@@ -39,8 +39,6 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
     beginning to `stop`, and as a context manager to the end of the block.
 
     Attributes:
-        directory: of the recording.
-        timeline: what is recorded.
         splits: the number of files; all but the last are closed, and `stop` closes that.
         failure: the error that ended the recording early, such as a full disk.
     """

@@ -201,15 +201,9 @@ def run_demo(
 ) -> int:
     """Records, serves, asks, and (unless `once`) continues until it is interrupted.
 
-    Args:
-        say: prints.
-        questions: what is asked.
-        once: leave after the answers.
-        port: where the server listens; 0 for any that is free.
-        bag_dir: an empty or new folder for the bags, kept; None for a temporary one.
-        duration_s: length of the history that exists when the questions are asked.
-        verbose: the server's log goes to stderr.
-        as_json: a line of JSON for each question, and nothing else.
+    `once`: leave after the answers. `port`: 0 for any that is free. `bag_dir`: an empty or new
+    folder for the bags, kept; None for a temporary one. `duration_s`: length of the history that
+    exists when the questions are asked. `as_json`: a line of JSON for each question, and no more.
 
     Returns:
         0 where every answer was right, otherwise 1.

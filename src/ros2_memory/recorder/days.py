@@ -120,10 +120,7 @@ class MemoryLimits(NamedTuple):
 
     Attributes:
         texts: names or globs of the topics of which texts may stay: speech, descriptions, logs.
-        labels: the labels of people that may stay.
         people: words for people besides those that are known: names, roles.
-        max_bytes: what all days may take.
-        max_age_ns: how old a day may become.
     """
 
     texts: tuple[str, ...] = ()
@@ -137,14 +134,10 @@ class MemoryDays:
     """Writes and deletes the days of one bag directory, whose lock its caller holds.
 
     Args:
-        bag_dir: the bag directory.
         reader: reads bags, without what counts in another recording.
-        writer: writes the days.
         own: lists the days as the recorder's own.
         extractor: has the schema map, by which detections are found.
         limits: which messages stay; None: none, and the days that exist are deleted.
-        static_topics: topics that are latched whatever their publishers declare.
-        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(

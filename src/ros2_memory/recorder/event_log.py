@@ -35,13 +35,8 @@ _MOST_TOPICS = 1000
 class EventLog:
     """Log events of the recorder.
 
-    Args:
-        clock: the wall clock.
-
     Attributes:
-        last_error: the sentence of the newest fault.
-        last_error_at: when that was.
-        recovered: whether recording has gone on since.
+        recovered: whether recording has gone on since the newest fault.
     """
 
     def __init__(self, clock: Clock) -> None:

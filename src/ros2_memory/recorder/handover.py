@@ -167,10 +167,6 @@ class HandoverTransfer:
         old: the session that records.
         new: the session that takes over.
         began: the time just before the new recorder was started.
-        orders: what to record.
-
-    Attributes:
-        directories: the old and the new recording.
     """
 
     def __init__(

@@ -60,17 +60,7 @@ _log = get_logger(__name__)
 
 
 class HouseStatus(NamedTuple):
-    """What the heartbeat shows of a housekeeper's work, under the same names.
-
-    Attributes:
-        age_held: describes the bags that are kept although their dates make them too old, or None.
-        unshipped: describes the bags that were deleted before they were shipped, as they had to be,
-            or None.
-        counted_bytes: the bytes that the budget counts; None before the first pass.
-        state_bytes: those of them that are no recording.
-        held_back: describes the splits that are not served for a fault, or None.
-        failing_rules: each rule of `recording.exclude_when` that cannot be evaluated.
-    """
+    """What the heartbeat shows of a housekeeper's work, under the same names."""
 
     age_held: str | None = None
     unshipped: str | None = None
@@ -88,26 +78,16 @@ class Housekeeping:
     under way is not begun again.
 
     Args:
-        bag_dir: the bag directory.
-        reader: reads bags.
-        writer: writes repaired bags, and the bag of carried messages.
-        clock: the wall clock.
         limits: how much is kept. If bags of other programs do not count, they are not repaired
             either.
         is_synchronised: whether the system clock is synchronised; may take some seconds.
-        split_duration_s: how long the recorder writes one file.
-        own: the recordings that the recorder made.
         moments_bytes: how much of the budget saved moments may take.
         rule_bytes: how much of that each rule may take.
         watch: makes the rules' watch over what is recorded; None where there are no rules.
         screening: excludes messages before splits are served; None where nothing is excluded.
-        static_topics: topics that are latched whatever their publishers declare.
         grace_s: for how long a query may work on an older snapshot of the bags.
-        measure_free: measures what the disk has left, in bytes.
-        monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
-        background: runs what takes a while, of the recorder, too.
     """
 
     def __init__(
@@ -344,11 +324,6 @@ class Housekeeping:
         """Counts recorded time, by which recordings age where the wall clock is wrong.
 
         Called several times a second, with no recordings while nothing is recorded.
-
-        Args:
-            recordings: the directories being written, relative to the bag directory.
-            bytes_written: the bytes that all recordings wrote since the recorder started.
-            monotonic_s: the monotonic clock, in seconds.
         """
         self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 

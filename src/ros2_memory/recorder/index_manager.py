@@ -44,11 +44,7 @@ class IndexManager:
     """Keeps the snapshot of one bag directory. Thread-safe.
 
     Args:
-        bag_dir: the bag directory.
-        reader: reads bags.
-        clock: the wall clock.
         refresh_s: how old a snapshot may become before a query has it renewed.
-        split_duration_s: how long the recorder writes one file.
         known: gives closed files which were read earlier, in order of time. A first scan does not
             read them again if they are unchanged.
         include_active: whether the readable part of a file that is being written answers, too. Not
@@ -60,7 +56,6 @@ class IndexManager:
         large: the turn to hold much of a bag, for which no scan waits.
 
     Attributes:
-        bag_dir: the bag directory.
         published: the result of the last scan, however old; None before the first has ended.
     """
 

@@ -330,7 +330,6 @@ class TopicFlow(NamedTuple):
     """How a topic arrives.
 
     Attributes:
-        offered: what all of its publishers offer.
         burst: the most messages within `HOLD_S`.
         largest: the largest payload in bytes.
     """

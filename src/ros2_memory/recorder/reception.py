@@ -141,12 +141,9 @@ class Reception:
     """How the topics of one bag directory arrive, across its recordings.
 
     Args:
-        reader: reads splits that are closed.
         queue_bytes: what the queues of all topics together may take.
         bag_dir: where losses are written.
-        latched: topics that count as latched.
         volatile: topics that are not asked for their earlier messages once a split has shown them.
-        background: measures splits and writes losses beside the recorder's loop.
 
     Attributes:
         may_write: whether losses are written; those that are not wait.

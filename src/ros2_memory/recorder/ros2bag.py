@@ -50,27 +50,12 @@ class Ros2BagRecorder(Recorder):
     """Records with `ros2 bag record`, and keeps it recording while `tick` is called.
 
     Args:
-        reader: reads splits that are closed.
-        bag_dir: where to record; it is made where it does not exist.
-        topics_file: `topics.yaml`, see `process.topics`.
-        split_duration_s: length of one bag file, whole seconds.
-        session_duration_s: how long one recording lasts before the next takes over.
-        use_sim_time: whether log times come from `/clock`.
-        queue_mb: what the queues of all topics together may take, in MiB.
-        min_free_gb: what must be free on the disk for recording to continue, in 10^9 bytes.
-        setup_files: bash files that make the ROS environment.
         latched_topics: topics whose publishers are transient local; all of their messages are
             recorded, however many there are.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that. Their log times may lie long before the split.
-        required: topics without which recording counts as failed: a name or a glob in `topic`, and
-            in `min_hz` the least messages a second.
-        chunk_bytes: size of an MCAP chunk before compression.
-        housekeeper: repairs and deletes.
-        own: the list of the recordings that were made here.
         keep_open: file descriptors that `ros2 bag record` inherits.
         excluding: the topics by which `recording.exclude_when` excludes, each with its rule.
-        background: does what takes a while, of the housekeeper, too.
     """
 
     def __init__(
@@ -87,7 +72,7 @@ class Ros2BagRecorder(Recorder):
         setup_files: Sequence[Path],
         latched_topics: Sequence[str],
         repeat_latched: Sequence[str],
-        required: Sequence[Mapping[str, str | float]],
+        required: Sequence[Required],
         chunk_bytes: int,
         housekeeper: Housekeeping,
         own: OwnRecordings,
@@ -102,8 +87,7 @@ class Ros2BagRecorder(Recorder):
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
         self._checked = False
-        wanted = [Required(str(entry["topic"]), float(entry["min_hz"])) for entry in required]
-        topics = (entry.topic for entry in wanted if "*" not in entry.topic)
+        topics = (entry.topic for entry in required if "*" not in entry.topic)
         by_setting = dict.fromkeys(topics, "recording.required")
         self._topics = TopicsFile(topics_file, {**by_setting, **excluding})
         self._ros = Installation("ros2", {}, frozenset())
@@ -129,7 +113,7 @@ class Ros2BagRecorder(Recorder):
             own=own,
             reception=self._reception,
             background=background,
-            required=wanted,
+            required=required,
             simulated=use_sim_time,
             advice=lambda: advice_on_silence(self._ros.env),
         )

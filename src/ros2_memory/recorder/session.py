@@ -61,9 +61,6 @@ class Splits:
     """The splits of one recording, as of the last observation.
 
     Attributes:
-        directory: the recording.
-        reader: reads splits that are closed.
-        exists: whether the directory exists.
         received: the topics of which a closed split has a message.
         messages: how many messages all closed splits have.
     """
@@ -167,7 +164,6 @@ class RecordingSession:
     """One recording: its name, its child process and its splits.
 
     Attributes:
-        state: how far it has come.
         is_listed: whether it is in the list of the recorder's own recordings, as a directory.
         has_recorded: whether its child ever reported that it records.
         subscribed: the topics that its child reported as subscribed, which does not mean that it

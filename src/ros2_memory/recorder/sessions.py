@@ -54,18 +54,9 @@ class Orders:
     """What to record, and with what. Durations are in seconds.
 
     Attributes:
-        bag_dir: where recordings are made.
-        split_duration_s: how long one bag file is.
         session_duration_s: how long a recording lasts before the next takes over.
         min_free_bytes: what must be free on the disk for recording to continue.
         start_child: starts the `ros2 bag record` of a recording, given its name and directory.
-        reader: reads splits that are closed.
-        clock: the wall clock.
-        topics: the list of topics to record.
-        own: the list of recordings that were made here.
-        reception: plans how topics are subscribed, and measures how they arrive.
-        background: does what takes a while.
-        required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
     """
@@ -96,11 +87,9 @@ class RecordingSessions:
     """The sessions of one bag directory.
 
     Args:
-        orders: what to record.
         announce: receives the name of a recording before anything of it exists.
         interrupted: receives when a recording last grew that ended unexpectedly (wall time), and
             how it ended.
-        events: where everything is reported.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.

@@ -36,10 +36,6 @@ class Shortfall(NamedTuple):
 class TopicWatch:
     """Watches the topics of all recordings, and names each fault once.
 
-    Args:
-        orders: what to record.
-        events: where faults are named.
-
     Attributes:
         waiting_for: why no message has arrived since recording started, as a sentence; else None.
         gone: the topics that some publisher has offered since the start, and none does any more.

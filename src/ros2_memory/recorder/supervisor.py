@@ -63,9 +63,6 @@ class Supervisor:
     """Keeps one recording going, two during a handover.
 
     Args:
-        orders: what to record.
-        housekeeper: repairs and deletes in the background.
-        monotonic: a clock that never steps, in seconds.
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
         keep_alive: tells the service manager's watchdog that the recorder runs; called before each

@@ -53,14 +53,9 @@ class Collected:
     """What one pass did.
 
     Attributes:
-        bags: how many bags were deleted.
-        bytes: how many bytes that freed.
-        recordings: how many directories of recordings were deleted.
+        bags: how many were deleted, of so many `bytes`; `failed` could not be.
         carried: how many latched messages are carried, if their bag was rewritten.
-        failed: how many bags could not be deleted.
         total_bytes: what the budget counts afterwards.
-        foreign_bytes: the size of bags that the recorder did not make and no limit counts.
-        state_bytes: how much of that is no recording: `.episodic` and logs.
         saved_bytes: how much of it saved moments take.
         fits: whether the limits are kept.
         held: how many bags are too old by their dates and stay, since the clock is not known to be
@@ -98,9 +93,6 @@ class _Pass:
         urgent: whether it does not wait until carried messages have been known for long enough.
         synchronised: whether the system clock is synchronised; None until asked.
         waiting: those of the remaining bags that can be deleted some moments later.
-        result: what it did so far.
-        deleted: bags that were deleted.
-        remaining: bags that stay.
         saved: those of the deleted bags whose files are saved in moments.
         unshipped: those that had to be shipped, in the order in which they were deleted.
         gave_up: whether some were deleted though what stays of them could not be written.
@@ -150,17 +142,9 @@ class GarbageCollector:
     """Keeps one bag directory within its limits. Not thread-safe.
 
     Args:
-        bag_dir: the bag directory.
-        limits: how much is kept.
-        carrier: carries latched messages forward.
-        own: the recordings that the recorder made.
         recorded: how long was recorded after each recording.
-        is_synchronised: whether the system clock is synchronised; may take some seconds.
-        static_topics: topics that are latched whatever their publishers declare.
         grace_s: how long latched messages are carried before their bag is deleted.
         needed: gives the bags that rules may still need, which no age deletes.
-        measure_free: measures what the disk of a directory has left, in bytes.
-        monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags; None where nothing does.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
     """
@@ -206,10 +190,7 @@ class GarbageCollector:
     ) -> Collected:
         """Deletes what is too old, then what exceeds the budget. Reports what cannot be deleted.
 
-        Args:
-            known: what the index knows about files.
-            snapshot: the index's snapshot of the same files.
-            free_bytes_wanted: how much of the disk must be free; None if that does not count.
+        `free_bytes_wanted`: how much of the disk must be free; None if that does not count.
 
         Raises:
             OSError: the free space cannot be measured, or the list of the recorder's own recordings

@@ -54,10 +54,7 @@ def is_journal(name: str) -> bool:
 def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
     """Deletes one bag file below the root, and a sqlite bag's journals; returns its size in bytes.
 
-    Args:
-        root: the bag directory.
-        path: the file.
-        inode: the device and inode number that it must have.
+    `inode` are the device and inode number that the file must have.
 
     Raises:
         FileNotFoundError: it is not there any more.

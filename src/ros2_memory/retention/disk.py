@@ -90,11 +90,7 @@ class HomeDisk:
 
 
 class FailingFiles:
-    """Since when the disk fails to read files, so that those bad for good are given up.
-
-    Args:
-        monotonic: a clock that never steps, in seconds.
-    """
+    """Since when the disk fails to read files, so that those bad for good are given up."""
 
     def __init__(self, monotonic: Callable[[], float]) -> None:
         self._monotonic = monotonic

@@ -79,7 +79,6 @@ class Holder:
 
     Attributes:
         paths: all its names in the bag directory that may be changed.
-        inode: device and inode.
         counts: the messages that go, by topic.
         windows: likewise, by topic and window.
         ids: what identifies those of them in sidecars that one may list, by topic.
@@ -115,9 +114,7 @@ class Eraser:
     """Takes messages out of the bags of one bag directory.
 
     Args:
-        bag_dir: where the bags lie.
         reader: reads files as they are, also what does not count in answers.
-        writer: rewrites them.
         own: the recordings that may be changed; None: all.
         written: files that are still being written, and what they may hold; None: unknown.
         recorder: why a recorder holds the directory; None where none does, nor can begin to.

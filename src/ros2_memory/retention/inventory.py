@@ -140,7 +140,6 @@ class Inventory:
     """The contents of one bag directory. Not thread-safe.
 
     Args:
-        root: the bag directory.
         static_topics: topics that are latched whatever their publishers declare.
         own: the recorder's recordings; only the size of other bags is counted. None: all bags may
             be deleted.
@@ -165,11 +164,6 @@ class Inventory:
 
         A bag that is being written must not be deleted, nor one that cannot be read: its age is
         unknown. A bag that a crash left open may, unless the recorder named it last.
-
-        Args:
-            known: what the index knows.
-            deleted: bags that have been deleted since.
-            remaining: bags that cannot be deleted.
 
         Raises:
             OSError: the list of the recorder's own recordings cannot be read.

@@ -172,12 +172,7 @@ class Carrier:
     """Writes the bag of carried messages of one bag directory.
 
     Args:
-        bag_dir: where the bags lie.
-        reader: reads them.
-        writer: writes the one of carried messages.
         static_topics: carried though no publisher is known to have offered them as transient local.
-        own: lists the bag.
-        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(

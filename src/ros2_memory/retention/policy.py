@@ -124,7 +124,6 @@ class DirContents:
 
     Attributes:
         bags: those that may be deleted.
-        now: the wall clock.
         other_bytes: all else that counts: open bags, and what goes with a recording's last bag.
         free_bytes: free disk space; None if that does not count.
         saved: the sizes of the files of moments, by inode (device and number), which are never
@@ -132,7 +131,6 @@ class DirContents:
         recorded_since: how long was recorded after each recording, by the monotonic clock; a
             recording that is missing counts as new.
         doubtful: the recordings whose dates are not known to be right.
-        synchronised: whether the system clock is synchronised.
         foreign_bytes: the size of bags of other programs, which no limit counts.
         state_bytes: how much of `other_bytes` is no recording: `.episodic` and logs.
         places: the place of each recording in the list of those that the recorder made; one that

@@ -111,9 +111,7 @@ class Share:
     def refusal(self, files: Iterable[tuple[int, int]], expected: int = 0) -> str | None:
         """Describes why a moment is refused for want of room; None if all of its files fit.
 
-        Args:
-            files: inodes and sizes (bytes).
-            expected: the bytes of open files.
+        `files` are inodes and sizes (bytes), `expected` the bytes of open files.
         """
         used = sum(self.stored.values())
         new = {inode: size for inode, size in files if inode not in self.stored}
@@ -147,10 +145,7 @@ class MomentKeeper:
     """The moments of one bag directory. Not thread-safe, except for `has_work`.
 
     Args:
-        bag_dir: the bag directory.
         share_bytes: how much of the budget moments may take.
-        clock: the wall clock.
-        own: lists what is linked.
         rule_bytes: how much of that is set aside for each rule.
     """
 

@@ -64,8 +64,6 @@ class Backfill:
     """Stores the bags of one memory. Only `progress` may be called from several threads.
 
     Attributes:
-        memory: has the bags.
-        filling: fills the store of columns; None where there is none.
         helper: the command line of the program that stores a backlog (`ros2-memory index`);
             without it that is stored here.
         undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.

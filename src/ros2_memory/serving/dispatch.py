@@ -115,9 +115,6 @@ class Dispatcher:
     caller wrote, cut short. `most_questions`: how many calls are kept for the page.
 
     Attributes:
-        memory: what answers.
-        questions: the latest calls with their replies.
-        tools: the tools that a call can name, in the order of their declaration.
         readable: the names of those that a resource can name.
         quick: the queue of the other tools.
         blocking: the queue of the tools that are declared as blocking.

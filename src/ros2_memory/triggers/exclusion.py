@@ -32,9 +32,6 @@ class ExclusionRule:
     """A rule of `recording.exclude_when`.
 
     Attributes:
-        name: unique among the rules.
-        topic: the topic whose messages decide.
-        condition: the condition that they must meet.
         margin: how long before and after is excluded, too.
         stale: for how long a message is valid if its topic is not latched.
         excludes_unknown: whether times with an unknown value are excluded, too.

@@ -73,15 +73,12 @@ class Rule:
     """When to keep something, and how much.
 
     Attributes:
-        name: unique among the rules.
         topic: the name or glob of the topics; None for a restart of the recorder.
         condition: what a message must meet; None for a rule over silences, and for a restart.
         hold: for how long the condition, or the silence, must hold before it fires.
         before: how much is kept of the time before the match began.
         after: how much is kept of the time after it fired.
-        label: what its moments are called.
         max_bytes: how much its moments may take together.
-        max_per_hour: how many moments it may begin in an hour.
     """
 
     name: str
@@ -254,14 +251,7 @@ class _Event(NamedTuple):
 
 
 class SplitSearch:
-    """Searches on behalf of some rules.
-
-    Args:
-        reader: gives the messages that count, and decodes them.
-        extractor: gives the values that conditions are tested on.
-        rules: what to search for.
-        monotonic: a clock that never steps, in seconds.
-    """
+    """Searches on behalf of some rules."""
 
     def __init__(
         self,

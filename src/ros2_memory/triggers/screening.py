@@ -95,13 +95,8 @@ class Screening:
     for any one other.
 
     Args:
-        bag_dir: the bag directory.
         rules: what is excluded, by unique names; with none nothing is announced.
         reader: reads files as they are, also what does not count in answers.
-        extractor: gives the values that conditions are tested on.
-        writer: rewrites splits.
-        split_duration_s: how long one split is.
-        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(

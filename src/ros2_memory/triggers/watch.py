@@ -57,14 +57,8 @@ class Triggers:
     """The rules of one bag directory. Not thread-safe, except for `note_restart`.
 
     Args:
-        bag_dir: the bag directory.
         rules: what to look for, by unique names.
-        search: searches closed splits for it.
         own: the recordings that the recorder made, which alone are searched.
-        moments: saves what is to be kept.
-        clock: the wall clock.
-        split_duration_s: how long one split is.
-        is_recorded: whether a topic is among those that the recorder is to record.
 
     Attributes:
         restarts: those of the recording that are still to be evaluated; from when to when.

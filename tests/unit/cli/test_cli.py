@@ -157,7 +157,6 @@ class TestConfig:
             ("reader.custom_msg_paths", "config.yaml, and by ROS_VISION_INTERFACES_PATH "),
             ("recording.bag_dir", "by MEMORY_BAG_DIR "),
             ("recorder._target_", "recorder/none.yaml "),
-            ("storage.cache_mb", "as reader.chunk_cache_mb "),
         ):
             assert told[key].startswith(who), key
 

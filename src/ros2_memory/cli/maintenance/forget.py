@@ -122,11 +122,6 @@ def forget(
 class _Forget:
     """Forgets bags, or messages of them, and prints what is done.
 
-    Args:
-        settings: of this deployment.
-        memory: over its bags.
-        dry_run: whether it only reports what it would do.
-
     Attributes:
         leaves_some: whether something stays that was to go.
     """

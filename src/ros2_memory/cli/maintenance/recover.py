@@ -100,11 +100,8 @@ def recover_files(
 ) -> RecoveryOutcome:
     """Repairs one file, or every MCAP file below a directory.
 
-    Args:
-        path: the file or directory.
-        force: also repairs what changed in the last half minute.
-        confirm: is shown the folders in which files will change; it raises where they must not.
-        clock: the wall clock.
+    `force`: also what changed in the last half minute. `confirm` is shown the folders in which
+    files will change; it raises where they must not.
 
     Raises:
         RecorderError: there is no such file or directory.

@@ -212,7 +212,6 @@ class Installation(NamedTuple):
     """A ROS 2 that can record.
 
     Attributes:
-        ros2: the path of the program.
         env: the whole environment that it runs in.
         options: the long options of its `ros2 bag record`.
     """
@@ -224,10 +223,6 @@ class Installation(NamedTuple):
 
 def find_installation(setup_files: Sequence[Path], log_dir: Path) -> Installation:
     """Makes the environment of `ros2`, and reads its options from its help.
-
-    Args:
-        setup_files: as for `robot_environment`.
-        log_dir: as for `robot_environment`.
 
     Raises:
         RecorderError: a setup file fails, there is no `ros2`, or it cannot record MCAP.

@@ -90,11 +90,9 @@ class TopicsFile:
     """The list of topics in use, and its file, which may change while the recorder runs.
 
     Args:
-        path: `topics.yaml`.
         needed: topics that a list must have, each with what needs it.
 
     Attributes:
-        selection: the list in use.
         refused: why the file's present content is not used, as a sentence; else None.
     """
 

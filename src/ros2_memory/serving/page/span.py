@@ -142,7 +142,6 @@ class SpanRequest:
 
     Attributes:
         start_s: Unix seconds of the begin of the span; with `end_s`, else the last `last_s`.
-        end_s: of its end.
         last_s: seconds before the newest data.
         since_s: only what is newer is returned of the path and the signals, and of the bag that it
             is in; without `things` also of the events.
@@ -151,7 +150,6 @@ class SpanRequest:
         status: whether the state of the memory is; without it only how far it reaches.
         patient: whether the answer may take long; else what takes long is left out.
         first: whether nothing is shown yet, so that the answer must not take long as a whole.
-        signals: numbers to be plotted.
     """
 
     start_s: float | None = None
