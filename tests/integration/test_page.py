@@ -336,15 +336,16 @@ def test_what_the_server_had_no_time_for_is_kept_and_asked_for_again(page: Brows
 
 def test_a_look_without_things_leaves_those_shown_and_is_not_the_last(page: Browser) -> None:
     """As at the end of filling: what was not known yet is asked for again, and nothing vanishes."""
-    late, gone, is_whole = page.run(
+    late, gone, robots = page.run(
         "const before = { ...state.view, things: [{ label: 'cup' }] }, late = { ...before };"
         "delete late.things; delete late.path; const next = whole(late, before);"
+        "const robots = { ...before, paths: [{ name: 'red', error: 'no time', late: true }] };"
         "return [[next.things.length, next.path.t.length === before.path.t.length, next.isWhole],"
-        "  whole(late, null).things.length, whole(before).isWhole];"
+        "  whole(late, null).things.length, [whole(robots, null).isWhole, whole(before).isWhole]];"
     )
     assert late == [1, True, False]
     assert gone == 0
-    assert is_whole
+    assert robots == [False, True]
 
 
 def test_a_gap_is_as_long_as_it_was_where_the_span_begins_in_it(page: Browser) -> None:
@@ -800,7 +801,12 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
     with serving(bag_dir, scratch / "log_two_robots", *given) as server:
         show(chromium, server)
         assert "Robots are mixed: robin, wren overlap" in chromium.text("#mixed")
-        assert "joins their paths" in chromium.text("#mixed")
+        # Each has a path of its own, and the robots are where they were at one time.
+        drawn = "return map.paths.map((each) => [each.name, each.x[0], each.x.at(-1)])"
+        assert chromium.run(drawn) == [["robin", 0, 20], ["wren", 100, 120]]
+        assert "robin\nwren" in chromium.text("#map-key")
+        chromium.run("map.place(arguments[0])", T0_S + 8)
+        assert chromium.run("return map.moments.map((each) => Math.round(each.x))") == [8, 103]
         offered = chromium.run("return [...document.getElementById('recording').options]")
         assert len(offered) == 3
         chromium.run(

@@ -45,7 +45,7 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import detections, odom, write_mcap
+from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
 
@@ -341,6 +341,63 @@ def test_a_folder_of_several_recordings_is_listed_too(tmp_path: Path) -> None:
     assert names == ["moments/y/e", "moments/x/d", "wren/c", "robin", "robin/b", "robin/a"]
     assert rows[3] == {"name": "robin", "start": BEGIN_S, "end": BEGIN_S + 1, "holds": 2}
     assert len(recordings.alone("robin").index.snapshot().bags) == 2
+
+
+def paths_in(memory: Memory, start_s: int, stop_s: int) -> Any:
+    window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
+    return Recordings(memory).paths(memory, Call(), window)["paths"]
+
+
+def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
+    tmp_path: Path,
+) -> None:
+    """Wren's two recordings follow each other, robin drives beside them, and jay long before."""
+    for name, begins, x in (
+        ("jay", -900, 0),
+        ("robin", 0, 10),
+        ("wren/a", 0, 20),
+        ("wren/b", 11, 30),
+    ):
+        at_s = [n / 10 for n in range(101)]
+        messages = [odom(BEGIN + int((begins + s) * S), x + s, 0.0) for s in at_s]
+        write_mcap(tmp_path / name / "0.mcap", messages)
+    memory = memory_of(tmp_path)
+
+    def paths(start_s: int, stop_s: int) -> dict[str, tuple[float, float]]:
+        found = paths_in(memory, start_s, stop_s)
+        return {each["name"]: (each["x"][0], each["x"][-1]) for each in found}
+
+    assert paths(0, 30) == {"robin": (10, 20), "wren": (20, 40)}
+    assert paths(-1000, 30) == {"jay": (0, 10), "robin": (10, 20), "wren": (20, 40)}
+    assert paths(-1000, -800) == {}
+
+
+def test_robots_within_one_folder_have_a_path_each_beside_another_folder(tmp_path: Path) -> None:
+    for name, x in (("hall/robin", 0), ("hall/wren", 100), ("yard/jay", 200)):
+        messages = [odom(BEGIN + n * S // 10, x + n / 10, 0.0) for n in range(101)]
+        write_mcap(tmp_path / name / "0.mcap", messages)
+    found = paths_in(memory_of(tmp_path), 0, 30)
+    ends = {path["name"]: (path["x"][0], path["x"][-1]) for path in found}
+    assert ends == {"hall/robin": (0, 10), "hall/wren": (100, 110), "yard": (200, 210)}
+
+
+def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
+    tmp_path: Path,
+) -> None:
+    for name, begins, parent in (("robin", 0, "base"), ("wren", 500, "map"), ("jay", 900, "base")):
+        poses = [odom(BEGIN + (begins + n) * S, float(n), 0.0) for n in range(10)]
+        at = poses[0].log_time
+        mount = transform(at, parent, "laser", (0.1, 0.0, 0.0))
+        mounted = tf(at, mount, topic="/tf_static")
+        write_mcap(tmp_path / name / "0.mcap", [mounted, *poses])
+    memory = memory_of(tmp_path)
+
+    def robots(start_s: int, stop_s: int) -> list[str]:
+        return [each["name"] for each in paths_in(memory, start_s, stop_s)]
+
+    assert robots(0, 600) == ["robin", "wren"]
+    assert robots(0, 1000) == ["jay", "robin", "wren"]
+    assert robots(0, 400) == []
 
 
 def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:

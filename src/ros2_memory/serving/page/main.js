@@ -122,6 +122,7 @@ async function look(isMore = false, isPatient = false) {
     isWholeOwed = reply.whole_ms === undefined;
     if (!isWholeOwed) wholeAt = lookedAt;
     if (reply.status) statusAt = lookedAt;
+    if (reply.recordings && !reply.mixed.length) reply.paths = [];
     if (reply.events) {
       reply.events.forEach((each) => uncut(each, reply.range || view.range));
       reply.events.push(...always(reply, reply.range || view.range));
@@ -253,11 +254,12 @@ function always(reply, range) {
 }
 /* Whether an answer has all that was asked for, and that takes long. */
 function isWhole(reply, given) {
-  return Boolean(reply.events && reply.path !== undefined && (reply.things || given.get("things") === "0"));
+  return Boolean(reply.events && reply.path !== undefined && (reply.things || given.get("things") === "0"))
+    && !(reply.paths || []).some((each) => each.late);
 }
 function whole(reply, before) {
-  const { path = null, seen = null, robot = null, places = [], things = [], events = [] } = before || {};
-  return { path, seen, robot, places, things, events, moments: [], owed: null, ...reply,
+  const { path = null, paths = [], seen = null, robot = null, places = [], things = [], events = [] } = before || {};
+  return { path, paths, seen, robot, places, things, events, moments: [], owed: null, ...reply,
     isWhole: isWhole(reply, new URLSearchParams()) };
 }
 /* What is shown, with an answer about what came since. */
@@ -412,7 +414,10 @@ function showRecordings(view) {
   at("ask-one").replaceChildren("Answers are from the recording ", bdi(state.recording), " alone.");
   at("mixed").hidden = !mixed.length;
   at("mixed").replaceChildren(...mixed.map((each) => el("p", {}, `! ${each[0].toUpperCase()}${each.slice(1)}.`)),
-    ...(mixed.length ? [el("p", {}, "The map joins their paths. Choose one recording above.")] : []));
+    ...(mixed.length ? [el("p", {}, apart(view)
+      ? "The map has a path for each recording. All else on this page is of all of them together: "
+        + "choose one recording above to see it alone."
+      : "The map joins their paths. Choose one recording above.")] : []));
 }
 function showFilling(filling) {
   at("filling").hidden = !filling;
@@ -427,6 +432,7 @@ function showKey() {
   const one = (kind, text) => el("span", {}, el("i", { class: kind }), text);
   const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
   const { stops } = view.counts || {};  // the longest are among the events
+  const left = view.paths_left_out;
   // Without poses there is no map: the reason is shown instead.
   const isEmpty = Boolean(view.no_path) && !(view.places || []).length;
   at("map").hidden = at("map-tools").hidden = isEmpty;
@@ -436,7 +442,12 @@ function showKey() {
       ? `No path: ${view.no_path}.` : "No path: which topic says where the robot is? Choose it above."));
     return;
   }
-  at("map-key").replaceChildren(...pathKey(view, one),
+  at("map-key").replaceChildren(...(apart(view) ? [
+    ...map.paths.map((each, n) => one(ofPath(n), each.name)),
+    ...view.paths.filter((each) => each.error).map((each) => el("span", { class: "warn" },
+      "no path of ", bdi(each.name), `: ${each.error}`)),
+    ...(left ? [el("span", { class: "warn" }, `${counted(left, "more path")} left out`)] : [])]
+    : pathKey(view, one)),
   ...(map.stops.length ? [one("stood", `stops, ${map.stops.length}${stops > map.stops.length ? ` of ${stops}` : ""}`)]
     : []),
   ...(map.things.length ? [one("seen", `things, ${map.things.length}${more}`)] : []),

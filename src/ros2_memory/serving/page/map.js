@@ -33,6 +33,9 @@ function continuedBy(known, more) {
       .map((each) => each - first + known.t.length)] };
 }
 
+const ofPath = (n) => (n ? `path-${n + 1}` : "path");
+const apart = (view) => Boolean(view.paths && view.paths.length);
+
 class RobotMap {
   /* `told` has time(t, isChosen), thing(thing), stretch(event), closer(path, box, since): the path is
      to be drawn more exactly; `since`: what is known of it reaches so far, else null. */
@@ -46,8 +49,10 @@ class RobotMap {
     this.centre = { x: 0, y: 0 };
     this.scale = 40;
     this.paths = [];
+    this.isApart = false;
     this.t = null;
     this.moment = null;
+    this.moments = [];
     this.chosen = null;
     pointers(canvas, {
       hover: (x, y, event) => this.hover(x, y, event),
@@ -64,14 +69,17 @@ class RobotMap {
   show(view) {
     this.view = view;
     const path = view.path;
-    this.paths = path ? [path] : [];
+    // Of several robots each has a path of its own.
+    this.isApart = apart(view);
+    this.paths = this.isApart ? view.paths.filter((each) => each.t) : path ? [path] : [];
     for (const each of this.paths) {
       each.starts = new Set(each.begins);
       each.of = view.of;
     }
     this.things = view.things.filter((each) => path && each.frame === path.frame);
     this.stops = view.events.filter((each) => each.kind === "stop" && each.x !== undefined);
-    const driven = path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame || "a frame without a name")}` : "no path";
+    const driven = this.isApart ? `paths of ${this.paths.map((each) => plain(each.name)).join(", ")}`
+      : path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame || "a frame without a name")}` : "no path";
     this.canvas.setAttribute("aria-label", `Map: ${driven}, ${counted(this.stops.length, "stop")}, `
       + `${counted(this.things.length, "thing")}. Arrow keys move it, plus and minus zoom.`);
     this.draw();
@@ -114,7 +122,7 @@ class RobotMap {
   }
 
   /* Where the robot was at a time: between two poses, or at one shortly before; on what is drawn. */
-  at(t, path = this.paths[0]) {
+  at(t, path = this.isApart ? null : this.paths[0]) {
     const on = this.between(t, path);
     const shape = on && this.exactly(path);
     if (!shape) return on;
@@ -143,12 +151,13 @@ class RobotMap {
   place(t) {
     this.t = t;
     this.moment = t === null ? null : this.at(t);
+    this.moments = t === null || !this.isApart ? [] : this.paths.map((each) => this.at(t, each));
     this.draw();
   }
   /* Puts it where an answer has it: between points of a long path it is not known. */
   correct(answer) {
     const [path] = this.paths;
-    if (!answer.robot || !path || answer.frame !== path.frame
+    if (!answer.robot || this.isApart || !path || answer.frame !== path.frame
       || (this.moment && this.moment.isExact)) return;
     this.moment = { x: answer.robot.x, y: answer.robot.y, yaw: answer.robot.yaw_deg };
     this.draw();
@@ -236,7 +245,7 @@ class RobotMap {
     }
     const { t, path } = this.timeNear(x, y);
     const place = t === null ? this.placeAt(x, y) : null;
-    tip(place ? place.name : t === null ? "" : clock(t), event);
+    tip(place ? place.name : t === null ? "" : `${this.isApart ? `${path.name}, ` : ""}${clock(t)}`, event);
     this.told.time(t, false);
   }
   click(x, y) {
@@ -285,7 +294,9 @@ class RobotMap {
     this.drawStops(c);
     this.drawNames(c, width, height, this.drawThings(c, width, height));
     const { robot } = this.view;
-    if (robot && this.paths.length) {
+    if (this.isApart) {
+      this.moments.forEach((each, n) => each && this.drawRobot(c, each, colour(ofPath(n)), true));
+    } else if (robot && this.paths.length) {
       this.drawRobot(c, robot, colour("now"), this.moment === null);
     }
     if (this.moment) this.drawRobot(c, this.moment, colour("robot"), true);
@@ -406,9 +417,10 @@ class RobotMap {
     return Boolean(chosen && chosen.label === thing.label && chosen.x === thing.x && chosen.y === thing.y);
   }
   drawPath(c) {
-    this.paths.forEach((path) => {
-      c.strokeStyle = colour("path");
-      c.lineWidth = 2;
+    this.paths.forEach((path, index) => {
+      c.strokeStyle = colour(ofPath(index));
+      // What lies below others shows on both sides of them.
+      c.lineWidth = 1 + this.paths.length - index;
       c.beginPath();
       const exact = this.exactly(path);
       if (exact) this.trace(c, exact, 0);

@@ -75,6 +75,9 @@ def page_routes(
         if "status" in shown:
             shown |= recordings.shown(part, call)
             shown |= {"memory": named(memory)} if given.get("named") == "1" else {}
+        if shown.get("mixed") and "path" in shown:
+            window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
+            shown |= recordings.paths(part, call, window)
         return shown
 
     def route(path: str, work: _Work) -> Route:

@@ -334,6 +334,16 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     return Shown({"path": _drawn(path), "robot": robot, "places": named}, tuple(notes))
 
 
+def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
+    """Returns the path in a window; None where no topic with poses is recorded.
+
+    Raises:
+        QueryTimeoutError: it is not known within the time of a quick answer.
+    """
+    path = robot_path(View(memory, call.within(_QUICK_S), window.stop), window)
+    return None if path is None else _drawn(path)
+
+
 def _drawn(path: RobotPath) -> JsonObject:
     """Returns a path by `MOST_POINTS` points at most."""
     track = path.track
