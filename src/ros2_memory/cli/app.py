@@ -85,6 +85,12 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "copy a time window to MCAP or Parquet",
         "part of it could not be read or decoded, or has no definition (stderr names it)",
     ),
+    "prove": CommandEntry(
+        "prove.prove",
+        "write the messages that an answer rests on to MCAP",
+        "its answer over the file differs, or a type that it needs has no definition (stderr "
+        "names them)",
+    ),
     "forget": CommandEntry(
         "maintenance.forget.forget",
         "delete a time window, after confirmation",

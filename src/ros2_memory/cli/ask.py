@@ -30,7 +30,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.timebase import unix_from_ns, unix_from_text
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.arguments import TIME_KINDS
 from ros2_memory.tools.build import build_tools
@@ -116,13 +116,7 @@ def ask(
     # A folder that is not there may stand before the tool.
     name = next((word for word in asked if word in tools), asked[0])
     rest = [word for word in asked if word and word != name]
-    schemas = tools[name].arguments if name in tools else {}
-    arguments = with_times(
-        parse_arguments(rest, schemas), schemas, unix_from_ns(present_time(memory))
-    )
-    if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
-        first, last = newest_day(memory).asked()
-        arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
+    arguments = question_for(memory, name, tools.get(name), rest)
     with spinner(f"asking {name}"):
         (reply,) = call_tools(dispatcher, {name: arguments})
     answer: JsonValue = json.loads(reply.text)
@@ -135,6 +129,26 @@ def ask(
             answer = with_shorter_lists(answer, ["waypoints"])
         print_reply(answer, unix_from_ns(present_time(memory)))
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
+
+
+def question_for(
+    memory: Memory, name: str, tool: Tool | None, words: Sequence[str]
+) -> dict[str, object]:
+    """Returns the arguments for a tool, from the words of the command line.
+
+    A `recap` without a time is that of the newest day.
+
+    Raises:
+        InvalidArgumentsError: a word is no argument, or a text is no time.
+    """
+    schemas = {} if tool is None else tool.arguments
+    arguments = with_times(
+        parse_arguments(words, schemas), schemas, unix_from_ns(present_time(memory))
+    )
+    if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
+        first, last = newest_day(memory).asked()
+        arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
+    return arguments
 
 
 def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]) -> list[Reply]:

@@ -84,14 +84,8 @@ def export(
     with spinner("exporting"):
         if mcap is not None:
             undefined: list[str] = []
-            count = write_mcap(mcap, _with_definitions(messages, memory.reader, undefined))
-            where = f"in {mcap}"
-            if undefined:
-                lacking = (
-                    f"{', '.join(undefined)}: no definition in the bags, in "
-                    "reader.custom_msg_paths or among the standard types, and none in the file: "
-                    "other programs cannot read such messages"
-                )
+            count = write_mcap(mcap, with_definitions(messages, memory.reader, undefined))
+            lacking, where = describe_undefined(undefined), f"in {mcap}"
         elif parquet is not None:
             count, files, lacking = _write_parquet(parquet, messages, memory, robot)
             where = f"in {counted(files, 'file')} below {parquet}"
@@ -156,7 +150,7 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
     return sorted(once.values(), key=lambda stored: stored.time)
 
 
-def _with_definitions(
+def with_definitions(
     messages: Iterator[StoredMessage], reader: BagReader, undefined: list[str]
 ) -> Iterator[StoredMessage]:
     """Yields the messages with the definitions that their bags lack; collects unknown types."""
@@ -176,6 +170,17 @@ def _with_definitions(
     for stored in messages:
         record = stored.record
         yield stored._replace(record=record._replace(channel=defined(record.channel)))
+
+
+def describe_undefined(types: Sequence[str]) -> str:
+    """Returns the sentence on types that an MCAP file has no definition of; empty without any."""
+    if not types:
+        return ""
+    return (
+        f"{', '.join(types)} {'has' if len(types) == 1 else 'have'} no definition in the bags, in "
+        "reader.custom_msg_paths or among the standard types, and none in the file: other programs "
+        "cannot read such messages"
+    )
 
 
 def write_mcap(path: Path, messages: Iterator[StoredMessage]) -> int:

@@ -1,0 +1,146 @@
+"""`ros2-memory prove`: a file with what an answer rests on, which alone gives that answer."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.reader import make_reader
+
+from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
+from tests.support.moving_map import BEGIN, S, write_moving_map
+
+if TYPE_CHECKING:
+    from tests.support.program import Program
+
+DAY_S = 86_400
+ABOVE = {"topic": "/odom", "condition_type": "above", "value": 0.1, "field": "position.x"}
+
+
+@pytest.fixture
+def bags(tmp_path: Path) -> Path:
+    """A robot with a map, for two minutes in splits of 10 s."""
+    write_moving_map(tmp_path / "bags", 3)
+    return tmp_path / "bags"
+
+
+@pytest.fixture
+def two_days(tmp_path: Path) -> Path:
+    """Ten seconds a day on two days, each a recording."""
+    for day in range(2):
+        start = BEGIN + day * DAY_S * S
+        poses = [odom(start + nth * S // 10, nth / 20, 0.0) for nth in range(100)]
+        words = [text(start + nth * S, f"word {nth}") for nth in range(10)]
+        write_mcap(tmp_path / "days" / f"rec_{day}" / f"rec_{day}_0.mcap", [*poses, *words])
+    return tmp_path / "days"
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as file:
+        return [
+            (channel.topic, message.log_time, message.data)
+            for _, channel, message in make_reader(file).iter_messages()
+        ]
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        f"find_last_match {json.dumps(ABOVE)}",
+        "find_last_match topic=*/scene_objects condition_type=contains value=never",
+        'visits where={"x": 4.0, "y": 0.0, "radius_m": 1.0}',
+        "get_position_seconds_ago seconds_ago=1m frame_id=map",
+        "get_topic_at_time topic=/tf_static timestamp=2026-07-14T03:34:00Z",
+        "get_topic_in_range topic=/nothing start=1784000000 end=1784000010",
+    ],
+)
+def test_the_file_alone_gives_the_answer(
+    bags: Path, tmp_path: Path, exits: Program, question: str
+) -> None:
+    proof = tmp_path / "proof.mcap"
+    proved = exits(0, "prove", question, "-o", proof, bags)
+    assert f"{len(messages(proof))} messages in {proof}" in proved.out
+    said, _, command = proved.err.splitlines()[-1].partition(": ros2-memory ask ")
+    assert said == "the same answer"
+    *words, last = shlex.split(command)
+    assert (" ".join(words), last) == (question, str(proof))
+    code = 1 if "/nothing" in question else 0
+    asked = exits(code, "ask", *words, bags, "--json", "--set", "data.now=latest").json
+    assert exits(code, "ask", *words, proof, "--json").json == asked
+
+
+def test_types_without_a_definition_are_named_and_exit_1_where_the_answer_rests_on_them(
+    tmp_path: Path, exits: Program
+) -> None:
+    odd = [Msg("/odd", "nobody_msgs/msg/Knows", BEGIN, b"\0\1\0\0\0"), text(BEGIN, "x")]
+    write_mcap(tmp_path / "bags" / "rec_0.mcap", odd, McapLayout(definitions=False))
+    for code, topic in ((0, "/chatter"), (1, "/odd")):
+        question = f"get_topic_seconds_ago topic={topic} seconds_ago=0"
+        proof = tmp_path / f"proof_{code}.mcap"
+        err = exits(code, "prove", question, "-o", proof, tmp_path / "bags").err
+        assert "the same answer" in err
+        assert "nobody_msgs/msg/Knows has no definition" in err
+
+
+def test_topics_of_other_recordings_are_left_out(tmp_path: Path, exits: Program) -> None:
+    for nth in range(4):
+        at = BEGIN + nth * DAY_S * S
+        word = text(at, f"word {nth}", topic=f"/chatter_{nth}")
+        odd = Msg("/odd", "nobody_msgs/msg/Knows", at + S, b"\0\1\0\0\0")
+        own = tmp_path / "bags" / f"rec_{nth}"
+        layout = McapLayout(definitions=False)
+        write_mcap(own / "rec_0.mcap", [word, odd] if nth in {1, 2} else [word], layout)
+    proof = tmp_path / "proof.mcap"
+    question = f"get_topic_at_time topic=/chatter_1 timestamp={BEGIN // S + DAY_S}"
+    assert "Knows" not in exits(0, "prove", question, "-o", proof, tmp_path / "bags").err
+    assert [topic for topic, *_ in messages(proof)] == ["/chatter_0", "/chatter_1", "/chatter_3"]
+
+
+def test_what_lay_between_recordings_needs_a_folder(
+    two_days: Path, tmp_path: Path, exits: Program
+) -> None:
+    span = f"start={BEGIN // S} end={BEGIN // S + DAY_S + 60}"
+    question, proof = f"trajectory_summary by=day {span}", tmp_path / "proof.mcap"
+    differs = exits(1, "prove", question, "-o", proof, two_days)
+    assert f"over {proof} the answer differs in rows, all" in differs.err
+    assert f"-o {tmp_path / 'proof'} keeps recordings apart" in differs.err
+    folder = tmp_path / "proof"
+    proved = exits(0, "prove", question, "-o", folder, two_days, "--json").json
+    same = {"same": True, "differing": [], "beside": []}
+    assert proved == {"path": str(folder), "messages": 201, **same}
+    assert [each.name for each in sorted(folder.iterdir())] == ["rec_0", "rec_1"]
+
+
+def test_a_key_on_files_is_named_and_is_no_other_answer(
+    bags: Path, tmp_path: Path, exits: Program
+) -> None:
+    proved = exits(0, f"prove data_time_range -o {tmp_path}/proof.mcap {bags}")
+    assert "note: only the bags themselves give the same bags\n" in proved.err
+
+
+def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:
+    (tmp_path / "bags").mkdir()
+    refused = exits(2, f"prove 'visits x=1 y=1' -o {tmp_path}/proof {tmp_path}/bags")
+    assert "contains no bag with messages; `ros2-memory info`" in refused.err
+
+
+@pytest.mark.parametrize(
+    ("question", "name", "said"),
+    [
+        ("find_thing", "p.mcap", 'unknown tool "find_thing"; do you mean find_things'),
+        ("remember_moment label=x", "p.mcap", "remember_moment is not offered here"),
+        ("recap foo=1", "p.mcap", 'unknown argument "foo"'),
+        ("visits 5", "p.mcap", "is not an argument"),
+        ("visits", "none/p.mcap", "must be new, in a folder that is there"),
+        ("visits", "bags", "must be new, in a folder that is there"),
+    ],
+)
+def test_what_cannot_be_proved_is_refused(
+    bags: Path, tmp_path: Path, exits: Program, question: str, name: str, said: str
+) -> None:
+    refused = exits(2, "prove", question, "-o", tmp_path / name, bags)
+    assert said in refused.err
+    assert [*tmp_path.iterdir()] == [bags]
