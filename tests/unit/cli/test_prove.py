@@ -124,7 +124,7 @@ def test_a_key_on_files_is_named_and_is_no_other_answer(
 def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "bags").mkdir()
     refused = exits(2, f"prove 'visits x=1 y=1' -o {tmp_path}/proof {tmp_path}/bags")
-    assert "contains no bag with messages; `ros2-memory info`" in refused.err
+    assert "contains no bag with messages; data_time_range" in refused.err
 
 
 @pytest.mark.parametrize(
