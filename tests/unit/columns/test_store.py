@@ -108,6 +108,18 @@ def stored_rows(file: Path) -> str:
     return digest.hexdigest()[:16]
 
 
+def test_what_follows_from_parts_is_the_same_when_they_are_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashes = set[str]()
+    for name, held_bytes in (("held", 16 << 20), ("few", 2_000), ("none", 0)):
+        monkeypatch.setattr("ros2_memory.columns.scanner._WRITTEN_BYTES", held_bytes)
+        write_all_that_is_derived(tmp_path / name)
+        World.of(tmp_path / name).fill()
+        hashes.add(stored_rows(store_file(tmp_path / name)))
+    assert len(hashes) == 1
+
+
 def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None:
     write_all_that_is_derived(tmp_path)
     world = World.of(tmp_path)
