@@ -69,9 +69,11 @@ class Coverage:
     def missing_extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that are not stored as `Timeline.extents` yields all."""
         for covered in self.segments:
-            span = covered.segment.spans.get(topic) if covered.missing else None
-            if span is not None and window.overlaps(*span):
-                yield from covered.segment.extents(topic, window, covered.numbers < 0)
+            if covered.missing:
+                bags, is_missing = covered.segment.bags, covered.numbers < 0
+                is_missing &= (bags.starts < window.stop) & (bags.ends >= window.start)
+                if is_missing.any():
+                    yield from covered.segment.extents(topic, window, is_missing)
 
     def _are_there(self, numbers: IntArray) -> NDArray[np.bool_]:
         """Returns which of some numbers are of bags of the timeline."""

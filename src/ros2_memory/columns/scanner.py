@@ -7,7 +7,7 @@ their columns. Of a part that nothing needs not even the times are unpacked.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
@@ -30,7 +30,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
@@ -57,6 +57,8 @@ _FEW_DAYS_NS: Final = 3 * DAY_NS
 _DROPPED: Final = "beyond the share of the store (store.max_share)"
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
+_WRITTEN_BYTES: Final = 16 << 20
+"""Of parts that were just written so many compressed bytes are held, until what follows is made."""
 _MOST_DAMAGED: Final = 10_000
 """Files whose damage is remembered."""
 
@@ -178,6 +180,7 @@ class Scanner:
         self._reading = reading
         self._damaged: dict[tuple[str | Ns, ...], str] = {}
         self._fresh: set[int] = set()
+        self._written: dict[int, PackedPart] = {}
         # They follow from columns alone, and are of use where these were dropped.
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read, self._fresh)
         self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
@@ -205,18 +208,23 @@ class Scanner:
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
 
-    def make_outlines(self, timeline: Timeline, window: TimeWindow) -> None:
-        """Makes the outlines of the whole parts that have rows in a window."""
+    def outlines_made(self, timeline: Timeline, window: TimeWindow) -> Iterator[Ns]:
+        """Makes the outlines of the whole parts that have rows in a window, the newest first.
+
+        Yields a log time (ns) of each.
+        """
         coverage = self.coverage(timeline)
         if coverage is None:
             return
-        for topic in timeline.topics():
-            heads = [head for head in self.parts(topic, window, coverage) if head.is_whole]
-            for head in heads:
-                key = _outline_key(head)
-                unit = None if self._outlines.get(key) else self.part(head, coverage, heads)
+        topics = timeline.topics()
+        heads = [head for topic in topics for head in self.parts(topic, window, coverage)]
+        for head in sorted(heads, key=lambda head: head.first, reverse=True):
+            key = _outline_key(head)
+            if head.is_whole and not self._outlines.get(key):
+                unit = self.part(head, coverage)
                 if unit is not None:
                     self._outlines.put(key, outline_of(unit.table, unit.times()))
+            yield head.first
 
     def fragments_of_others(self) -> list[Ns]:
         """Returns where slices begin that have fragments of other settings alone, newest first."""
@@ -225,6 +233,7 @@ class Scanner:
     def write_fragments(self) -> None:
         """Stores the fragments that were made since."""
         self._fresh.clear()
+        self._written.clear()
         for fragments in [*self._fragments.values()]:
             cast("Fragments[Sized]", fragments).write()
 
@@ -391,13 +400,11 @@ class Scanner:
     def remember(self, parts: Mapping[int, PackedPart]) -> None:
         """Remembers parts that were written, by their numbers: what follows is made of these."""
         self._fresh.update(parts)
+        room = _WRITTEN_BYTES - sum(part.size for part in self._written.values())
         for number, part in parts.items():
-            for path, packed in part.columns.items():
-                known = replace(packed, data=b"")
-                self.caches.packed.put((number, path), known, _COLUMN_BYTES)
-                if packed.data:
-                    size = len(packed.data) + _COLUMN_BYTES
-                    self.caches.fetched.put((number, path), packed.data, size)
+            room -= part.size
+            if room >= 0:
+                self._written[number] = part
 
     def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:
         """Returns what is known of a column of a part; None where it has no such one.
@@ -407,6 +414,9 @@ class Scanner:
         Raises:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
+        written = self._written.get(head.number)
+        if written is not None:
+            return written.columns.get(path)
         cached = self.caches.packed.get((head.number, path))
         if cached is None:
             numbers = [head.number, *(part.number for part in together if part.topic == head.topic)]
@@ -442,7 +452,7 @@ class Scanner:
         # The one value of a constant is its least, unless it is a text.
         is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
         if packed.count and not is_constant:
-            stored = self._stored(head, path, together)
+            stored = packed.data or self._stored(head, path, together)
             if is_large(stored):
                 self._large.acquire()
         try:

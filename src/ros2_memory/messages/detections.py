@@ -47,6 +47,8 @@ _NAMED_IN_TYPES: Final = {
     frozenset({"Class", "probability"}): "Class",  # darknet_ros_msgs of ROS 1
 }
 """The name of an object that has these fields, for types in which no label says what was seen."""
+_NAMED_BY: Final = frozenset(LABELS).union(("name", "category", "id"), *_NAMED_IN_TYPES)
+"""An object without any of these fields has no name."""
 _MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 7
 """Lists, objects and texts that are JSON around a detection, and it."""
@@ -82,7 +84,7 @@ def naming(fields: Collection[str]) -> Iterator[str]:
 
     Of these the first text that is not blank is its name, else the first whole number.
     """
-    if NOT_LABELLED.isdisjoint(fields):
+    if not _NAMED_BY.isdisjoint(fields) and NOT_LABELLED.isdisjoint(fields):
         yield from LABELS
         yield from (name for own, name in _NAMED_IN_TYPES.items() if own.issubset(fields))
         if not (_SCORED.isdisjoint(fields) or _SHOWN.isdisjoint(fields)):
@@ -147,7 +149,8 @@ def _walked_object(
             detections += [
                 Detection(element) for element in inner if isinstance(element, str) and element
             ]
-        fields[name] = _walked(inner, frame, depth - 1, least, detections)
+        is_leaf = not inner or isinstance(inner, int | float)  # most are: no call for each
+        fields[name] = inner if is_leaf else _walked(inner, frame, depth - 1, least, detections)
     return value if all(map(is_, fields.values(), value.values())) else fields
 
 

@@ -274,10 +274,10 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
         events_made(view, window, topics_with_changes(view)),
         Watching(view).made(window, is_joined=is_joined),
     ]
+    if not is_joined:
+        fragments.append(memory.scanner.outlines_made(view.timeline, window))
     # Each goes back in time as far as the others: what they read is still remembered.
     deque(merge(*fragments, reverse=True), maxlen=0)
-    if not is_joined:
-        memory.scanner.make_outlines(view.timeline, window)
 
 
 async def keep_backfilled(backfill: Backfill, every_s: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 from ros2_memory.storage.errors import UnreadableError
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 EMPTY_FILE: Final = "empty file: nothing had reached the disk"
+_AT_ONCE_BYTES: Final = 1 << 20
+"""A file up to this size can be read at once: one of a minute has some two hundred pieces."""
 LINK: Final = "a symbolic link, which is not followed"
 
 
@@ -54,17 +57,25 @@ class OpenFile:
     It stays readable after the file is deleted, until it is closed. Safe to use from several
     threads at once.
 
+    Args:
+        path: of the file.
+        at_once: whether a small one is read at once, since most of it will be asked for.
+
     Raises:
         OSError: it cannot be opened.
         UnreadableError: it is not a regular file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, at_once: bool = False) -> None:
         self._descriptor = open_regular(path)
         status = os.fstat(self._descriptor)
         self.size = status.st_size
         times = status.st_mtime_ns, status.st_ino, status.st_ctime_ns
         self.key = FileKey(str(path), status.st_size, *times)
+        self._whole = b""
+        if at_once and self.size <= _AT_ONCE_BYTES:
+            with suppress(OSError):  # whoever reads a part of it meets the error, too
+                self._whole = os.pread(self._descriptor, self.size, 0)
 
     def __enter__(self) -> Self:
         """Returns the open file."""
@@ -82,6 +93,8 @@ class OpenFile:
         """
         if offset < 0 or length < 0 or offset + length > self.size:
             raise UnreadableError("damaged: it refers to bytes past its end")
+        if len(self._whole) == self.size:
+            return self._whole[offset : offset + length]
         pieces: list[bytes] = []
         missing = length
         while missing:
@@ -101,6 +114,8 @@ class OpenFile:
         Raises:
             UnreadableError: the file became shorter.
         """
+        if len(self._whole) == self.size:
+            return [self._whole[offset : offset + length] for offset in offsets]
         # One call for all: a file has a chunk, and so an offset, for each 16 KiB to 1 MiB.
         read, descriptor = os.pread, self._descriptor
         pieces = [(offset, read(descriptor, length, offset)) for offset in offsets]

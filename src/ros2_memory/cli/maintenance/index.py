@@ -43,7 +43,7 @@ _BATCH: Final = 4096
 """Bags stored before the program looks which others closed meanwhile, among all that wait."""
 _FOLLOWED: Final = 12
 """Batches stored before what follows from them is made: of two hours most is still in the cache."""
-_CACHE_MB: Final = 32
+_CACHE_MB: Final = 16
 _RARELY: Final = (50_000, 20, 100)
 """Thresholds of `gc`: columns make no cycles, and the index of a week has many objects."""
 
@@ -119,7 +119,7 @@ def _fill_for_server(settings: Settings, server: int) -> None:
 
 def _cache_mb(settings: Settings) -> int:
     """Returns what a cache may take, in MiB: of ten minutes at a time all is read together."""
-    return min(_CACHE_MB, settings.reader.chunk_cache_mb)
+    return min(_CACHE_MB, settings.store.cache_mb)
 
 
 def _filled(backfill: Backfill, show: Callable[[Progress], None] = lambda _: None) -> Progress:

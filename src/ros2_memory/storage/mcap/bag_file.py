@@ -136,7 +136,7 @@ class McapBags:
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
-        with OpenFile(path) as file:
+        with OpenFile(path, at_once=True) as file:
             index = _Reading(self, file, has_totals=True).verified()
         return summarize_channels(
             index.channels,
@@ -172,7 +172,7 @@ class McapBags:
         An error is yielded in place of the messages of a damaged chunk.
         """
         if not window.empty:
-            with OpenFile(path) as file:
+            with OpenFile(path, at_once=window == _EVERYTHING) as file:
                 yield from _Reading(self, file, topics, window).batches(bare)
 
 
