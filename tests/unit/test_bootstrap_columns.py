@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING
 from ros2_memory.bootstrap import (
     build_backfill,
     build_memory,
-    column_paths,
 )
-from ros2_memory.columns.store import FILE
 from ros2_memory.config import load_settings
 from tests.support.bags import odom, write_mcap
-from tests.support.housekeepers import recorded_before
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,18 +17,6 @@ if TYPE_CHECKING:
     import pytest
 
 T0 = 1_700_000_000 * 10**9
-
-
-def test_columns_lie_beside_the_bags_also_where_one_recording_answers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    recorded_before(tmp_path)
-    given = {"MEMORY_BAG_DIR": str(tmp_path), "MEMORY_DEPLOYMENT": "robot"}
-    paths = column_paths(load_settings([], given))
-    assert paths[0] == tmp_path / ".episodic" / FILE
-    assert paths[1].is_relative_to(tmp_path / "cache")
-    assert column_paths(load_settings(["data.recording=rec"], given)) == paths
 
 
 def test_a_memory_stores_columns_unless_it_is_told_not_to(

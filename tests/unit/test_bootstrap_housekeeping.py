@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
-
-import pytest
 
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_housekeeper, build_reader
@@ -32,15 +29,6 @@ def kept(bag_dir: Path, *overrides: str) -> list[str]:
     return files_in(bag_dir)
 
 
-def with_timedatectl(monkeypatch: pytest.MonkeyPatch, folder: Path, answer: str) -> None:
-    """Has the system's clock reported as synchronised, or not."""
-    folder.mkdir()
-    program = folder / "timedatectl"
-    program.write_text(f"#!/bin/sh\necho {answer}\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
-
-
 def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
     size = (
         2.5
@@ -50,16 +38,3 @@ def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
         tmp_path / "bags", f"retention.max_total_gb={size / 1e9}", "retention.foreign=delete"
     )
     assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap"]
-
-
-@pytest.mark.parametrize(("synchronised", "bags"), [("yes", 3), ("no", 5)])
-def test_the_age_of_the_configuration_is_kept_where_the_clock_is_synchronised(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synchronised: str, bags: int
-) -> None:
-    with_timedatectl(monkeypatch, tmp_path / "bin", synchronised)
-    left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
-    assert left == ["rec", *(f"rec/h{ago}.mcap" for ago in range(bags))]
-
-
-def test_by_default_bags_of_other_programs_are_kept(tmp_path: Path) -> None:
-    assert len(kept(tmp_path / "bags", "retention.max_total_gb=0.000001")) == 6

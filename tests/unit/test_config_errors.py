@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from ros2_memory.config import exit_on_config_error, load_settings
-from tests.support.config_folders import copied, edit, refusal
-
-
-@pytest.fixture
-def own_config(tmp_path: Path) -> Path:
-    """A configuration folder of one's own to change."""
-    return copied(tmp_path)
+from tests.support.config_folders import refusal
 
 
 class TestRefusals:
@@ -80,39 +72,6 @@ class TestRefusals:
         for message in (refusal(override), refusal(MEMORY_CONFIG_OVERRIDES=f"'{override}")):
             assert "s3cret" not in message
             assert "secret" in message or "shell" in message
-
-    def test_are_all_listed_each_with_its_source(self, own_config: Path) -> None:
-        edit(own_config / "config.yaml", "max_age_h: 168", "max_age_h: -1")
-        message = refusal(
-            "data.now=walls",
-            MCP_TRANSPORT="carrier_pigeon",
-            MEMORY_CONFIG_OVERRIDES="server.call_timeout_s=0",
-            MEMORY_CONFIG_DIR=str(own_config),
-        )
-        lines = sorted(message.splitlines())
-        assert [line.split(":")[0] for line in lines] == [
-            "data.now",
-            "retention.max_age_h",
-            "server.call_timeout_s",
-            "server.transport",
-        ]
-        assert lines[0].endswith("(set on the command line)")
-        assert lines[1].endswith(f"(set in {own_config / 'config.yaml'})")
-        assert lines[2].endswith("(set by MEMORY_CONFIG_OVERRIDES)")
-        assert lines[3].endswith("(set by MCP_TRANSPORT)")
-
-    @pytest.mark.parametrize(
-        "override", ["reader.chunk_cache_mb=-1", "reader.custom_msg_paths=[/no/such/folder]"]
-    )
-    def test_come_once_for_a_value_that_an_adapter_repeats(self, override: str) -> None:
-        assert refusal(override).splitlines() == [refusal(override)]
-        assert refusal(override).startswith("reader.")
-
-    @pytest.mark.parametrize("preset", ["replay", "query_only"])
-    def test_settings_of_a_recorder_where_none_records(self, preset: str) -> None:
-        message = refusal("recorder.setup_files=[/opt/ros/x/setup.bash]", MEMORY_DEPLOYMENT=preset)
-        assert "recorder.setup_files: recorder=none records nothing" in message
-        assert "unset MEMORY_DEPLOYMENT" in message
 
 
 class TestExit:

@@ -7,17 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bootstrap import build_housekeeper, build_reader, exclusions_of, query_settings_of
+from ros2_memory.bootstrap import exclusions_of, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.recorder.background import Background
 
 if TYPE_CHECKING:
     from ros2_memory.triggers.exclusion import ExclusionRule
 
 S: Final = 10**9
-ROOT: Final = Path(__file__).resolve().parents[2]
 PRIVACY: Final = "topic: /privacy_mode, condition_type: equals, value: true"
 
 
@@ -27,17 +24,6 @@ def rules(tmp_path: Path, text: str, *overrides: str) -> tuple[ExclusionRule, ..
     topics.write_text("topics: [/odom, /privacy_mode, /mission_zone]")
     given = [f"recording.exclude_when={path}", f"recording.topics_file={topics}", *overrides]
     return exclusions_of(load_settings(given))
-
-
-def test_the_ready_rules_are_valid_and_none_is_on(tmp_path: Path) -> None:
-    shipped = (ROOT / "config" / "exclusions.yaml").read_text(encoding="utf-8")
-    assert rules(tmp_path, shipped) == ()
-    commented = shipped[shipped.index("# rules:") :].splitlines()
-    ready = rules(tmp_path, "\n".join(line.removeprefix("# ") for line in commented))
-    assert [(each.name, each.margin) for each in ready] == [
-        ("privacy mode", S),
-        ("in the bathroom", 3 * S),
-    ]
 
 
 def test_a_rule_has_what_its_file_says(tmp_path: Path) -> None:
@@ -95,14 +81,3 @@ def test_a_recording_of_too_many_splits_is_refused(tmp_path: Path) -> None:
     assert rules(tmp_path, text, "recording.session_duration_s=50000")
     with pytest.raises(ConfigError, match="5000 splits at most"):
         rules(tmp_path, text, "recording.session_duration_s=50001")
-
-
-def test_without_rules_nothing_is_announced(tmp_path: Path) -> None:
-    settings = load_settings([f"recording.bag_dir={tmp_path}"])
-    house = build_housekeeper(
-        settings, tmp_path, build_reader(settings), OwnRecordings(tmp_path), Background()
-    )
-    house.announce("rec_20261120T080000Z")
-    house.screen(())
-    house.finish()
-    assert [*tmp_path.iterdir()] == []

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -45,29 +44,6 @@ def shown(message: object, type_name: str, *fields: str) -> Any:
 
 
 # What the specification asks of its types
-
-
-def test_odometry_is_shown_as_position_angles_and_velocities() -> None:
-    assert shown(odometry(), ODOMETRY) == {
-        "position": {"x": 1.2346, "y": -2, "z": 0},
-        "orientation": {"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 28.65},
-        "linear_velocity": {"x": 0.3, "y": 0, "z": 0},
-        "angular_velocity": {"x": 0, "y": 0, "z": 0.1},
-    }
-
-
-def test_detections_are_shown_with_label_score_point_and_box() -> None:
-    assert shown(detections("cup"), DETECTIONS) == {
-        "skill": "scene",
-        "detections": [
-            {
-                "label": "cup",
-                "score": 0.9,
-                "point": {"x": 1.2346, "y": 2, "z": 3},
-                "bbox": [10, 20, 100, 120],
-            }
-        ],
-    }
 
 
 def test_more_detections_than_the_limit_are_thinned_with_a_note_and_whole_for_conditions() -> None:
@@ -145,17 +121,6 @@ def test_fields_over_a_list_take_an_element_or_map_over_all() -> None:
     assert shown(detections(), DETECTIONS, "detections.label") == {"detections.label": []}
 
 
-def test_the_field_of_the_value_counts_before_that_of_the_message() -> None:
-    imu = {"orientation": bags.quaternion(0.5)}
-    type_name = "sensor_msgs/msg/Imu"
-    assert set(shown(imu, type_name, "orientation")["orientation"]) == {
-        "roll_deg",
-        "pitch_deg",
-        "yaw_deg",
-    }
-    assert shown(imu, type_name, "orientation.w") == {"orientation.w": pytest.approx(0.96891242)}
-
-
 def test_the_full_path_to_the_quaternions_of_a_list_gives_their_components() -> None:
     path = bags.make(
         "nav_msgs/msg/Path",
@@ -165,22 +130,6 @@ def test_the_full_path_to_the_quaternions_of_a_list_gives_their_components() -> 
     both = shown(path, "nav_msgs/msg/Path", "poses.orientation", "poses.pose.orientation")
     assert both["poses.orientation"] == [{"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 0}]
     assert both["poses.pose.orientation"] == [{"x": 0, "y": 0, "z": 0, "w": 1}]
-
-
-def test_an_unknown_field_is_refused_with_the_path_the_type_and_what_there_is() -> None:
-    with pytest.raises(InvalidArgumentsError) as refused:
-        EXTRACTOR.shown(odometry(), ODOMETRY, ["position", "speed"])
-    assert str(refused.value) == (
-        "nav_msgs/msg/Odometry has no field 'speed'; its fields are: position, orientation, "
-        "linear_velocity, angular_velocity; or give a full path in the message, which begins with "
-        "one of: header, child_frame_id, pose, twist"
-    )
-
-
-def test_an_angle_that_other_tools_return_is_named_where_it_is() -> None:
-    with pytest.raises(InvalidArgumentsError, match=r"did you mean orientation\.yaw_deg\?"):
-        EXTRACTOR.shown(odometry(), ODOMETRY, ["yaw_deg"])
-    assert shown(odometry(), ODOMETRY, "orientation.yaw_deg")
 
 
 def test_an_unknown_field_of_an_unmapped_type_is_refused_with_what_the_message_has() -> None:
@@ -216,16 +165,3 @@ def test_no_list_of_texts_is_too_long_to_be_shown(message: object) -> None:
 def test_a_malformed_path_is_refused_with_its_type_and_field(path: str) -> None:
     with pytest.raises(ConfigError, match=r"message schema a_msgs/msg/A: where: .* is not a dot-"):
         SchemaExtractor({"a_msgs/msg/A": {"where": path}}, 50)
-
-
-def test_a_map_of_ones_own_may_reach_into_lists() -> None:
-    schemas = {"a_msgs/msg/A": {"labels": "seen.label", "first": "seen.0", "second": "stamp.sec"}}
-    extractor = SchemaExtractor(schemas, 50)
-    message = SimpleNamespace(
-        seen=[{"label": "cup"}, {"label": "mug"}], stamp=bags.stamp(2 * 10**9)
-    )
-    assert extractor.exact(message, "a_msgs/msg/A") == {
-        "labels": ["cup", "mug"],
-        "first": {"label": "cup"},
-        "second": 2,
-    }

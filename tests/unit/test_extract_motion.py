@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any
-
-import pytest
 
 from ros2_memory.core.model import Pose, Twist
 from tests.support import bags
@@ -39,22 +36,6 @@ def test_a_twist_is_in_its_headers_frame_or_in_none() -> None:
     assert found.frame_id == "base_link"
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        SimpleNamespace(pose=SimpleNamespace(pose=SimpleNamespace(position=bags.point(1, 2, 3)))),
-        SimpleNamespace(pose=SimpleNamespace(position=bags.point(1, 2, 3))),
-        SimpleNamespace(position=bags.point(1, 2, 3)),
-        {"pose": {"pose": {"position": {"x": 1, "y": 2, "z": 3}}}},
-        {"position": {"x": 1, "y": 2, "z": 3}},
-    ],
-)
-def test_a_type_without_an_entry_has_a_pose_where_a_point_stands_in_one_of_three_places(
-    message: object,
-) -> None:
-    assert EXTRACTOR.pose(message, "custom_msgs/msg/Place") == Pose((1.0, 2.0, 3.0), None, "")
-
-
 def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> None:
     vector = {"x": 1, "y": 0, "z": 0}
     message = {
@@ -70,30 +51,6 @@ def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> Non
         assert EXTRACTOR.twist(message, type_name) == Twist(
             (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), "base_link"
         )
-
-
-@pytest.mark.parametrize(
-    ("message", "type_name"),
-    [
-        (bags.make("std_msgs/msg/String", data="x"), "std_msgs/msg/String"),
-        (bags.twist(1.0, 0.0), "geometry_msgs/msg/Twist"),
-        (SimpleNamespace(position=[1.0, 2.0]), "custom_msgs/msg/Joints"),
-        ({"position": {"x": "1", "y": 2, "z": 3}}, "json"),
-        ([1, 2], "json"),
-        (None, "json"),
-    ],
-)
-def test_what_carries_no_pose_has_none(message: object, type_name: str) -> None:
-    assert EXTRACTOR.pose(message, type_name) is None
-
-
-def test_a_point_is_a_pose_without_orientation() -> None:
-    point = bags.make(
-        "geometry_msgs/msg/PointStamped", header=bags.header(NS, "map"), point=bags.point(1.0, 2.0)
-    )
-    assert EXTRACTOR.pose(point, "geometry_msgs/msg/PointStamped") == Pose(
-        (1.0, 2.0, 0.0), None, "map"
-    )
 
 
 def tf_message(*transforms: object) -> object:

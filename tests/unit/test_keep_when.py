@@ -14,7 +14,6 @@ from ros2_memory.core.errors import ConfigError
 if TYPE_CHECKING:
     from ros2_memory.triggers.rules import Rule
 
-S: Final = 10**9
 ROOT: Final = Path(__file__).resolve().parents[2]
 BUMPER: Final = "topic: /bumper, condition_type: equals, value: true"
 
@@ -45,14 +44,6 @@ def test_the_ready_rules_are_valid_and_none_is_on(tmp_path: Path) -> None:
         "odometry silent"
     ]
     assert sum(each.max_bytes for each in ready) <= 10**9
-
-
-def test_a_rule_has_what_its_file_says(tmp_path: Path) -> None:
-    [rule] = rules(tmp_path, f"rules: {{a: {{{BUMPER}, for_s: 2.5, before_s: 7, max_gb: 0.2}}}}")
-    assert (rule.hold, rule.before, rule.after) == (2 * S + S // 2, 7 * S, 30 * S)
-    assert (rule.label, rule.max_bytes, rule.max_per_hour) == ("a", 200_000_000, 6)
-    assert rule.condition is not None
-    assert rule.condition.matches({"value": True})
 
 
 @pytest.mark.parametrize(

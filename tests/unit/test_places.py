@@ -36,10 +36,6 @@ def test_each_place_is_a_circle_a_rectangle_or_a_polygon(tmp_path: Path) -> None
     )
 
 
-def test_the_file_that_is_shipped_names_no_place() -> None:
-    assert places_of(load_settings([])) == ()
-
-
 @pytest.mark.parametrize(
     "shape",
     [
@@ -57,8 +53,3 @@ def test_the_file_that_is_shipped_names_no_place() -> None:
 def test_what_is_no_shape_is_refused(tmp_path: Path, shape: str) -> None:
     with pytest.raises(ConfigError, match="places"):
         places(tmp_path, f"places: {{dock: {shape}}}\n")
-
-
-def test_a_file_that_is_missing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"data\.places_file"):
-        places_of(load_settings([f"data.places_file={tmp_path / 'none.yaml'}"]))

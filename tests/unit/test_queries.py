@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,19 +14,16 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.bags import (
     Msg,
     boolean,
     command,
     detections,
     odom,
-    text,
     tf,
     transform,
     write_mcap,
 )
-from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
@@ -57,17 +53,6 @@ def test_what_no_value_can_meet_is_refused_and_not_answered_with_never(
     write_mcap(tmp_path / "a" / "a_0.mcap", [boolean(T0, True), odom(T0, 1.0, 0.0)])
     with pytest.raises(InvalidArgumentsError, match=topic):
         queries.find_last_match(memory_of(tmp_path), Call(), topic, kind, value, field=field)
-
-
-def test_a_glob_is_refused_only_where_none_of_its_topics_can_meet_the_condition(
-    tmp_path: Path,
-) -> None:
-    write_mcap(tmp_path / "a" / "a_0.mcap", [detections(T0, ["cup"]), text(T0, "a", "/vision/log")])
-    answer = queries.find_last_match(
-        memory_of(tmp_path), Call(), "/vision/*", "equals", "knife", field="detections.label"
-    )
-    assert answer.found is None
-    assert answer.notes == ()
 
 
 def test_nothing_seen_in_the_newest_message_does_not_make_a_field_unknown(tmp_path: Path) -> None:
@@ -126,31 +111,6 @@ def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: P
     ]
 
 
-def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "a" / "a_0.mcap", [odom(T0, 0, 0)])
-
-    class Counting(SettableClock):
-        reads = 0
-
-        def now(self) -> int:
-            Counting.reads += 1
-            return super().now()
-
-    memory = memory_of(tmp_path)
-    counted = type(memory)(
-        memory.index,
-        memory.reader,
-        memory.extractor,
-        Counting(T0 + 9 * S),
-        memory.limits,
-        memory.scanner,
-    )
-    answer = queries.find_last_match(counted, Call(), "/odom", "near_position", {"x": 0, "y": 0})
-    assert answer.found is not None
-    assert answer.found.age == 9 * S
-    assert Counting.reads == 1
-
-
 @pytest.mark.parametrize(
     ("at", "reason"),
     [
@@ -181,18 +141,6 @@ def test_why_there_is_no_transform_is_reported_of_the_whole_memory(
         )
     assert caught.value.reason == reason
     assert "tolerance_s" not in caught.value.detail
-
-
-def test_what_is_listed_reaches_to_the_bag_that_closed_last(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "a" / "a_0.mcap", [odom(T0, 0, 0)])
-    patient = memory_of(tmp_path)
-    index = IndexManager(
-        tmp_path, patient.reader, patient.clock, refresh_s=3600.0, split_duration_s=10.0
-    )
-    memory = replace(patient, index=index)
-    assert [row.count for row in queries.list_recorded_topics(memory, Call())] == [1]
-    write_mcap(tmp_path / "b" / "b_0.mcap", [odom(T0 + 60 * S, 0, 0), boolean(T0 + 60 * S, True)])
-    assert [row.count for row in queries.list_recorded_topics(memory, Call())] == [1, 2]
 
 
 def test_without_a_bag_directory_it_is_not_reported_that_nothing_was_recorded(

@@ -211,10 +211,6 @@ def test_near_is_within_the_tolerance_in_the_plane(
     assert near == (distance_m < tolerance_m)
 
 
-def test_a_position_at_the_tolerance_is_near() -> None:
-    assert Condition(NearPosition(1.0, 2.0, None, 5.0)).matches({"x": 4.0, "y": 6.0})
-
-
 ONE_TWO, OTHER = {"x": 1.0, "y": 2.0}, {"x": 9.0, "y": 9.0}
 BAD = (None, math.nan, math.inf)
 

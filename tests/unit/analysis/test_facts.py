@@ -63,11 +63,6 @@ def test_a_charge_that_is_not_known_is_no_fact(charge: JsonValue) -> None:
     assert Word(CHARGE) not in stated({"percentage": charge}, BATTERY)
 
 
-@pytest.mark.parametrize(("charge", "below"), [(0.199, 1), (0.2, None), (0.219, None), (0.221, 0)])
-def test_a_charge_just_above_a_limit_says_nothing_of_it(charge: float, below: int | None) -> None:
-    assert stated({"percentage": charge}, BATTERY).get(Word(CHARGE)) == below
-
-
 @pytest.mark.parametrize(
     ("reported", "charge"), [(1.0, 1.0), (1.02, 1.0), (1.5, 0.015), (80.0, 0.8)]
 )

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,7 +17,7 @@ from ros2_memory.analysis.intervals import (
     united,
     visible_in,
 )
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S
 
 Messages = list[tuple[int, tuple[str, ...]]]
 
@@ -125,63 +124,6 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
             assert own[at].first <= one.first
 
 
-def test_the_longest_intervals_remain_in_order_with_the_labels_that_they_need() -> None:
-    late = 40 * NS_PER_S
-    seen = watched(
-        [(0, ("b",)), (1, ("b",)), (20 * NS_PER_S, ("a",)), (late, ("c",)), (late + 1, ("c",))]
-    ).visible
-    assert seen.labels == ("a", "b", "c")
-    kept = seen.most_lasting(2)
-    assert kept.labels == ("b", "c")
-    assert kept.intervals() == (
-        VisibleInterval("b", 0, 1),
-        VisibleInterval("c", late, late + 1),
-    )
-    assert [each.label for each in seen.most_lasting(1).intervals()] == ["b"]
-    assert seen.most_lasting(3) is seen
-
-
-def each_s(begin: float, end: float, period: float, *labels: str) -> Messages:
-    return [
-        (round((begin + n * period) * NS_PER_S), labels) for n in range(int((end - begin) / period))
-    ]
-
-
-@pytest.mark.parametrize(
-    ("messages", "is_seen"),
-    [
-        (each_s(0, 65, 0.2, "a"), True),
-        (each_s(0.5, 64.5, 0.2, "a"), True),
-        (each_s(0, 66, 3, "a"), True),
-        (each_s(12, 17, 0.2, "a"), False),
-        (each_s(2, 65, 0.2, "a"), False),
-        (each_s(0, 63, 0.2, "a"), False),
-        (each_s(0, 30, 0.2, "a") + each_s(32, 65, 0.2, "a"), False),
-        (each_s(0, 30, 0.2, "a") + each_s(30.6, 65, 0.2, "a"), True),
-        (each_s(0, 30, 0.2, "a") + each_s(30, 32, 0.2) + each_s(32, 65, 0.2, "a"), False),
-        (each_s(0, 65, 0.2, "b"), False),
-        (each_s(30, 31, 1, "a"), False),
-    ],
-)
-def test_a_thing_is_seen_throughout_where_it_is_seen_at_the_usual_rate(
-    messages: Messages, is_seen: bool
-) -> None:
-    seen = watched(messages).visible
-    assert ("a" in seen.throughout(0, 65 * NS_PER_S)) is is_seen
-    half = len(messages) // 2 or 1
-    parts = [watched(part) for part in (messages[:half], messages[half:]) if part]
-    assert ("a" in joined(parts).visible.throughout(0, 65 * NS_PER_S)) is is_seen
-
-
-def test_a_thing_that_is_not_seen_any_more_is_not_there_still() -> None:
-    messages = each_s(0, 20, 0.2, "a")
-    last = messages[-1][0]
-    seen = watched(messages).visible
-    assert seen.at_end(last, last + NS_PER_S) == ["a"]
-    assert seen.at_end(last, last + 2 * NS_PER_S) == []
-    assert seen.at_end(last - 1, last) == []
-
-
 @given(histories())
 def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
     messages: Messages,
@@ -193,12 +135,6 @@ def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
         usual = (times[-1] - times[0]) / max(1, len(times) - 1)
         edges = [start, *times, end]
         assert max(b - a for a, b in pairwise(edges)) <= max(NS_PER_S, 3 * usual)
-
-
-def test_times_at_either_end_of_the_range_are_far_apart() -> None:
-    ends = [watched([(time, ("a",))]) for time in (MIN_NS, MAX_NS)]
-    assert joined(ends).visible.size == 2
-    assert united([each.visible for each in ends]).size == 2
 
 
 @given(

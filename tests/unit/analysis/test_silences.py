@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.silences import (
-    LONGEST_OFF_NS,
     SHORTEST_NS,
     Pacing,
     Silence,
@@ -109,47 +108,6 @@ def test_a_topic_is_silent_while_others_are_heard(
     odom: Activity, seen: Activity, expected: tuple[int, int, int] | None
 ) -> None:
     assert found(odom=odom, seen=seen) == ([] if expected is None else [Silence(SEEN, *expected)])
-
-
-def test_a_short_outage_of_the_recorder_is_no_part_of_a_silence() -> None:
-    activities = {
-        ODOM: heard((0, 99 * S), (128 * S, 200 * S)),
-        SEEN: heard((0, 98 * S), (129 * S, 200 * S)),
-    }
-    [silence] = silences_of(activities, [activities])
-    assert silence.length == 31 * S
-    gap = (99 * S, 128 * S)
-    assert silences_of(activities, [activities], [gap]) == []
-    # What is silent before and after it is so in all.
-    activities[SEEN] = heard((0, 80 * S), (150 * S, 200 * S))
-    [silence] = silences_of(activities, [activities], [(0, S), gap, (180 * S, 190 * S)])
-    assert (silence.start, silence.end, silence.length) == (80 * S, 150 * S, 41 * S)
-
-
-def test_no_silence_goes_on_behind_a_gap_after_which_another_robot_may_be_recorded() -> None:
-    later = 9 * HOUR + LONGEST_OFF_NS
-    for gap, goes_on in ((0, True), (1, False)):
-        odom = heard((0, 9 * HOUR), (later + gap, later + 5 * HOUR))
-        assert [each.goes_on for each in found(odom=odom, seen=heard((0, HOUR)))] == [goes_on]
-        # It fell silent when all else did: nothing shows that it should be heard later.
-        whole = found(odom=odom, seen=heard((0, 9 * HOUR)))
-        assert [each.length for each in whole] == ([5 * HOUR] if goes_on else [])
-
-
-def test_the_topics_of_another_robot_do_not_make_this_one_silent() -> None:
-    activities = {
-        "/a/odom": heard((0, HOUR)),
-        "/a/seen": heard((0, HOUR)),
-        "/b/odom": heard((0, 9 * HOUR)),
-        "/b/seen": heard((0, 9 * HOUR)),
-    }
-    assert silences_of(activities, [("/a/odom", "/a/seen"), ("/b/odom", "/b/seen")]) == []
-
-
-def test_one_of_many_topics_does_not_show_that_the_robot_is_on() -> None:
-    many = {f"/{name}": heard((0, HOUR), (5 * HOUR, 9 * HOUR)) for name in "abcde"}
-    activities = {**many, "/battery": heard((0, 9 * HOUR))}
-    assert silences_of(activities, [activities]) == []
 
 
 def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:

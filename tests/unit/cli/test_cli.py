@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,7 +11,6 @@ import yaml
 
 from ros2_memory import cli
 from ros2_memory.cli.app import COMMANDS, epilog
-from ros2_memory.cli.ask import complete
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
 from tests.support.housekeepers import later, recording_now
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
     from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
-Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(autouse=True)
@@ -41,38 +38,6 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class TestAsk:
-    def test_a_time_that_a_command_or_a_reply_prints_finds_its_message_when_pasted_back(
-        self, bag_dir: Path, exits: Program
-    ) -> None:
-        newest = T0 + 7200 * NS_PER_S + 745_616_123
-        messages = [odom(newest - 600_000, 6.0, 0.0), odom(newest, 7.0, 0.0)]
-        write_mcap(bag_dir / "rec" / "rec_9.mcap", messages)
-
-        def position(timestamp: str) -> float:
-            x: float = exits(0, f"ask get_position_at timestamp={timestamp} --json").json["x"]
-            return x
-
-        times = [exits(0, f"cat /odom --start {newest / NS_PER_S}").out.split()[0]]
-        times.append(exits(0, "ask data_time_range --json").json["latest_local"])
-        shown = exits(0, "ask get_position_seconds_ago seconds_ago=0").out
-        times += re.findall(r"20\d\d-\S+", shown)
-        assert len(times) >= 3
-        for time in (*times, times[0][: -len("616")]):
-            assert position(time) == 7.0, time
-        for time in times:
-            assert "7" in exits(0, f"cat /odom --end {time}").out.splitlines()[-1]
-        assert position(f"{newest / NS_PER_S - 0.0003:.6f}") == 6.0
-
-    def test_a_window_up_to_the_newest_time_has_no_note_on_the_end(
-        self, bag_dir: Path, exits: Program
-    ) -> None:
-        newest = T0 + 7200 * NS_PER_S + 745_616_123
-        write_mcap(bag_dir / "rec" / "rec_9.mcap", [odom(newest, 7.0, 0.0)])
-        latest = exits(0, "ask data_time_range --json").json["latest"]
-        window = f"ask get_topic_in_range --json topic=/odom start={latest - 1}"
-        assert "the memory ends" not in exits(0, f"{window} end={latest}").out
-        assert "the memory ends at" in exits(0, f"{window} end={latest + 2e-6:.6f}").out
-
     def test_what_was_recorded_cannot_command_the_terminal(self, exits: Program) -> None:
         shown = exits(0, "ask get_topic_in_last topic=/chatter seconds=4000").out
         assert "\x1b" not in shown
@@ -85,30 +50,8 @@ class TestAsk:
     def test_without_a_name_the_tools_are_listed_with_their_arguments(self, exits: Program) -> None:
         assert "seconds_ago, topic?, tolerance_s?" in exits(0, "ask").out
 
-    def test_shells_complete_its_tools(self) -> None:
-        assert complete("get_pos") == ["get_position_at", "get_position_seconds_ago"]
-
-
-class TestTopics:
-    def test_rates_do_not_count_the_time_between_bags(self, exits: Program) -> None:
-        rows = {row["topic"]: row for row in exits(0, "topics --json").json}
-        assert rows["/odom"]["rate_hz"] == pytest.approx(10.0)
-        assert rows["/odom"]["count"] == 200
-        assert rows["/chatter"]["rate_hz"] is None
-
 
 class TestInfo:
-    def test_it_shows_the_range_the_gaps_and_the_bags(self, bag_dir: Path, exits: Program) -> None:
-        # Far from where it was: the hour before it was no step of the clock.
-        messages = [odom(T0 + (7200 + n) * NS_PER_S, 500.0, float(n)) for n in range(20)]
-        write_mcap(bag_dir / "rec" / "rec_2.mcap", messages)
-        output = exits(0, "info --json").json
-        assert output["data_time_range"]["earliest"] == 1_700_000_000.0
-        assert output["data_time_range"]["bags"] == 3
-        assert len(output["data_time_range"]["clock_steps"]) == 1
-        assert len(output["data_time_range"]["gaps"]) == 1
-        assert output["memory_status"]["budget"]["max_gb"] is None
-
     def test_where_something_is_it_says_for_how_long_the_budget_lasts(
         self, bag_dir: Path, exits: Program
     ) -> None:

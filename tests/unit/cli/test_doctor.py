@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     Examined = Callable[..., dict[str, list[dict[str, str]]]]
 
-Capture = pytest.CaptureFixture[str]
-
 
 class Answering(BaseHTTPRequestHandler):
     """What stands for the server's `/health`."""
@@ -109,12 +107,6 @@ def examined(exits: Program) -> Examined:
         return wrong
 
     return run
-
-
-def test_where_all_is_well_people_read_a_line_for_each_concern(robot: Path, exits: Program) -> None:
-    output = [line.split()[:2] for line in exits(0, "doctor").out.splitlines()]
-    about = ["config", "bag_dir", "disk", "clock", "bags", "ros", "recorder", "topics"]
-    assert output == [["ok", each] for each in [*about, "server"]]
 
 
 def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
@@ -248,14 +240,6 @@ def lay(robot: Path, name: str, content: bytes) -> None:
     path.parent.mkdir()
     path.write_bytes(content)
     left(path)
-
-
-def test_bags_that_a_crash_cut_lead_to_recover(robot: Path, examined: Examined) -> None:
-    whole = (robot / "rec" / "rec_0.mcap").read_bytes()
-    for name, content in (("cut", whole[: len(whole) // 2]), ("empty", b""), ("begun", whole[:40])):
-        lay(robot, name, content)
-    wrong = examined(1)
-    assert wrong["bags"][0]["do"] == f"ros2-memory recover {robot}"
 
 
 def test_recover_is_not_advised_for_files_that_it_refuses(robot: Path, examined: Examined) -> None:

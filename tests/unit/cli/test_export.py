@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 from collections import Counter
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
 
 T0 = 1_700_000_000 * NS_PER_S
 NOW = datetime.fromisoformat("2023-11-14T20:00:00").timestamp()
-Capture = pytest.CaptureFixture[str]
 EMPTY = "std_msgs/msg/Empty"
 Row = tuple[str, int, bytes]
 
@@ -104,37 +102,6 @@ def things(writer: McapFile) -> None:
 
 
 class TestMcap:
-    def test_plain_rosbags_reads_the_very_messages_of_the_window(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        out, begin = tmp_path / "out.mcap", T0 / NS_PER_S
-        shown = exits(0, f"export --mcap {out} --start {begin + 2} --end {begin + 5}").out
-        source = read(bag_dir / "rec_0" / "rec_0_0.mcap")
-        wanted = [row for row in source if T0 + 2 * NS_PER_S <= row[1] <= T0 + 5 * NS_PER_S]
-        assert read(out) == wanted
-        assert len(wanted) == 35
-        assert "35 messages" in shown
-
-    def test_what_latched_messages_held_at_the_start_comes_along_unless_it_is_refused(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        mounts = [
-            tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
-            for at, child, x in (
-                (T0, "laser", 0.1),
-                (T0 + 1, "camera", 0.2),
-                (T0 + 2, "laser", 0.3),
-            )
-        ]
-        write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [*mounts, *driven(T0 + 3, 0)])
-        window = f"export --start {T0 / NS_PER_S + 5} --end {T0 / NS_PER_S + 6}"
-        exits(0, f"{window} --mcap {tmp_path}/without.mcap --no-latched")
-        err = exits(0, f"{window} --mcap {tmp_path}/with.mcap").err
-        assert "2 latched messages are copied from before the window" in err
-        first, second, *rest = read(tmp_path / "with.mcap")
-        assert [row[:2] for row in (first, second)] == [("/tf_static", T0 + n) for n in (1, 2)]
-        assert rest == read(tmp_path / "without.mcap")
-
     def test_that_nothing_but_latched_messages_of_before_was_found_is_reported(
         self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
@@ -234,15 +201,6 @@ class TestMcap:
             export_mcap(folder / "out.mcap", interrupted())
         assert [*folder.iterdir()] == []
 
-    def test_a_file_of_the_window_that_is_not_read_at_all_is_reported_and_the_exit_code_is_1(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        source = bag_dir / "rec_0" / "rec_0_0.mcap"
-        source.write_bytes(b"no MCAP file")
-        at = T0 / NS_PER_S + 10
-        os.utime(source, (at, at))
-        assert "rec_0_0.mcap" in exits(1, f"export --mcap {tmp_path}/out.mcap").err
-
 
 class TestParquet:
     def test_duckdb_computes_the_way_that_trajectory_summary_reports(
@@ -264,30 +222,6 @@ class TestParquet:
         )
         assert length == pytest.approx(told, abs=1e-3)
         assert told > 4
-
-    def test_stamps_of_headers_are_there_to_the_nanosecond(
-        self, tmp_path: Path, exits: Program
-    ) -> None:
-        poses = [odom(T0 + n, 0.0, 0.0, log_time=T0 + n * NS_PER_S) for n in range(3)]
-        write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*poses, text(T0 + 9, "no header")])
-        exits(0, f"export --parquet {tmp_path}/rows {tmp_path}/bags")
-        found = queried(
-            tmp_path / "rows", "SELECT topic, epoch_ns(header_stamp) FROM memory ORDER BY log_time"
-        )
-        stamps = [("/odom", T0), ("/chatter", None), ("/odom", T0 + 1), ("/odom", T0 + 2)]
-        assert [*found] == stamps
-
-    def test_times_are_exact_and_values_are_json(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        which = f"--robot r2 --topic /chatter --end {T0 / NS_PER_S}"
-        exits(0, f"export --parquet {tmp_path}/rows {which}")
-        rows = queried(
-            tmp_path / "rows",
-            "SELECT robot, type, epoch_ns(log_time), epoch_ns(publish_time), value->>'value', x "
-            "FROM memory",
-        )
-        assert rows == [("r2", "std_msgs/msg/String", T0, T0, "word 0 0 ü", None)]
 
     def test_what_cannot_be_decoded_has_a_row_that_says_why(
         self, tmp_path: Path, exits: Program

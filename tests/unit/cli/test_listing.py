@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import os
 import re
 import shutil
@@ -22,7 +21,7 @@ from hypothesis import strategies as st
 from ros2_memory import cli
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.cli.ask import with_times
-from ros2_memory.cli.options import LOOKING, parse_end, parse_time, settings_to_look
+from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
     from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
-Capture = pytest.CaptureFixture[str]
 
 
 def seconds(first: int, count: int, x: float = 0.0) -> list[Msg]:
@@ -150,16 +148,6 @@ class TestPaths:
         assert ": 1 unfinished bag" in shown
         assert [len(row["notes"]) for row in exits(0, "topics . --json").json] == [1, 1]
 
-    def test_bags_of_others_need_no_recorder_and_no_preset(
-        self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        findings = exits(0, "doctor a --json").json["findings"]
-        seen = {finding["about"]: finding["seen"] for finding in findings}
-        assert "recorder=none" in seen["recorder"]
-        assert "ros" not in seen
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-        assert exits(0, "ask get_position_seconds_ago seconds_ago=0 --json").json["age_s"] == 0
-
     def test_a_deployment_that_records_there_is_looked_at_as_it_is(
         self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -195,16 +183,6 @@ class TestRecordings:
     def rows(self, exits: Program, *words: str) -> dict[str, dict[str, JsonValue]]:
         found = exits(0, "recordings . --json", *words).json
         return {row["recording"]: row for row in found if "recording" in row}
-
-    def test_folders_are_recordings_and_so_are_files_that_lie_loose(
-        self, folder: Path, exits: Program
-    ) -> None:
-        rows = self.rows(exits)
-        bags = {name: row["bags"] for name, row in rows.items()}
-        assert bags == {"a": 2, "b": 1, "loose/red": 1, "loose/blue": 1}
-        keys = ("start", "end", "length_s", "messages", "topics", "storage")
-        start_s = 1_700_000_000.0
-        assert [rows["a"][key] for key in keys] == [start_s, start_s + 9.0, 9.0, 11, 2, "mcap"]
 
     def test_it_says_whose_they_are_and_names_what_is_not_read(
         self, folder: Path, exits: Program
@@ -260,15 +238,6 @@ class TestRecordings:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
 
 
-def test_a_path_elsewhere_is_looked_at_whatever_the_environment_deploys(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder / "a"))
-    assert settings_to_look(None, [str(folder)]) == (folder, [*LOOKING])
-    assert settings_to_look(None, [str(folder / "a")]) == (folder / "a", [])
-
-
 class TestCat:
     @pytest.mark.parametrize("option", ["--csv", "--json"])
     def test_no_text_commands_a_terminal(
@@ -287,16 +256,6 @@ class TestCat:
         monkeypatch.setattr(sys, "stdout", TextIOWrapper(written, encoding="ascii"))
         assert cli.main(["cat", "/speech", str(tmp_path)]) == 0
         assert written.getvalue().endswith(b"  k\\xfcche\n")
-
-    def test_json_lines_are_whole_and_strict(self, tmp_path: Path, exits: Program) -> None:
-        messages = [odom(T0 + 1, math.nan, 0.123456789), odom(T0 + 2, 1.0, 2.0)]
-        write_mcap(tmp_path / "r" / "r_0.mcap", messages)
-        first, second = (
-            json.loads(line, parse_constant=pytest.fail)
-            for line in exits(0, f"cat /odom {tmp_path} --json").out.splitlines()
-        )
-        assert (first["time_ns"], second["time_ns"]) == (T0 + 1, T0 + 2)
-        assert first["value"]["position"] == {"x": None, "y": 0.123456789, "z": 0.0}
 
     def test_csv_has_a_column_for_each_field(self, folder: Path, exits: Program) -> None:
         words = ("--csv", "--field", "position.y", "--field", "header.frame_id")
@@ -405,13 +364,6 @@ def test_every_command_prints_json(
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
     code = 1 if line.startswith("forget") else 0  # bags of others stay
     assert exits(code, line, "--json").json
-
-
-def test_a_window_that_ends_with_a_date_has_all_of_that_day() -> None:
-    start = parse_time("2026-11-20", 0)
-    assert parse_end("2026-11-20", 0, start) == pytest.approx(parse_time("2026-11-21", 0))
-    assert parse_end("2026-11-20T09:00", 0, start) == parse_time("2026-11-20T09:00", 0)
-    assert parse_end("1784023260", 0, start) == 1784023260
 
 
 def test_a_date_without_dashes_is_no_second_of_1970() -> None:

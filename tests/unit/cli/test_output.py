@@ -58,12 +58,6 @@ def test_a_moment_has_its_local_time_and_its_age(shown: Shown) -> None:
     assert f"{format_time(T0 + 60)} (in 60.0 s)" in output
 
 
-def test_moments_in_notes_are_local_times(shown: Shown) -> None:
-    output = shown({"notes": [f"the memory ends at {T0:.6f}", "2 of 1300000000 samples"]})
-    assert f"the memory ends at {format_time(T0)}" in output
-    assert "1300000000 samples" in output
-
-
 def test_long_times_are_in_a_unit_that_suits_them(shown: Shown) -> None:
     rows: JsonValue = [{"topic": "/a", "ago_s": 186_462_260.5}, {"topic": "/b", "ago_s": 12.25}]
     output = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()

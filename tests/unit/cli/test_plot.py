@@ -9,14 +9,13 @@ import sys
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, battery, boolean, make, odom, text, write_mcap
+from tests.support.bags import battery, boolean, odom, text, write_mcap
 from tests.support.memories import memory_of
 
 pytest.importorskip("matplotlib", reason="needs the extra plot")
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
-Capture = pytest.CaptureFixture[str]
 S = NS_PER_S
 
 
@@ -115,26 +113,6 @@ def test_each_is_a_picture_of_the_asked_kind(
     assert ET.parse(drawn).getroot().tag.endswith("svg")  # noqa: S314 - written just now
 
 
-def test_the_path_is_that_of_the_poses(bags: Path) -> None:
-    frame, path = asked_in(bags).path()
-    assert (frame, path.x[0], path.y[0]) == ("odom", 0.0, 0.0)
-    assert (path.x[-1], path.y[-1]) == (10.0, 9.8)
-    assert np.interp(1_700_000_005.0, path.times / S, path.x) == pytest.approx(5.0, abs=0.06)
-    assert np.count_nonzero(path.begins) == 2  # nothing was recorded in between
-
-
-def test_a_curve_is_drawn_to_the_millimetre(tmp_path: Path) -> None:
-    turns = [n * math.tau / 100 for n in range(101)]
-    circle = [
-        odom(T0 + n * S // 10, 2 * math.sin(turn), 2 - 2 * math.cos(turn))
-        for n, turn in enumerate(turns)
-    ]
-    write_mcap(tmp_path / "bag.mcap", circle)
-    _, path = asked_in(tmp_path).path()
-    middles = [(column[1:] + column[:-1]) / 2 for column in (path.x, path.y)]
-    assert np.hypot(middles[0], middles[1] - 2) == pytest.approx(2, abs=4e-3)
-
-
 def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> None:
     signals, _ = plot.signals_of(asked_in(bags), "/battery_state", ["percentage"])
     _, charge = signals["percentage"]
@@ -200,15 +178,3 @@ def test_without_the_extra_it_names_the_command_that_installs_it(
 ) -> None:
     monkeypatch.setattr("ros2_memory.bootstrap.find_spec", lambda name: None)
     assert "pip install '.[plot]'" in exits(2, f"plot path {bags} --out {tmp_path}/a.svg").err
-
-
-def test_a_field_that_is_not_known_at_first_is_drawn(tmp_path: Path) -> None:
-    kind = "std_msgs/msg/Float32"
-    values = [math.nan, *range(20, 40)]
-    messages = [
-        Msg("/f", kind, T0 + nth * NS_PER_S, make(kind, data=float(each)))
-        for nth, each in enumerate(values)
-    ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    signals, _ = plot.signals_of(asked_in(tmp_path), "/f", ())
-    assert [len(drawn) for _, drawn in signals.values()] == [len(values)]

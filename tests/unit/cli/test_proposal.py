@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-import yaml
 
 from ros2_memory.cli.proposal import (
     Choice,
@@ -15,12 +14,10 @@ from ros2_memory.cli.proposal import (
     chosen,
     judge,
     propose,
-    topics_yaml,
 )
-from ros2_memory.recorder.process.topics import load_topics
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    pass
 
 DISK = Disk(
     ratio=0.5,
@@ -143,17 +140,3 @@ def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> Non
     assert chosen(left, Choice.RECORD) == [ODOM]
     assert left[SCAN].choice is Choice.LEAVE
     assert left[SCAN].reason == "70% of a list of which the budget would hold 0.9 days"
-
-
-def test_the_file_lists_what_is_proposed_and_has_the_rest_to_tick(tmp_path: Path) -> None:
-    speech, camera = Offered("/speech", "std_msgs/msg/String"), Offered("/c", "a/msg/Image")
-    text = topics_yaml(propose([camera, ODOM, speech], DISK), "about 1 MB a day")
-    assert text.splitlines() == [
-        "# Proposed by `ros2-memory up`, and yours to change: about 1 MB a day",
-        "topics:",
-        "  - /odom  # nav_msgs/msg/Odometry",
-        "  # - /speech  # std_msgs/msg/String: what people said",
-    ]
-    assert yaml.safe_load(text) == {"topics": ["/odom"]}
-    (tmp_path / "topics.yaml").write_text(text)
-    assert load_topics(tmp_path / "topics.yaml").entries == ("/odom",)

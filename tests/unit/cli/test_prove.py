@@ -85,20 +85,6 @@ def test_types_without_a_definition_are_named_and_exit_1_where_the_answer_rests_
         assert "nobody_msgs/msg/Knows has no definition" in err
 
 
-def test_topics_of_other_recordings_are_left_out(tmp_path: Path, exits: Program) -> None:
-    for nth in range(4):
-        at = BEGIN + nth * DAY_S * S
-        word = text(at, f"word {nth}", topic=f"/chatter_{nth}")
-        odd = Msg("/odd", "nobody_msgs/msg/Knows", at + S, b"\0\1\0\0\0")
-        own = tmp_path / "bags" / f"rec_{nth}"
-        layout = McapLayout(definitions=False)
-        write_mcap(own / "rec_0.mcap", [word, odd] if nth in {1, 2} else [word], layout)
-    proof = tmp_path / "proof.mcap"
-    question = f"get_topic_at_time topic=/chatter_1 timestamp={BEGIN // S + DAY_S}"
-    assert "Knows" not in exits(0, "prove", question, "-o", proof, tmp_path / "bags").err
-    assert [topic for topic, *_ in messages(proof)] == ["/chatter_0", "/chatter_1", "/chatter_3"]
-
-
 def test_what_lay_between_recordings_needs_a_folder(
     two_days: Path, tmp_path: Path, exits: Program
 ) -> None:
@@ -112,13 +98,6 @@ def test_what_lay_between_recordings_needs_a_folder(
     same = {"same": True, "differing": [], "beside": []}
     assert proved == {"path": str(folder), "messages": 201, **same}
     assert [each.name for each in sorted(folder.iterdir())] == ["rec_0", "rec_1"]
-
-
-def test_a_key_on_files_is_named_and_is_no_other_answer(
-    bags: Path, tmp_path: Path, exits: Program
-) -> None:
-    proved = exits(0, f"prove data_time_range -o {tmp_path}/proof.mcap {bags}")
-    assert "note: only the bags themselves give the same bags\n" in proved.err
 
 
 def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:

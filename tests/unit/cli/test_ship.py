@@ -54,14 +54,6 @@ def ship(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Pr
     return run
 
 
-def test_one_pass_ships_every_closed_bag(ship: Ship, tmp_path: Path) -> None:
-    done = ship(0).json
-    assert (done["bags"], done["waiting"], done["problems"]) == (4, 0, [])
-    labels = [label for name in ROBOTS for _, label in seeded(name).seen]
-    assert lake_column(tmp_path / "lake", "sightings", "label") == sorted(labels)
-    assert ship(0).json["bags"] == 0
-
-
 def test_what_a_batch_took_goes_back_to_the_c_library(tmp_path: Path) -> None:
     """Arrow's own heap kept it: after 1,300 bags `ship` had 1.4 GB, and more after each batch."""
     bag = write_bag(tmp_path / "robots" / "hall", 0)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, assessment
 from ros2_memory.core.timebase import NS_PER_S
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.support.program import Program
-
-Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(autouse=True)
@@ -120,15 +117,6 @@ def test_a_terminal_gets_a_table(tmp_path: Path) -> None:
     assert b"/odom" in shown
     assert b"usual_hz" in shown
     assert b"silent" in shown
-
-
-def test_restarts_and_topics_that_nobody_offers_are_reported(bag_dir: Path, exits: Program) -> None:
-    now, lost = time.time_ns(), ("/gone", "/lost")
-    beat = Heartbeat(1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, lost)
-    write_heartbeat(bag_dir, beat)
-    output = exits(0, "watch --count 1").out
-    assert re.search(r"recorder +recording (.*\n)+restarts +2 ", output)
-    assert "offered by no publisher: /gone, /lost" in output
 
 
 class TestOldData:

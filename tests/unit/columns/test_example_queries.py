@@ -59,14 +59,6 @@ def answer(file: Path, question: str) -> list[tuple[object, ...]]:
         return base.execute(query(question)).fetchall()
 
 
-def test_bags_that_are_stored(file: Path) -> None:
-    assert answer(file, "Which bags are stored?") == [
-        ("rec/rec_0.mcap", 2005, "2023-11-14 22:20:00"),
-        ("rec/rec_1.mcap", 2005, "2023-11-14 23:10:00"),
-        ("rec/rec_2.mcap", 2005, "2023-11-15 00:00:00"),
-    ]
-
-
 def test_columns_that_are_dropped(file: Path) -> None:
     assert answer(file, "Of which topics are columns dropped, and since when?") == [
         ("/odom", "2023-11-14 22:20:00", 3)

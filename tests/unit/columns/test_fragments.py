@@ -159,64 +159,6 @@ def test_fragments_shortly_before_one_are_remembered_with_it(world: World) -> No
     assert reading.get(keys[2]._replace(settings="other")) is None
 
 
-def test_another_process_finds_a_fragment_that_was_stored_after_it_looked(world: World) -> None:
-    store, key = world.store, FragmentKey(T0, "any", (part_of(world.store),))
-    one, other = words_in(store), words_in(store)
-    assert other.get(key) is None
-    one.put(key, Words("there"))
-    assert other.get(key) is None
-    one.write()
-    found = other.get(key)
-    assert found is not None
-    assert found.words == "there"
-
-
-def test_a_fragment_of_other_parts_settings_or_days_is_another(world: World) -> None:
-    part = part_of(world.store)
-    known = words_in(world.store)
-    known.put(FragmentKey(T0, "any", (part,)), Words("there"))
-    known.write()
-    for other in (
-        FragmentKey(T0, "any", ()),
-        FragmentKey(T0, "other", (part,)),
-        FragmentKey(T0 + S, "any", (part,)),
-    ):
-        assert words_in(world.store).get(other) is None
-    assert words_in(world.store, "else").get(FragmentKey(T0, "any", (part,))) is None
-
-
-def test_what_follows_from_more_parts_takes_the_place_of_what_followed_from_some(
-    tmp_path: Path,
-) -> None:
-    for number in range(3):
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(T0 + number * 60 * S, 0, 0)])
-    world = World.of(tmp_path)
-    world.fill_alone()
-    one, two, three = (head.number for head in world.store.parts("/odom"))
-    words = words_in(world.store)
-    others = FragmentKey(T0, "", (three,)), FragmentKey(T0, "other", (one,))
-    for key in (FragmentKey(T0, "", (one,)), *others, FragmentKey(T0, "", (one, two))):
-        words.put(key, Words(str(key.parts)))
-    words.write()
-    found = words_in(world.store)
-    assert found.get(FragmentKey(T0, "", (one,))) is None
-    for key in (*others, FragmentKey(T0, "", (one, two))):
-        stored = found.get(key)
-        assert stored is not None
-        assert stored.words == str(key.parts)
-
-
-def test_a_fragment_of_a_part_that_went_meanwhile_is_not_stored(
-    world: World, tmp_path: Path
-) -> None:
-    key = FragmentKey(T0, "any", (part_of(world.store),))
-    known = words_in(world.store)
-    known.put(key, Words("secret"))
-    world.store.delete(world.store.paths())
-    known.write()
-    assert fragments_in(store_file(tmp_path)) == 0
-
-
 @pytest.mark.parametrize("data", [b"\0", compressed(b"[]\n"), compressed(b"[0]"), b""])
 def test_a_damaged_fragment_is_made_again_and_takes_its_place(
     world: World, tmp_path: Path, data: bytes
@@ -239,23 +181,3 @@ def test_a_damaged_fragment_is_made_again_and_takes_its_place(
     again.memory.scanner.write_fragments()
     assert damaged() == 0
     assert fragments_in(store_file(tmp_path)) == before
-
-
-def test_of_a_long_backlog_no_fragment_is_dropped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Though it is of more than may wait to be written."""
-    for number in range(12):
-        start = T0 + number * 1800 * S
-        poses = [odom(start + n * 60 * S, number + n / 300, 0.1 * (n % 7)) for n in range(30)]
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", poses)
-    stored = []
-    for most in (20, 10_000):
-        monkeypatch.setattr("ros2_memory.columns.fragments._MOST_WAITING", most)
-        file = tmp_path / f"with_{most}.sqlite"
-        World.of(tmp_path, file=file).fill()
-        with closing(sqlite3.connect(file)) as base:
-            stored.append({*base.execute("SELECT kind, start_ns FROM fragment")})
-    few, many = stored
-    assert few == many
-    assert len(many) > 5 * 20

@@ -142,20 +142,6 @@ def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
         assert found(field="data.bytes")["value"] is not None
 
 
-def test_the_size_of_a_long_array_is_found_beside_a_list_of_names(tmp_path: Path) -> None:
-    kind = "acme_msgs/msg/NamedBytes"
-    typestore().register(get_types_from_msg("string[] names\nuint8[] data\n", kind))
-    for nth, size in enumerate((3, 500, 2)):
-        at, data = T0 + nth * NS_PER_S, np.full(size, 7, np.uint8)
-        message = Msg("/named", kind, at, make(kind, names=["left", "right"], data=data))
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", [message])
-    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
-        for field, value, nth in (("data.bytes", 100, 1), ("data.right", 6, 2)):
-            given = {"condition_type": "above", "value": value, "field": field}
-            match = asked(memory, tmp_path, "find_last_match", topic="/named", **given)
-            assert match["timestamp"] == T0 / NS_PER_S + nth
-
-
 @pytest.mark.parametrize("count", [3, MAX_NUMBERS, MAX_NUMBERS + 1])
 def test_a_joint_is_found_by_its_name_in_an_array_of_fixed_length(
     tmp_path: Path, count: int

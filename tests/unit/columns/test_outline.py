@@ -20,7 +20,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
-from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.fields import extremes_of
@@ -117,31 +116,3 @@ def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
         started = World.of(Path(folder))  # what it knows it has from the store
         for found, expected in zip(answers(started.memory, Random(seed)), plain, strict=True):
             assert found == expected
-
-
-def test_whole_parts_are_told_without_their_columns_and_without_bags(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_world(tmp_path, Random(1))
-    world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
-    world.fill()
-    span = TimeRange(T0 / S, T0 / S + 9000)
-
-    def by_weekday(memory: Memory) -> list[object]:
-        return [
-            numbers_by(memory, span, "weekday", "position.y"),
-            count_matches(memory, Call(), "/seen", "contains", "tasse", by="weekday"),
-        ]
-
-    expected = by_weekday(world.unstored().memory)
-    read: list[object] = []
-    tables = BagAccess.tables
-
-    def counted(self: BagAccess, bag: object, *args: object, **more: object) -> object:
-        read.append(bag)
-        return tables(self, bag, *args, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(BagAccess, "tables", counted)
-    assert by_weekday(world.memory) == expected
-    # Of some 85 bags those that hold an end of a number, or are in no whole part yet.
-    assert len(read) < 30

@@ -153,14 +153,6 @@ def test_texts_come_back_as_they_were(values: list[str]) -> None:
     assert back.codes.dtype == np.uint32
 
 
-def test_words_that_no_row_has_are_not_packed() -> None:
-    column = Texts(np.array([2, 0, 2], np.uint32), ("cup", "secret", "table"))
-    packed = pack(column)
-    assert b"secret" not in packed.data
-    assert packed.zone.words == "table\ncup"
-    assert unpacked(packed).values() == ["table", "cup", "table"]
-
-
 def test_a_zone_of_too_many_texts_keeps_the_letters_in_them() -> None:
     texts = [f'{{"label": "Größe {number}", "score": 0.{number}}}' for number in range(1000)]
     zone = pack(Texts.of(texts)).zone

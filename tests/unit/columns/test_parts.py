@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from ros2_memory.columns.layout import Layout, columns_in
+from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import decompressed, unpack
 from ros2_memory.columns.stored import lazy_columns
 from ros2_memory.columns.table import Column, Elements, Table, Texts, column_bytes, joined
@@ -59,40 +56,9 @@ def unpacked(*given: Table) -> Table:
     return replace(joined(given), columns=columns, elements=elements)
 
 
-def values(column: Column) -> list[object]:
-    return [*(column.values() if isinstance(column, Texts) else column.tolist())]
-
-
-def test_columns_come_back_where_they_were_of_one_table_and_of_several() -> None:
-    for given in ([table()], [table(40), table(60, 40), table(1, 99)]):
-        back = dict(columns_in(unpacked(*given)))
-        expected = dict(columns_in(joined(given)))
-        assert [*back] == [*expected]
-        for path, column in expected.items():
-            assert values(back[path]) == pytest.approx(values(column)), path
-
-
 def test_what_is_unpacked_of_a_constant_column_is_one_value() -> None:
     back = unpacked(table(rows=1000))
     assert column_bytes(back.columns["mode"]) == 1
     assert column_bytes(back.columns["header.frame_id"]) < 100
     assert column_bytes(back.columns["speed"]) == 8 * 1000
     assert back.columns["speed"] is back.columns["speed"]
-
-
-def test_a_table_is_freed_when_nobody_holds_it_without_the_garbage_collector() -> None:
-    """Each question opens thousands of them."""
-
-    def load(path: str) -> Column:
-        return loaded.pop(path)
-
-    loaded: dict[str, Column] = {"objects#": np.arange(3), "objects.label": Texts.of(["cup"] * 3)}
-    layout, loads = Layout.of(table(), None), weakref.ref(load)
-    gc.disable()
-    try:
-        back = lazy_columns(layout, load, ())
-        assert back[1]["objects"].columns["label"]
-        del back, load
-        assert loads() is None
-    finally:
-        gc.enable()

@@ -90,9 +90,3 @@ def test_poses_of_rounded_columns_are_the_same_bit_by_bit(type_name: str) -> Non
     assert rounded is not None
     assert np.array_equal(rounded.positions, whole.positions[some])
     assert rounded.frames.values() == whole.rows(some).frames.values()
-
-
-def test_a_table_without_columns_is_left_to_its_messages() -> None:
-    drawn = drawn_of("nav_msgs/msg/Path", [message("nav_msgs/msg/Path", random.Random(1))])
-    with pytest.raises(NoPoseError):
-        PoseColumns(EXTRACTOR).of(drawn.table, drawn.table.log_times, None)

@@ -5,16 +5,13 @@ from __future__ import annotations
 import os
 import sqlite3
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.columns.scanner import Caches, Scanner
 from ros2_memory.columns.units import GoneError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.history.view import View
@@ -24,7 +21,6 @@ from tests.support.column_worlds import EVERYTHING, World, check_rows, store_fil
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
-    from ros2_memory.columns.store import PartHead
     from ros2_memory.columns.zones import PartZones
 
 S = 10**9
@@ -58,18 +54,6 @@ def test_tables_come_in_the_order_of_time(tmp_path: Path, newest_first: bool) ->
     assert check_rows(world, "/odom", newest_first=newest_first) == 40
 
 
-def test_bags_that_are_not_stored_are_left_out_where_that_is_asked(tmp_path: Path) -> None:
-    cut(tmp_path, [10, 30, 31, 60])
-    world = World.of(tmp_path)
-    bags = world.memory.index.snapshot().timeline.bags
-    world.fill_alone(bags[:2])
-    expected = sum(bag.summary.of("/odom")[0].count for bag in bags[:2])
-    found = scan(View(world.memory, Call()), "/odom", EVERYTHING, stored=True)
-    assert sum(map(len, found)) == expected
-    without = replace(world.memory, scanner=Scanner(None, tmp_path))
-    assert [*scan(View(without, Call()), "/odom", EVERYTHING, stored=True)] == []
-
-
 def test_columns_of_a_bag_that_take_too_much_are_not_held_and_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,48 +67,6 @@ def test_columns_of_a_bag_that_take_too_much_are_not_held_and_it_is_read(
     assert sum(table.memory_bytes for table in tables) < most
     found = find_last_match(memory, Call(), "/chatter", "contains", "07a")
     assert (found.found and found.found.sample.time) == said[7].log_time
-
-
-def test_windows_of_hours_and_of_all_time_have_the_same_rows(tmp_path: Path) -> None:
-    apart = 1800 * S
-    cut(tmp_path, [9, 30, 31, 60], each=apart)  # twenty hours
-    world = World.of(tmp_path)
-    edges = [T0 + nth * apart + 1 for nth in range(-1, 44, 5)]
-    windows = [TimeWindow(*pair) for pair in pairwise(edges)]
-
-    def check(*, whole_first: bool = False) -> None:
-        if whole_first:
-            assert check_rows(world, "/odom") == 40
-        assert sum(check_rows(world, "/odom", window) for window in windows) == 40
-        assert check_rows(world, "/odom") == 40
-
-    world.fill_alone(world.memory.index.snapshot().timeline.bags[:2])
-    check()
-    world.fill()
-    check(whole_first=True)
-    [first, *_] = sorted(world.store.paths())
-    assert world.store.delete([first])
-    assert first not in world.store.paths()
-    check()
-
-
-def test_parts_that_another_process_makes_meanwhile_hide_no_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cut(tmp_path, [10, 30, 31, 60])
-    world, other = World.of(tmp_path), World.of(tmp_path)
-    world.fill_alone()
-    assert check_rows(world, "/odom") == 40
-    parts = world.store.parts
-
-    def after_a_merge(*asked: Any) -> list[PartHead]:
-        other.fill()
-        return parts(*asked)
-
-    world = replace(world, memory=replace(world.memory, scanner=Scanner(world.store, tmp_path)))
-    monkeypatch.setattr(world.store, "parts", after_a_merge)
-    assert check_rows(world, "/odom") == 40
-    assert world.store.unmerged() == frozenset()
 
 
 def test_a_file_that_is_replaced_while_a_scan_is_read_hides_no_row(tmp_path: Path) -> None:
@@ -175,11 +117,3 @@ def test_a_store_that_fails_while_it_is_asked_hides_no_row(
         assert check_rows(world, "/odom") == 40
     assert not failing
     assert check_rows(world, "/odom") == 40
-
-
-def test_what_is_remembered_of_any_kind_makes_room_for_the_newest() -> None:
-    caches = Caches.of(cache_mb=1)
-    caches.sights.put("older", b"", 700 << 10)
-    caches.namespace().fetched.put("newer", b"", 700 << 10)
-    assert caches.sights.get("older") is None
-    assert caches.read.get("newer") is None

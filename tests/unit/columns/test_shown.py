@@ -37,7 +37,6 @@ from tests.unit.columns.drawn_tables import (
     drawn_tables,
     message,
     paths_of,
-    stored,
 )
 
 if TYPE_CHECKING:
@@ -149,19 +148,6 @@ def test_numbers_of_a_field_are_those_of_each_message(drawn: Drawn, random: Rand
             assert own == pytest.approx(expected, abs=found.error, rel=0.0), field
 
 
-def test_numbers_state_the_error_of_rounded_columns() -> None:
-    random = Random(7)
-    drawn = drawn_of(ODOMETRY, [message(ODOMETRY, random, is_odd=False) for _ in range(20)])
-    table = stored(drawn.table, 0.01)
-    found = numbers(table, "position.x", EXTRACTOR)
-    exact = numbers(drawn.table, "position.x", EXTRACTOR)
-    assert found is not None
-    assert exact is not None
-    assert 0.0 < found.error <= 0.0050001
-    assert np.abs(found.numbers - exact.numbers).max() <= found.error
-    assert table.unpacked == {"pose.pose.position.x"}
-
-
 def test_numbers_of_arrays_that_are_not_held_are_left_to_the_bag() -> None:
     drawn = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))])
     assert numbers(drawn.table, "pose.covariance", EXTRACTOR) is None
@@ -229,12 +215,3 @@ def test_a_mapped_path_that_leads_into_times_is_left_to_the_bag() -> None:
     extractor = SchemaExtractor({ODOMETRY: {"second": "header.stamp.sec"}}, 50)
     table = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))]).table
     assert numbers(table, "second", extractor) is None
-
-
-def test_the_numbers_of_an_array_that_is_a_point_keep_their_order() -> None:
-    kind = "px4_msgs/msg/VehicleOdometry"
-    odometry = message(kind, Random(1), is_odd=False)
-    odometry.position = np.arange(1, 4, dtype=np.float32)  # type: ignore[attr-defined]
-    table = drawn_of(kind, [odometry]).table
-    read = [numbers(table, f"position.{axis}", EXTRACTOR) for axis in "xyz"]
-    assert [found.numbers.tolist() for found in read if found is not None] == [[1.0], [2.0], [3.0]]

@@ -17,7 +17,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history import sessions
 from ros2_memory.history.context import Call
-from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.scan import joined_back, open_scan
 from ros2_memory.history.scan import scan as scan_rows
 from ros2_memory.history.view import View
@@ -78,25 +77,6 @@ def starts_of_settled(world: World, window: TimeWindow = WINDOW) -> list[int]:
     return [one.window.start for one in stretches(world, window) if one.parts is not None][::-1]
 
 
-def joined_fragments(file: Path) -> int:
-    with closing(sqlite3.connect(file)) as base:
-        query = "SELECT count(*) FROM fragment WHERE kind LIKE '%-joined %'"
-        return int(base.execute(query).fetchone()[0])
-
-
-def test_stretches_are_all_of_the_window_and_those_of_whole_parts_have_these(world: World) -> None:
-    found = stretches(world)[::-1]
-    assert [found[0].window.start, found[-1].window.stop] == [WINDOW.start, WINDOW.stop]
-    assert all(one.window.stop == two.window.start for one, two in pairwise(found))
-    # The last one is not over.
-    assert starts_of_settled(world) == [T0 + n * LENGTH for n in range(4)]
-
-
-def test_a_stretch_that_the_window_cuts_is_none(world: World) -> None:
-    window = TimeWindow(T0 + 1, T0 + 4 * LENGTH - 1)
-    assert starts_of_settled(world, window) == [T0 + LENGTH, T0 + 2 * LENGTH]
-
-
 @pytest.mark.parametrize("how", ["gone", "changed"])
 def test_a_stretch_without_one_of_its_bags_is_none(copied: World, tmp_path: Path, how: str) -> None:
     assert len(starts_of_settled(copied)) == 4
@@ -107,21 +87,6 @@ def test_a_stretch_without_one_of_its_bags_is_none(copied: World, tmp_path: Path
         write_mcap(bag, [odom(T0 + 1301 * S, 0, 0)])
     again = World.of(tmp_path)
     assert starts_of_settled(again) == [T0, T0 + 2 * LENGTH, T0 + 3 * LENGTH]
-
-
-def test_answers_are_the_same_with_and_without_what_is_joined(world: World) -> None:
-    started = World.of(world.bag_dir)  # what is joined it has from the store
-    view, plain = View(started.memory, Call()), View(world.unstored().memory, Call())
-    assert starts_of_settled(started)
-    assert events_in(view, "/bumper", WINDOW) == events_in(plain, "/bumper", WINDOW)
-    one, other = (
-        [
-            (path.first, path.poses, path.totals)
-            for _, path in slices_of_path(each, "/odom", WINDOW, [])
-        ]
-        for each in (view, plain)
-    )
-    assert one == other
 
 
 @pytest.fixture
@@ -170,18 +135,6 @@ def test_what_was_received_again_is_of_the_parts_that_had_it_before_and_counts_w
     assert (rows(again)[0], rows(again)[1:]) == (before[0] + 1, before[1:])
     assert latched_stretches(again).get(T0 + 2 * LENGTH) is None
     assert events(again) == events(again.unstored())
-
-
-def test_what_is_joined_is_made_while_filling_and_goes_with_any_part(
-    copied: World, tmp_path: Path
-) -> None:
-    before = joined_fragments(store_file(tmp_path))
-    assert before > 0
-    for bag in (tmp_path / "rec_1").iterdir():  # half of some stretches
-        bag.unlink()
-    copied.memory.index.refresh()
-    copied.prune()
-    assert 0 < joined_fragments(store_file(tmp_path)) < before
 
 
 def test_what_was_made_in_time_is_told_before_the_time_is_over(world: World) -> None:
@@ -255,24 +208,3 @@ def test_static_transforms_of_many_sessions_are_found_together_also_beside_the_a
         [found] = view.sessions.static(view.sessions.of(tmp_path / f"rec_{number}"))
         assert found.transform.translation[0] == number
     assert len(scanned) < 10
-
-
-def test_two_robots_side_by_side_have_no_stretch_made_anew_with_each_bag(tmp_path: Path) -> None:
-    def record(number: int) -> None:
-        start = T0 + number * 100 * S
-        for robot, name in enumerate(["rec_a", "rec_b"]):
-            times = range(start + robot * S, start + 100 * S, 5 * S)
-            poses = [odom(at, number + 10 * robot, 0.1) for at in times]
-            write_mcap(tmp_path / name / f"{number}.mcap", poses)
-
-    for number in range(28):
-        record(number)
-    found: list[int] = []
-    for number in range(28, 31):
-        record(number)
-        world = World.of(tmp_path)
-        world.fill()
-        assert [*slices_of_path(View(world.memory, Call()), "/odom", WINDOW, [])]
-        world.memory.scanner.write_fragments()
-        found.append(joined_fragments(store_file(tmp_path)))
-    assert found == found[:1] * 3 != [0] * 3

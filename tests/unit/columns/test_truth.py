@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals
+from ros2_memory.analysis.conditions import Beyond, Condition, Equals
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.table import Table
@@ -211,23 +211,6 @@ def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:
     condition = Condition(Beyond(-1e300, above=True), "detections.results.pose", 0.5)
     table = drawn_of(kind, [whole]).table
     assert ColumnCondition(condition, EXTRACTOR).truth(table).unsure.all()
-
-
-def test_only_the_columns_that_may_match_are_unpacked() -> None:
-    table = stored(drawn_of(VISION, [detections(("cup", 0.9))]).table, 0.0)
-    assert ColumnCondition(Condition(Contains("cup")), EXTRACTOR).truth(table).surely.tolist() == [
-        True
-    ]
-    assert table.unpacked == {"detections.label"}
-
-
-def test_a_limit_within_the_error_of_a_number_is_unsure() -> None:
-    kind = "std_msgs/msg/Float64"
-    drawn = drawn_of(kind, [make(kind, data=number) for number in (0.96, 1.04, 2.0)])
-    table = stored(drawn.table, 0.1)
-    found = ColumnCondition(Condition(Beyond(1.01, above=True), "value"), EXTRACTOR).truth(table)
-    assert found.surely.tolist() == [False, False, True]
-    assert found.unsure.tolist() == [True, True, False]
 
 
 def test_an_array_that_is_not_held_is_settled_by_its_ends_or_unsure() -> None:

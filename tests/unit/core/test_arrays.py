@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from random import Random
 
 import numpy as np
 import pytest
@@ -13,16 +12,6 @@ from hypothesis import strategies as st
 from ros2_memory.core.arrays import Columns, distinct_rows, gathered
 
 PAIR = np.dtype([("number", "<u2"), ("value", "<f8")])
-
-
-def test_structures_are_gathered_wherever_they_lie() -> None:
-    draw = Random(3)
-    data = draw.randbytes(500)
-    places = [draw.randrange(len(data) - PAIR.itemsize + 1) for _ in range(100)]
-    found = gathered(data, PAIR, np.array(places))
-    expected = [struct.unpack_from("<Hd", data, at) for at in places]
-    assert found["number"].tolist() == [number for number, _ in expected]
-    assert np.array_equal(found["value"], [value for _, value in expected], equal_nan=True)
 
 
 def test_nothing_is_gathered_behind_the_end() -> None:

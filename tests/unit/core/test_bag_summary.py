@@ -63,11 +63,3 @@ def test_packing_changes_nothing(
             assert numbers_of(summary.schema, 2 * summary.data, 2, some).tolist() == [
                 [[topics_of[at].count, topics_of[at].first, topics_of[at].last]] * 2 for at in some
             ]
-
-
-def test_summaries_of_equal_numbers_differ_by_what_else_they_say() -> None:
-    summary = BagSummary((TopicSummary("/a", "std_msgs/msg/Bool", "cdr", 1, 2, 3),))
-    assert summary != summary.replaced(complete=False)
-    assert summary != summary.replaced(notes=("odd",))
-    assert summary.replaced(notes=("odd",)).replaced(notes=()) == summary
-    assert summary.replaced(topics=()).empty

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -57,32 +56,6 @@ def log_failure(reason: str) -> None:
         get_logger("ours").exception("scan failed")
 
 
-def test_an_event_is_one_json_object_on_stderr_with_utc_time(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    log = get_logger("ros2_memory.index")
-    configure_logging("info", "json")
-    log.info("indexed", bags=3, duration_ms=1.5)
-    (event,) = events(capsys)
-    stamp = datetime.fromisoformat(event.pop("timestamp"))
-    assert stamp.tzinfo == UTC
-    assert event == {
-        "event": "indexed",
-        "bags": 3,
-        "duration_ms": 1.5,
-        "logger": "ros2_memory.index",
-        "level": "info",
-    }
-
-
-def test_what_libraries_log_has_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
-    configure_logging("info", "json")
-    logging.getLogger("uvicorn.error").warning("port %d is busy", 9203)
-    (event,) = events(capsys)
-    assert datetime.fromisoformat(event.pop("timestamp")).tzinfo == UTC
-    assert event == {"event": "port 9203 is busy", "logger": "uvicorn.error", "level": "warning"}
-
-
 @pytest.mark.parametrize(
     ("level", "logged"),
     [("debug", ["info", "warning"]), ("info", ["warning"]), ("error", [])],
@@ -96,15 +69,6 @@ def test_the_end_of_a_request_is_no_event_and_a_warning_of_its_library_is(
     theirs.info("Terminating session: None")
     theirs.warning("a stream was closed")
     assert [event["level"] for event in events(capsys)] == logged
-
-
-def test_a_bound_correlation_id_joins_every_event(capsys: pytest.CaptureFixture[str]) -> None:
-    configure_logging("info", "json")
-    with structlog.contextvars.bound_contextvars(call_id="c1"):
-        get_logger("ours").info("read")
-        logging.getLogger("theirs").info("read")
-    get_logger("ours").info("idle")
-    assert [event.get("call_id") for event in events(capsys)] == ["c1", "c1", None]
 
 
 @pytest.mark.parametrize("layout", ["json", "pretty"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -24,8 +23,7 @@ from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
-from tests.support.bags import McapLayout, Msg, battery, make, odom, write_mcap, write_splits
-from tests.support.mcap_surgery import spoil_chunk
+from tests.support.bags import Msg, battery, make, odom, write_mcap, write_splits
 from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
@@ -156,38 +154,6 @@ def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
     assert len(rows) > 1
 
 
-def test_a_mean_lies_between_the_least_and_the_greatest_number(tmp_path: Path) -> None:
-    position = 1.221303095  # a column says 1.2213
-    write(tmp_path, [odom(BEGIN + n * S, position * n, 0.0) for n in range(3)])
-    memory = storing(memory_of(tmp_path, limits=LATEST), tmp_path, Random(1))
-    window = TimeRange(BEGIN / S + 1, BEGIN / S + 1)
-    answer = count_range(memory, Call(), "/odom", window, "day", fields=["position.x"])
-    ends = [cells(answer, f"position.x.{name}") for name in ("min", "mean", "max")]
-    assert ends == [[position] * 2] * 3
-
-
-def test_what_is_damaged_since_it_was_stored_is_told_as_its_column_says(tmp_path: Path) -> None:
-    positions = [Random(n).uniform(-9, 9) for n in range(60)]
-    poses = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)]
-    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", poses, McapLayout(chunk_size=400))
-    os.utime(path, ns=(BEGIN, BEGIN))
-    memory = storing(memory_of(tmp_path, limits=LATEST), tmp_path, Random(1))
-    lost, others = 20, {0, 40}  # a flipped bit, which no date shows
-    spoil_chunk(path, lost)
-    os.utime(path, ns=(BEGIN, BEGIN))
-    for second in {lost, *others}:
-        window = TimeRange(BEGIN / S + second, BEGIN / S + second)
-        call = Call()
-        answer = count_range(memory, call, "/odom", window, "day", fields=["position.x"])
-        ends = [cells(answer, f"position.x.{name}")[-1] for name in ("min", "mean", "max")]
-        assert ends == pytest.approx([positions[second]] * 3, abs=1e-4)
-        assert len({*ends}) == 1
-        is_noted = any("could not be read whole" in note for note in answer.notes)
-        assert is_noted is (second == lost)
-        if second != lost:
-            assert ends == [positions[second]] * 3
-
-
 def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched(
     tmp_path: Path,
 ) -> None:
@@ -227,24 +193,6 @@ def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched
     assert len(sinces) > 3
 
 
-@pytest.mark.parametrize(
-    ("positions", "mean"),
-    [
-        ([1.7e308] * 3, 1.7e308),
-        ([1.7e308, 1.7e308, -1.7e308, -1.7e308], 0.0),
-        ([1.7e308, 1.7e308, -1.7e308, 1.7e308], 8.5e307),
-    ],
-)
-@pytest.mark.parametrize("recalls", [False, True])
-def test_numbers_of_which_no_float_holds_the_sum_have_a_mean(
-    tmp_path: Path, positions: list[float], mean: float, recalls: bool
-) -> None:
-    write(tmp_path, [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)], split=3)
-    memory = memory_of(tmp_path, limits=LATEST, recalls=recalls)
-    answer = count_range(memory, Call(), "/odom", span(), "day", fields=["position.x"])
-    assert cells(answer, "position.x.mean") == [mean] * 2
-
-
 T0 = 1_790_000_000
 
 
@@ -282,28 +230,3 @@ def test_the_least_and_greatest_of_whole_numbers_are_exact(
     row = dict(zip(counted["columns"], counted["rows"][0], strict=True))
     assert (row["value.min"], row["value.max"]) == (min(numbers), max(numbers))
     assert row["value.max_at_unix"] == extremes["max_at"]
-
-
-@each_way
-def test_equal_numbers_are_one_value_whatever_their_sign_of_zero_or_type(
-    tmp_path: Path, *, recalls: bool
-) -> None:
-    zeros = [("Float64", -0.0 if second % 2 else 0.0) for second in range(6)]
-    write_numbers(
-        tmp_path, *zeros, ("Float64", 2.0), ("Float64", 2.0), ("Int32", 2), ("Float64", 2.5)
-    )
-    memory = memory_of(tmp_path, recalls=recalls)
-    given = {"topic": "/number", "start": T0, "end": T0 + 9}
-    changes = asked(memory, tmp_path, "get_topic_in_range", **given, changes=True)["changes"]
-    assert [change["value"] for change in changes] == [0, 2, 2.5]
-    rows = asked(memory, tmp_path, "get_topic_in_range", **given, by="value")["rows"]
-    assert sorted(row[0] for row in rows) == ["0", "2", "2.5"]
-
-
-@each_way
-def test_a_byte_has_no_sign(tmp_path: Path, *, recalls: bool) -> None:
-    write_numbers(tmp_path, ("Byte", 200), ("Byte", 3))
-    memory = memory_of(tmp_path, recalls=recalls)
-    given = {"topic": "/number", "condition_type": "above", "value": 100, "field": "value"}
-    found = asked(memory, tmp_path, "find_last_match", **given)
-    assert (found["timestamp"], found["value"]["value"]) == (T0, 200)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from itertools import pairwise
 from pathlib import Path
 from random import Random
@@ -18,7 +17,6 @@ from rosbags.typesys import get_types_from_msg
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import (
     Msg,
-    battery,
     boolean,
     detections,
     make,
@@ -29,14 +27,13 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of
 from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 
@@ -105,39 +102,6 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
     assert counts == sorted(counts, reverse=True)
 
 
-def test_a_condition_takes_the_labels_that_meet_it_alone(tmp_path: Path) -> None:
-    world = draw(5, 60)
-    write(world, tmp_path)
-    memory = asked_of(tmp_path, stored=True)
-    some = asked(memory, tmp_path, "find_matches", **{**ANY, "value": "CAT"})
-    assert {row[0] for row in some["rows"]} == {"cat", "cat bed"}
-    one = asked(
-        memory, tmp_path, "find_matches", **{**ANY, "condition_type": "equals", "value": "cat"}
-    )
-    assert {row[0] for row in one["rows"]} == {"cat"}
-    none = asked(memory, tmp_path, "find_matches", **{**ANY, "value": "giraffe"})
-    assert (none["rows"], none["all"][0]) == ([], 0)
-
-
-def test_topics_of_a_glob_are_counted_as_one(tmp_path: Path) -> None:
-    left = [detections((BEGIN + at) * S, ["cup"], topic="/left/seen") for at in range(5)]
-    right = [
-        detections((BEGIN + at) * S + 1, ["cup", "cup"], topic="/right/seen") for at in range(3, 9)
-    ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", sorted([*left, *right], key=lambda m: m.log_time))
-    memory = with_store(memory_of(tmp_path), tmp_path)
-    row = rows_of(asked(memory, tmp_path, "find_matches", **{**ANY, "topic": "/*/seen"}))["cup"]
-    assert (row["count"], row["seconds"], row["most_at_once"]) == (1, 8.0, 2)
-
-
-def test_labels_of_more_than_two_words_are_quoted(tmp_path: Path) -> None:
-    named = "please open the door"
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [detections(BEGIN * S, ["cup", named])])
-    reply = asked(memory_of(tmp_path), tmp_path, "find_matches", **ANY)
-    assert reply["quoted"] == ["rows"]
-    assert {row[0] for row in reply["rows"]} == {"cup", named}
-
-
 def test_of_many_labels_those_seen_most_often_are_listed(tmp_path: Path) -> None:
     labels = [f"thing{nth}" for nth in range(80)]
     chance = Random(1)
@@ -184,8 +148,6 @@ def test_texts_that_show_nothing_are_named(tmp_path: Path, said: str, rows: int)
 
 
 T: Final = 1_790_000_000
-SCENE: Final = "/vision/scene/scene_objects"
-X: Final = "pose.pose.position.x"
 
 
 def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) -> dict[str, Any]:
@@ -213,92 +175,6 @@ def test_a_boolean_in_a_list_counts_beside_one_that_is_in_none(tmp_path: Path) -
     ]
     found = counted(tmp_path, messages, "/panel", condition_type="equals", value=True)
     assert (found["count"], found["seconds"]) == (1, 20.0)
-
-
-def test_a_number_that_is_contained_counts_by_its_value(tmp_path: Path) -> None:
-    kind = "std_msgs/msg/Int32"
-    messages = [
-        Msg("/level", kind, (T + nth) * NS_PER_S, make(kind, data=3 if nth > 100 else 1))
-        for nth in range(200)
-    ]
-    condition = {"condition_type": "contains", "value": 3, "field": "data"}
-    found = counted(tmp_path, messages, "/level", by="value", **condition)
-    assert found["count"] == 1
-
-
-def test_what_two_topics_show_at_once_lasts_once(tmp_path: Path) -> None:
-    messages = [
-        detections((T + nth) * NS_PER_S + late, ["person"], topic=topic)
-        for nth in range(100)
-        for topic, late in (("/cam1/objects", 0), ("/cam2/objects", 10**8))
-    ]
-    condition = {"condition_type": "contains", "value": "person"}
-    found = counted(tmp_path, messages, "/cam*/objects", **condition)
-    assert 99 <= found["seconds"] <= found["recorded_s"] + 1
-
-
-def test_a_number_that_is_none_at_last_is_a_value_like_others(tmp_path: Path) -> None:
-    charges = [0.5, 0.5, math.nan, 0.7, 0.7, math.nan]
-    messages = [battery((T + n) * NS_PER_S, charge) for n, charge in enumerate(charges)]
-    condition = {"condition_type": "above", "value": 0.1, "field": "percentage", "by": "value"}
-    found = counted(tmp_path, messages, "/battery_state", **condition)
-    assert (found["count"], found["seconds"]) == (2, 4.0)
-    window = {"topic": "/battery_state", "fields": ["percentage"], "start": T, "end": T + 9}
-    memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "get_topic_in_range", **window, changes=True)
-    assert [change["value"] for change in reply["changes"]] == [0.5, None, 0.7, None]
-    reply = asked(memory, tmp_path, "get_topic_in_range", **window, by="value")
-    assert {row[0]: row[1] for row in reply["rows"]} == {"0.5": 1, "0.7": 1, "null": 2}
-
-
-def label_counts(memory: Memory, topic: str, value: object, **given: object) -> list[object]:
-    kind = "equals" if isinstance(value, bool) else "contains"
-    sought = {"topic": topic, "condition_type": kind, "value": value, "by": "hour", **given}
-    answer = asked(memory, memory.index.bag_dir, "find_matches", **sought)
-    whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
-    return [whole["count"], whole["seconds"]]
-
-
-@each_way
-def test_what_is_once_does_not_depend_on_a_scope_that_always_holds(
-    tmp_path: Path, *, recalls: bool
-) -> None:
-    """A cup that every fourth message misses; a boolean that is said each 15 s."""
-    messages = [odom((T + at) * NS_PER_S, at / 100, 0.0) for at in range(120)]
-    messages += [boolean((T + at) * NS_PER_S, data=True, topic="/on") for at in range(120)]
-    labels = [[] if at % 4 == 3 else ["cup"] for at in range(120)]
-    messages += [detections((T + at) * NS_PER_S, seen) for at, seen in enumerate(labels)]
-    messages += [
-        boolean((T + at) * NS_PER_S, at % 40 >= 20, "/docked") for at in (*range(0, 120, 15), 119)
-    ]
-    write_splits(tmp_path, messages, 30)
-    memory = memory_of(tmp_path, recalls=recalls)
-    everywhere = {"where": {"x": [-9, 9], "y": [-9, 9]}}
-    always = {"while": {"topic": "/on", "condition_type": "equals", "value": True}}
-    for topic, value in ((SCENE, "cup"), ("/docked", True), ("/docked", False)):
-        counts = label_counts(memory, topic, value)
-        for scope in (everywhere, always, {"min_score": 0.1}):
-            assert label_counts(memory, topic, value, **scope) == counts, (topic, scope)
-    assert label_counts(memory, SCENE, "cup") == [1, 118]
-    half = {"while": {"topic": "/odom", "condition_type": "below", "value": 0.7, "field": X}}
-    assert label_counts(memory, "/docked", True, **half) == [2, 25]
-
-
-@each_way
-def test_a_text_beside_json_detections_counts_by_hour_as_it_is_found(
-    tmp_path: Path, *, recalls: bool
-) -> None:
-    objects = [{"label": "cup", "score": 0.8}]
-    rooms = ["hall" if at < 60 else "kitchen" for at in range(120)]
-    messages = [
-        text((T + at) * NS_PER_S, json.dumps({"room": room, "objects": objects}), "/vlm")
-        for at, room in enumerate(rooms)
-    ]
-    messages += [odom((T + at) * NS_PER_S, at / 100, 0.0) for at in range(120)]
-    write_splits(tmp_path, messages, 30)
-    memory = memory_of(tmp_path, recalls=recalls)
-    assert label_counts(memory, "/vlm", '"room": "hall"') == [1, 60]
-    assert label_counts(memory, "/vlm", "cup") == [1, 119]
 
 
 @each_way

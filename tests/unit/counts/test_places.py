@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,6 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.counts.robot import count_path
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
-from ros2_memory.places.visits import visits
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
@@ -27,8 +25,6 @@ WEST = Place("west", "map", Rectangle(-3.0, 2.0, -3.0, 6.0))
 EAST = Place("east", "map", Rectangle(2.0, 8.0, -3.0, 6.0))
 START = Place("start", "map", Circle(0.0, 0.0, 0.6))
 DOOR = {"start": BEGIN / S, "end": BEGIN / S + 300}
-OBJECTS = "/vision/scene/scene_objects"
-CUP = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
 
 
 def in_places(memory: Memory, *places: Place) -> Memory:
@@ -53,58 +49,6 @@ def table(reply: Any) -> dict[str, dict[str, Any]]:
     return {**rows, "all": dict(zip(names, reply["all"], strict=True))}
 
 
-def test_visits_are_counted_in_each_hour_with_entries_exits_and_minutes(
-    memory: Memory, world: Path
-) -> None:
-    rows = table(asked(memory, world, "visits", where="start", by="hour"))
-    alone = visits(memory, Call(), where="start", limit=100)
-    whole = rows.pop("all")
-    assert (whole["entries"], whole["exits"]) == (4, 4) == (alone.entries, alone.exits)
-    assert whole["minutes"] == pytest.approx(alone.duration / S / 60, abs=0.01)
-    assert whole["placed_s"] == pytest.approx(299.8, abs=0.5)
-    for name in ("entries", "exits", "minutes", "recorded_s"):
-        assert sum(row[name] for row in rows.values()) == pytest.approx(whole[name], abs=0.02)
-
-
-def test_all_named_places_are_counted_at_once(memory: Memory, world: Path) -> None:
-    places = visits(memory, Call()).places or ()
-    by_place = table(asked(memory, world, "visits", by="place"))
-    by_day = table(asked(memory, world, "visits", by="day"))["all"]
-    for each in places:
-        row = by_place[each.place]
-        assert (row["entries"], row["exits"]) == (each.entries, each.exits)
-        assert row["minutes"] == pytest.approx(each.duration / S / 60, abs=0.006)
-        assert row["recorded_s"] == pytest.approx(each.duration / S, abs=0.06)
-        assert by_day[f"{each.place}.minutes"] == row["minutes"]
-        assert by_day[f"{each.place}.entries"] == each.entries
-    assert by_place["(unknown)"]["recorded_s"] < 0.5
-
-
-def test_what_is_counted_by_place_is_where_the_robot_was(world: Path) -> None:
-    memory = in_places(with_store(memory_of(world), world), WEST, EAST)
-    truth = write_moving_map(world, 1, seconds=300)
-    west = sum(x <= 2.0 for x, _ in truth.places)
-    rows = table(asked(memory, world, "get_topic_in_range", topic="/odom", by="place", **DOOR))
-    assert rows["west"]["count"] + rows["east"]["count"] == rows["all"]["count"] == 1500
-    assert rows["west"]["count"] == pytest.approx(west, abs=25)
-    assert rows["(elsewhere)"]["count"] == rows["(unknown)"]["count"] == 0
-    steps = [
-        (abs(b[0] - a[0]) ** 2 + abs(b[1] - a[1]) ** 2) ** 0.5
-        for a, b in pairwise(truth.places)
-        if b[0] <= 2.0
-    ]
-    driven = table(asked(memory, world, "trajectory_summary", by="place", **DOOR))
-    whole = sum(driven[name]["metres"] or 0 for name in driven if name != "all")
-    assert whole == pytest.approx(driven["all"]["metres"], abs=0.05)
-    # Corrections of the map move odometry too, which is what is measured.
-    assert driven["west"]["metres"] == pytest.approx(sum(steps), rel=0.35)
-    seen = table(asked(memory, world, "find_matches", by="place", **CUP))
-    assert seen["west"]["seconds"] + seen["east"]["seconds"] == pytest.approx(
-        seen["all"]["seconds"], abs=0.2
-    )
-    assert seen["all"]["count"] == 1
-
-
 def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(
     memory: Memory, world: Path
 ) -> None:
@@ -125,21 +69,6 @@ def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path)
 
 
 HOUR = 1_784_001_600 * S  # a whole hour of UTC
-
-
-def test_a_jump_in_the_bag_in_which_a_bin_ends_adds_no_metres(tmp_path: Path) -> None:
-    """Drives 1 m/s for 20 s around the full hour, and jumps by 500 m 5 s after it."""
-    messages = []
-    for step in range(400):
-        at = HOUR - 10 * S + step * S // 20
-        messages.append(odom(at, step / 20 + (500 if step >= 300 else 0), 0.0))
-    write_mcap(tmp_path / "bag.mcap", messages)
-    span = TimeRange(HOUR / S - 100, HOUR / S + 100)
-    found = count_path(memory_of(tmp_path), Call(), span, "hour")
-    column = [name for name, _ in found.columns].index("metres")
-    metres = [row[column] for _, row in found.rows if row[column]]
-    assert metres == pytest.approx([10.0, 9.9], abs=0.2)
-    assert found.all[column] == pytest.approx(19.9, abs=0.2)
 
 
 def test_hours_without_a_recording_have_no_row_whatever_was_driven_before(tmp_path: Path) -> None:

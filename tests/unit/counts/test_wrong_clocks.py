@@ -42,33 +42,6 @@ def whole(by: str = "hour") -> dict[str, object]:
     return {"start": 0, "end": AHEAD + 10, "by": by}
 
 
-@pytest.mark.parametrize("by", ["hour", "day"])
-def test_messages_of_a_wrong_clock_do_not_count_in_the_first_or_the_last_bin(
-    memory: Memory, tmp_path: Path, by: str
-) -> None:
-    question = {"topic": "/odom", "fields": ["position.x"], **whole(by)}
-    reply = asked(memory, tmp_path, "get_topic_in_range", **question)
-    assert len(reply["rows"]) == 1
-    found = all_of(reply)
-    assert found["count"] == 6
-    assert (found["first_unix"], found["last_unix"]) == (TRUE, TRUE + 5)
-    assert (found["position.x.max"], found["position.x.mean"]) == (5.0, 2.5)
-    assert any("wrong clock" in note for note in reply["notes"])
-
-
-def test_a_condition_does_not_count_where_a_wrong_clock_dated_it(
-    memory: Memory, tmp_path: Path
-) -> None:
-    condition = {"topic": "/bumper", "condition_type": "equals", "value": False}
-    found = all_of(asked(memory, tmp_path, "find_matches", **condition, **whole()))
-    assert found["count"] == 3
-    assert found["seconds"] == pytest.approx(2, abs=0.1)
-
-
-def test_metres_of_a_wrong_clock_do_not_count(memory: Memory, tmp_path: Path) -> None:
-    assert all_of(asked(memory, tmp_path, "trajectory_summary", **whole()))["metres"] == 5.0
-
-
 def test_labels_of_a_wrong_clock_do_not_count(memory: Memory, tmp_path: Path) -> None:
     seen = {"topic": CUPS, "condition_type": "contains", "value": "cup", "by": "label"}
     for window in ({}, {"start": 0, "end": AHEAD + 10}):
@@ -93,15 +66,6 @@ def test_no_value_holds_from_one_clock_to_the_next(memory: Memory, tmp_path: Pat
     of_1970 = {"start": UNSET - 5, "end": UNSET + 60, "by": "value"}
     reply = asked(memory, tmp_path, "get_topic_in_range", topic="/chatter", **of_1970)
     assert all_of(reply)["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
-
-
-def test_what_was_searched_has_all_that_was_found(memory: Memory, tmp_path: Path) -> None:
-    seen = {"topic": CUPS, "condition_type": "contains", "value": "cup"}
-    reply = asked(memory, tmp_path, "find_matches", **seen, start=0, end=AHEAD + 10)
-    first = [sighting["first_seen"] for sighting in reply["sightings"]]
-    assert len(first) == 3
-    assert reply["searched_from"] <= min(first)
-    assert reply["searched_to"] >= max(first)
 
 
 @pytest.mark.parametrize(("begin", "count"), [(UNSET, 2), (AHEAD, 1)])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import math
-import weakref
 from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, pairwise, repeat
@@ -46,7 +44,6 @@ from tests.support.bags import (
 from tests.support.column_worlds import World
 from tests.support.examples import examples
 from tests.support.memories import each_way, memory_of
-from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,10 +109,6 @@ def test_frames_are_the_same_however_a_history_is_cut_and_whatever_is_stored(
     assert (found[0] == found[1]).all()
 
 
-def asked(reader: NotingReader, topic: str) -> set[str]:
-    return {path.name for path, topics in reader.asked if topic in topics}
-
-
 def static(second: int, child: str, x: float) -> Msg:
     at = T0 + second * S
     return tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
@@ -149,40 +142,6 @@ def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repe
         if second <= at or child.lstrip("/") not in expected:
             expected[child.lstrip("/")] = float(x)
     assert {each.child.lstrip("/"): each.transform.translation[0] for each in found} == expected
-
-
-def test_a_view_is_freed_with_its_call_without_the_garbage_collector(tmp_path: Path) -> None:
-    bag(tmp_path, 0, [static(0, "eye", 1.0)])
-    gc.disable()
-    try:
-        view = View(memory_of(tmp_path), Call())
-        assert view.sessions.recorded_at(T0)
-        known = weakref.ref(view)
-        del view
-        assert known() is None
-    finally:
-        gc.enable()
-
-
-def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) -> None:
-    for second in range(3):
-        bag(tmp_path, second, [static(second, "eye", 1.0)])
-    reader = NotingReader()
-    memory = memory_of(tmp_path, reader=reader)
-    moment = AtTime(T0 / 1e9 + 2.5)
-
-    def place() -> float:
-        return queries.transform(memory, Call(), "base_link", "eye", moment).transform.translation[
-            0
-        ]
-
-    assert place() == 1.0
-    assert asked(reader, "/tf_static") == {"rec_0.mcap", "rec_1.mcap", "rec_2.mcap"}
-    reader.asked.clear()
-    assert place() == 1.0
-    assert asked(reader, "/tf_static") == set()
-    bag(tmp_path, 3, [static(2, "eye", 2.0)])
-    assert place() == 2.0
 
 
 def test_static_transforms_of_many_recordings_are_read_together_beside_one_being_written(
@@ -220,24 +179,6 @@ def test_transforms_that_cannot_be_decoded_are_named_each_time(
     for _ in range(2):
         notes = recap(memory, Call(), TimeRange(start_s=T0 / 1e9, end_s=T0 / 1e9 + 9)).notes
         assert any("messages of /tf could not be decoded" in note for note in notes)
-
-
-def test_where_no_transform_leads_to_the_map_a_sighting_reads_those_around_it_alone(
-    tmp_path: Path,
-) -> None:
-    for minute in range(20):
-        at = T0 + minute * 60 * S
-        messages = [tf(at, transform(at, "odom", "other", (1.0, 0.0, 0.0)))]
-        messages += [detections(at, ["cup"])] if minute == 10 else []
-        bag(tmp_path, minute, messages)
-    reader = NotingReader()
-    answer = find_matches(
-        memory_of(tmp_path, reader=reader), Call(), "/vision/scene/scene_objects", "contains", "cup"
-    )
-    [sighting] = answer.sightings
-    assert sighting.thing is not None
-    assert sighting.thing.frame_id == "base_link"
-    assert asked(reader, "/tf") == {"rec_10.mcap"}
 
 
 DAY = 86_400 * S
@@ -291,16 +232,6 @@ def test_a_place_in_the_map_is_one_by_the_transforms_of_the_own_recording(
     assert arrivals(memory, 103.0) == [round(apart / S + 6.8, 1)]
     assert visits(memory, Call(), 3.0, 0.0, radius_m=0.3).visits == ()
     assert visits(memory, Call(), 105.0, 0.0, radius_m=0.3).total == 1
-
-
-def test_another_robots_static_transform_places_nothing(tmp_path: Path) -> None:
-    """A boat without a map has no position in that of another robot."""
-    record(tmp_path / "nav2", [fixed(T0 - DAY, "map", "odom", 100.0), *drive(T0 - DAY, 20)])
-    record(tmp_path / "boat", [*moving(T0, 20, "odom", "base_link", 0.0, 0.5), *drive(T0, 20)])
-    memory = memory_of(tmp_path)
-    assert arrivals(memory, 103.0) == [round(-DAY / S + 5.4, 1)]
-    with pytest.raises(NoDataError):
-        queries.transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(T0 + 5 * S)))
 
 
 def x_of(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -14,7 +13,6 @@ from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory, QuerySettings
 from ros2_memory.history.view import AtTime
 from ros2_memory.index.segment import Pace, TopicTotals
-from ros2_memory.insights.status import memory_status, usual_rate
 from ros2_memory.queries import position, topic_value, value_when
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
@@ -26,8 +24,6 @@ from tests.support.bags import (
     odom,
     stamp,
     text,
-    tf,
-    transform,
     write_mcap,
 )
 from tests.support.housekeepers import keeper_of
@@ -38,7 +34,6 @@ if TYPE_CHECKING:
 
 
 S = 10**9
-MS = 10**6
 T0 = 1_790_000_000 * S
 MAP, TELEMETRY, ROSOUT = "/map_name", "/fmu/out/vehicle_status", "/rosout"
 TRANSIENT = McapLayout(latched=frozenset({MAP, TELEMETRY, ROSOUT, "/tf_static"}))
@@ -138,37 +133,6 @@ def test_what_is_published_every_five_seconds_or_less_often_holds(
         assert (found["latched"], found["age_s"]) == (True, 3.0)
 
 
-def test_a_map_that_was_published_once_holds_and_says_how_old_it_is(tmp_path: Path) -> None:
-    record(tmp_path / "rec", [text(T0 + S, "office", MAP), *drive(T0, T0 + 30 * S)])
-    memory = remembered(tmp_path)
-    found = reply(memory, MAP, T0 + 29 * S)
-    assert (found["value"], found["latched"], found["age_s"]) == ({"value": "office"}, True, 28.0)
-    assert "error" in reply(memory, MAP, T0)
-
-
-def test_a_log_never_holds_and_is_no_reason_to_say_that_a_topic_fell_silent(
-    tmp_path: Path,
-) -> None:
-    lines = [log_line(T0 + n * 10 * MS) for n in range(6)]
-    record(tmp_path / "rec", [*lines, *drive(T0, T0 + 600 * S)])
-    memory = remembered(tmp_path)
-    assert set(reply(memory, ROSOUT, T0 + 300 * S)) == {"error"}
-    assert memory_status(memory, Call()).fell_silent == ()
-
-
-def test_static_transforms_hold_in_bags_without_qos(tmp_path: Path) -> None:
-    """As rosbags writes them; however often they are published."""
-    mounts = [
-        tf(T0 + n * S, transform(T0, "base_link", child, (0.1, 0.0, 0.0)), topic="/tf_static")
-        for n, child in enumerate(("laser", "camera", "sonar"))
-    ]
-    record(tmp_path / "rec", [*mounts, *drive(T0, T0 + 60 * S)], McapLayout(latched=frozenset()))
-    memory = remembered(tmp_path)
-    assert reply(memory, "/tf_static", T0 + 59 * S)["latched"] is True
-    memory = remembered(tmp_path, tf_static_topics=(), latching=Latching())
-    assert set(reply(memory, "/tf_static", T0 + 59 * S)) == {"error"}
-
-
 def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) -> None:
     telemetry = every(0.1, 7, TELEMETRY)
     record(tmp_path / "rec", [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
@@ -178,16 +142,6 @@ def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) 
     assert set(reply(memory, MAP, T0 + 59 * S)) == {"error"}
     both = remembered(tmp_path, latching=Latching(include=("/odom",), exclude=("/odom",)))
     assert set(reply(both, "/odom", T0 + 99 * S)) == {"error"}
-
-
-def test_the_status_sees_telemetry_fall_silent_and_topics_tell_its_rate(tmp_path: Path) -> None:
-    telemetry = every(0.01, 7, TELEMETRY)
-    record(tmp_path / "rec", [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
-    memory = remembered(tmp_path)
-    assert [each.topic for each in memory_status(memory, Call()).fell_silent] == [TELEMETRY]
-    snapshot, latching = memory.index.snapshot(), memory.limits.latching
-    assert usual_rate(snapshot, TELEMETRY, latching) == pytest.approx(100.0)
-    assert usual_rate(snapshot, MAP, latching) is None
 
 
 def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None:
@@ -225,20 +179,3 @@ def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
     assert set(reply(memory, TELEMETRY, T0 + 29 * S)) == {"error"}
     assert reply(memory, TELEMETRY, telemetry[-1].log_time)["value"] == {"value": "699"}
     assert reply(memory, MAP, T0 + 29 * S)["age_s"] == 29.0
-
-
-def test_static_transforms_in_every_split_stay_few(tmp_path: Path) -> None:
-    """As `--repeat-transient-local` and other recorders write them."""
-    body = transform(T0, "base_link", "laser", (0.1, 0.0, 0.0))
-    mounts = [
-        replace(tf(T0, body, topic="/tf_static"), log_time=T0 + n * 10 * S, publish_time=T0)
-        for n in range(20)
-    ]
-    record(tmp_path / "rec", [*mounts, *drive(T0, T0 + 200 * S)])
-    keeper_of(tmp_path, max_bytes=60_000).apply()
-    left = [path for path in tmp_path.rglob("*.mcap") if path.parent.name == "rec"]
-    assert 1 < len(left) < 20
-    carried = tmp_path / "latched/carried.mcap"
-    assert len([*McapReader().records(carried, ["/tf_static"], TimeWindow.everything())]) == 1
-    memory = remembered(tmp_path)
-    assert reply(memory, "/tf_static", T0 + 199 * S)["latched"] is True

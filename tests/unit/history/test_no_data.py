@@ -79,23 +79,6 @@ def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
         assert caught.value.reason is reason
 
 
-def test_notes_beside_a_transform_are_about_the_time_asked_alone(tmp_path: Path) -> None:
-    frames_that_part(tmp_path)
-    with pytest.raises(NoDataError, match="around then it is recorded"):
-        queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(61))
-
-
-def test_by_header_stamps_a_time_without_any_is_out_of_range_and_no_fault_of_the_frames(
-    tmp_path: Path,
-) -> None:
-    frames_that_part(tmp_path)
-    memory = memory_of(tmp_path, limits=QuerySettings(tf_clock="stamp"))
-    with pytest.raises(NoDataError) as caught:
-        queries.transform(memory, Call(), "odom", "base_link", after(5000))
-    assert caught.value.reason is NoDataReason.OUTSIDE_RANGE
-    assert "header stamp" in caught.value.detail
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reported(
     tmp_path: Path, sign: float
@@ -112,14 +95,6 @@ def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reporte
 )
 def test_a_duration_is_reported_without_powers_of_ten(length_s: float, reply: str) -> None:
     assert seconds(round(length_s * S)) == reply
-
-
-def test_no_tolerance_is_advised_for_a_message_of_another_day(tmp_path: Path) -> None:
-    messages = [boolean(T0, True), text(T0 + 80_000 * S, "late")]
-    write_mcap(tmp_path / "run" / "run_0.mcap", messages)
-    with pytest.raises(NoDataError) as caught:
-        queries.topic_value(memory_of(tmp_path), Call(), "/bumper", after(80_000))
-    assert "tolerance_s" not in caught.value.detail
 
 
 @pytest.mark.parametrize("older_s", [12.631, 59.891])
@@ -159,21 +134,6 @@ def test_of_several_robots_in_one_folder_the_nearest_message_is_not_another_robo
     # Between the two there is nothing to tell them apart by.
     with pytest.raises(NoDataError, match="nearest newer one is 364 days after"):
         queries.position(memory, Call(), after(86_400))
-
-
-def test_a_topic_that_a_recording_lacks_is_near_in_the_next_one(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "one" / "one_0.mcap", [text(T0, "a"), text(T0 + 9 * S, "b")])
-    write_mcap(tmp_path / "two" / "two_0.mcap", [odom(T0 + 20 * S, 0.0, 0.0)])
-    with pytest.raises(NoDataError) as caught:
-        queries.position(memory_of(tmp_path), Call(), after(5))
-    assert "the recording of that time, one, has no such topic" in caught.value.detail
-    assert "the nearest newer one is 15 s after it" in caught.value.detail
-
-
-def test_what_never_had_a_message_before_a_time_is_reported_in_words(tmp_path: Path) -> None:
-    frames_that_part(tmp_path)
-    with pytest.raises(NoDataError, match=f"no message of /tf within 10 s of {T0_S - 100}"):
-        queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(-100))
 
 
 TRUE = {"topic": "/bumper", "condition_type": "equals", "value": True}

@@ -129,21 +129,6 @@ def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
     assert any("could not be decoded" in note for note in reply["notes"])
 
 
-def test_a_slow_detector_is_not_silent_while_its_messages_cannot_be_decoded(tmp_path: Path) -> None:
-    torn = Msg(
-        OBJECTS,
-        "ros2_vision_interfaces/msg/VisionDetectionArray",
-        T0 + 8 * S,
-        b"\x00\x01\x00\x00\xff\xff\xff\x7f",
-    )
-    seen = [detections(T0 + at * S, ["cup"]) for at in (0, 16, 40)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [seen[0], torn, *seen[1:]])
-    memory = memory_of(tmp_path)
-    sightings = asked(memory, tmp_path, "find_matches", **CUP)["sightings"]
-    spans = [(each["first_seen"] - T0_S, each["last_seen"] - T0_S) for each in sightings]
-    assert spans == [(40, 40), (0, 16)]
-
-
 @pytest.mark.parametrize("bags", [3])
 @pytest.mark.parametrize(
     ("tool", "given"),

@@ -6,7 +6,6 @@ Replies of a call that was out of time have what is known, and claim no more tha
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import random
 from functools import partial
@@ -72,16 +71,6 @@ def filled(bag_dir: Path) -> tuple[Memory, NotingReader]:
     return memory, reader
 
 
-def test_a_text_for_a_number_is_refused_with_the_constants_of_that_name(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.5)])
-    equals = (memory_of(tmp_path), Call(), "/battery_state", "equals")
-    with pytest.raises(InvalidArgumentsError, match=r"POWER_SUPPLY_STATUS_CHARGING = 1$"):
-        queries.find_last_match(*equals, "charging", field="power_supply_status")
-    with pytest.raises(InvalidArgumentsError, match=r"must be a number$"):
-        queries.find_last_match(*equals, "asleep", field="power_supply_status")
-    assert queries.find_last_match(*equals, 2, field="power_supply_status").found is not None
-
-
 def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.5), text(T0, "POWER_SUPPLY_STATUS_FULL")])
     memory, call = memory_of(tmp_path), Call()
@@ -118,14 +107,6 @@ def test_percent_of_a_battery_that_states_no_charge_is_not_refused_as_if_it_stat
     question = (memory_of(tmp_path), Call(), "/battery_state")
     found = queries.find_last_match(*question, "above", 20, field="percentage").found
     assert found is None
-
-
-def test_percent_of_a_battery_that_states_percent_is_compared(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [battery(T0, 90.0), battery(T0 + NS_PER_S, 1.0)])
-    question = (memory_of(tmp_path), Call(), "/battery_state")
-    found = queries.find_last_match(*question, "above", 20, field="percentage").found
-    assert found is not None
-    assert found.sample.time == T0
 
 
 def test_never_within_a_least_score_above_one_says_what_scores_are(tmp_path: Path) -> None:
@@ -228,44 +209,6 @@ def test_what_never_was_is_answered_without_reading_a_message(
     assert not any(topics for _, topics in reader.asked)  # but the definitions of types
 
 
-def test_a_place_never_visited_is_looked_up_in_no_bag_but_the_newest(bag_dir: Path) -> None:
-    memory, reader = filled(bag_dir)
-    assert last(memory, "near_position", {"x": 500.0, "y": 0.0}, topic="/odom").found is None
-    assert set(reader.names) == {"rec_4.mcap"}
-
-
-def test_a_place_is_looked_for_only_where_it_may_be(bag_dir: Path) -> None:
-    memory, reader = filled(bag_dir)
-    assert at(last(memory, "near_position", {"x": 20.0, "y": 0.0}, topic="/odom")) == 20
-    assert reader.names == ["rec_2.mcap"]
-
-
-def test_before_looks_only_at_what_came_up_to_then(bag_dir: Path) -> None:
-    for memory in (memory_of(bag_dir), filled(bag_dir)[0]):
-        assert at(last(memory, "contains", "cup", before_s=T0_S + 41)) == 41
-        assert at(last(memory, "contains", "cup", before_s=T0_S + 40.9)) == 21
-        assert last(memory, "contains", "cup", before_s=T0_S + 5).found is None
-
-
-def test_a_search_that_runs_out_of_time_says_how_far_it_got_and_can_go_on(bag_dir: Path) -> None:
-    memory = memory_of(bag_dir)
-    found: Match | None = None
-    before_s: float | None = None
-    told: list[tuple[str, bool]] = []
-    while found is None:
-        assert len(told) < 20
-        call = Call(Deadline.after(6.0, partial(next, map(float, itertools.count()))))
-        try:
-            found = last(memory, "contains", "scissors", call=call, before_s=before_s)
-        except QueryTimeoutError as error:
-            reply = json.loads(Replies(bag_dir, 4000).error(error).text)
-            before_s = reply["searched_back_to"]
-            told.append((reply["error"], f"before={before_s:.6f}" in reply["detail"]))
-    assert at(found) == 1
-    assert told
-    assert set(told) == {("timeout", True)}
-
-
 def test_a_search_that_got_nowhere_in_its_time_does_not_say_how_far(bag_dir: Path) -> None:
     call = Call(Deadline.after(0.0))
     with pytest.raises(QueryTimeoutError) as caught:
@@ -360,16 +303,6 @@ def test_of_a_day_that_is_counted_in_part_the_first_time_is_not_known(
 def test_what_is_counted_by_label_begins_where_it_is_counted_from(ask: Callable[..., Any]) -> None:
     reply = ask("find_matches", 0, **CUPS, by="label", **SPAN)
     assert (reply["start"], reply["end"]) == pytest.approx((NEWEST, NEWEST + 19), abs=1e-6)
-
-
-def test_where_places_are_known_in_part_matches_there_have_no_total(
-    ask: Callable[..., Any],
-) -> None:
-    where = {"x": 0.5, "y": 0.0, "radius_m": 2.0}
-    reply = ask("find_matches", 1, **BUMPS, where=where, limit=100, **SPAN)
-    assert reply["at_least"] == len(reply["sightings"]) == 2
-    assert reply["unknown_s"] > 0
-    assert "total" not in reply
 
 
 def test_changes_that_were_not_all_read_have_no_total(ask: Callable[..., Any]) -> None:

@@ -13,7 +13,6 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
-from ros2_memory.index.segment import Segment, TopicTotals
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.memories import asked, memory_of, with_store
@@ -72,26 +71,6 @@ def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
     assert "blue, red overlap in time" in note
     assert "/odom" in note
     assert "robots are mixed (see notes)" in asked(memory, tmp_path, "memory_status")["doubts"]
-
-
-def test_two_robots_are_told_apart_by_questions_that_are_asked_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_mcap(tmp_path / "red" / "red_0.mcap", drive(0.0))
-    write_mcap(tmp_path / "blue" / "blue_0.mcap", drive(10.0, begin=20)[:20])
-    memory, found, recordings = memory_of(tmp_path), list[Any](), Segment.recordings
-    window = {"start": T0_S, "end": T0_S + 60}
-
-    def interrupted(segment: Segment, topic: str) -> dict[Path, TopicTotals]:
-        monkeypatch.setattr(Segment, "recordings", recordings)
-        found.append(asked(memory, tmp_path, "recap", **window))
-        return recordings(segment, topic)
-
-    memory.index.refresh().timeline.recordings("/odom")
-    monkeypatch.setattr(Segment, "recordings", interrupted)
-    found.append(asked(memory, tmp_path, "recap", **window))
-    assert found[0] == found[1]
-    assert any("the path is unknown: 2 recordings" in note for note in found[0]["notes"])
 
 
 def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Path) -> None:
@@ -303,14 +282,6 @@ def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
     )
     (note,) = warned(memory)
     assert "laser is in base_link in the recording red, and in torso in blue" in note
-
-
-def test_a_frame_that_was_moved_within_one_deployment_is_not(tmp_path: Path) -> None:
-    for number, parent in enumerate(("base_link", "torso")):
-        name = f"rec_20231114T22132{number}Z"
-        at = T0 + number * 3600 * S
-        write_mcap(tmp_path / name / f"{name}_0.mcap", [mounted(parent, at)])
-    assert contradicting_frames(memory_of(tmp_path), Call()) == ()
 
 
 @pytest.mark.parametrize("kind", ["mcap", "small chunks", "db3"])

@@ -121,14 +121,6 @@ def test_no_reply_about_public_bags_from_time_zero_does(
     hold(memory, bag_dir, topic if topic in topics else topics[0])
 
 
-def test_a_search_of_everything_says_that_it_began_at_zero(bag_dir: Path) -> None:
-    memory = memory_at(bag_dir, recalls=False)
-    reply = asked(memory, bag_dir, "find_matches", topic="/bumper", **SEARCH)
-    assert reply["searched_from"] == 0.0
-    assert reply["searched_to"] == 9.0
-    assert [each["first_seen"] for each in reply["sightings"]] == [0.0]
-
-
 @each_way
 def test_a_window_that_begins_below_zero_is_clamped(bag_dir: Path, recalls: bool) -> None:
     memory = memory_at(bag_dir, recalls)

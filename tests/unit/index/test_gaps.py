@@ -43,13 +43,6 @@ def test_what_is_published_seldom_leaves_no_gap() -> None:
     assert gaps([*seldom, bag("c/c_0", every(5, 150, 200))]) == [(130.0, 150.0)]
 
 
-def test_from_one_split_to_the_next_the_recorder_ran_on() -> None:
-    splits = [bag("a/a_0", [0, 1, 5]), bag("a/a_1", [14, 15, 20]), bag("a/a_2", [43, 49])]
-    assert gaps(splits) == [(20.0, 43.0)]
-    # A split between them is missing.
-    assert gaps([splits[0], bag("a/a_2", [14, 15, 20])]) == [(5.0, 14.0)]
-
-
 @given(
     st.lists(
         st.tuples(st.integers(0, 400), st.integers(2, 60), st.booleans()), min_size=1, max_size=12

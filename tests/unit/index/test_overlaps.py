@@ -46,16 +46,6 @@ def pairs(found: tuple[Overlapping, ...]) -> list[tuple[str, str, float, float]]
     ]
 
 
-def test_two_runs_at_once_are_named_with_the_time_that_they_share(tmp_path: Path) -> None:
-    spans = {"a": [(0.0, 20.0), (20.1, 40.0)], "b": [(15.0, 30.0)], "c": [(50.0, 60.0)]}
-    assert pairs(overlapping(robot(tmp_path, spans))) == [("a", "b", 15.0, 30.0)]
-
-
-def test_a_short_overlap_of_long_recordings_is_that_of_a_rotation(tmp_path: Path) -> None:
-    spans = {"a": [(0.0, 60.0)], "b": [(55.0, 120.0)]}
-    assert overlapping(robot(tmp_path, spans)) == ()
-
-
 @pytest.mark.parametrize("side", ["previous", "next"])
 def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, side: str) -> None:
     taken = robot(tmp_path, {"a": [(0, 60)], "b": [(5, 60)]})

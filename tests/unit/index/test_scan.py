@@ -61,13 +61,6 @@ def test_a_bag_is_known_by_the_end_of_its_name(name: str, kind: str | None) -> N
     assert bag_kind(name) == kind
 
 
-def test_folders_and_files_that_begin_with_a_dot_are_left_out(tmp_path: Path) -> None:
-    _file(tmp_path / ".trash" / "rec" / "a.mcap")
-    _file(tmp_path / "rec" / ".cache" / "b.mcap")
-    _file(tmp_path / "rec" / ".c.mcap")
-    assert _names(Tree(tmp_path).scan(NOW, ())) == []
-
-
 def test_a_watched_file_that_left_and_came_back_within_one_tick_is_found(tmp_path: Path) -> None:
     path = _file(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path))
@@ -172,13 +165,6 @@ def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) ->
     path.unlink()
     [odometry] = asked(memory, tmp_path, "list_recorded_topics")
     assert odometry["count"] == 10
-
-
-def test_runs_of_a_simulation_with_equal_times_are_no_copies(tmp_path: Path) -> None:
-    write_odometry(tmp_path / "run_1.mcap", 0.1)
-    write_odometry(tmp_path / "run_2.mcap", 0.2)
-    [odometry] = asked(memory_of(tmp_path), tmp_path, "list_recorded_topics")
-    assert odometry["count"] == 20
 
 
 @each_way

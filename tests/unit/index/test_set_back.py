@@ -45,15 +45,6 @@ def layout(request: pytest.FixtureRequest) -> McapLayout:
     return LAYOUTS[request.param]
 
 
-def test_how_far_it_was_set_back_is_told_whatever_the_layout(
-    tmp_path: Path, layout: McapLayout
-) -> None:
-    messages = [message(n) for n in range(20)] + [message(n - STEP) for n in range(20, 40)]
-    found = set_back(tmp_path / "a.mcap", messages, layout)
-    # Chunks hold two messages: what lies within one of them is not result apart.
-    assert (STEP - 3) * S <= found <= (STEP - 1) * S
-
-
 @settings(max_examples=examples(40), deadline=None)
 @given(
     times=st.lists(st.integers(0, 100), min_size=1, max_size=30),

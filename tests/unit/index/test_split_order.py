@@ -36,10 +36,6 @@ def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
     return [(step.before.path.name, step.after.path.name, step.by) for step in found]
 
 
-def test_files_that_people_named_tell_nothing_of_a_clock() -> None:
-    assert steps([bag("drive_1.mcap", 100, 110), bag("drive_2.mcap", 10, 20)]) == []
-
-
 @given(
     st.lists(st.integers(0, 40), min_size=2, max_size=20),
     st.integers(1, 6),

@@ -71,13 +71,6 @@ def start(tmp_path: Path) -> Start:
     return begun
 
 
-def test_a_start_over_known_bags_reads_none_and_finds_the_same(start: Start) -> None:
-    index, reader = start.index()
-    assert index.refresh() == start.read()
-    assert index.refresh() == start.read()
-    assert (reader.closings.total(), reader.summaries.total()) == (0, 0)
-
-
 def test_of_old_bags_an_index_keeps_rows_alone_and_of_young_ones_once_they_are_old(
     start: Start,
 ) -> None:
@@ -100,14 +93,6 @@ def test_of_old_bags_an_index_keeps_rows_alone_and_of_young_ones_once_they_are_o
     young.unlink()
     table.update(ScanContext(start.bag_dir, NOW + 70 * S, 30 * S), patrolling=True)
     assert len(table.snapshot(NOW).bags) == 5
-
-
-def test_a_bag_that_looks_otherwise_than_it_is_known_is_read(start: Start) -> None:
-    plain(start.bag_dir / "rec" / "rec_3.mcap", [30, 31, 32])
-    start.age()
-    index, reader = start.index()
-    assert index.refresh() == start.read()
-    assert [*reader.summaries] == ["rec_3.mcap"]
 
 
 @pytest.mark.parametrize("seed", range(20))

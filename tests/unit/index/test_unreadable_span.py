@@ -22,18 +22,6 @@ OWN = "rec_20260921T130000Z"
 """Begun 4400 s before NOW."""
 
 
-def test_a_file_that_was_copied_here_later_is_taken_to_hold_a_day() -> None:
-    found = unreadable_span("rec", Neighbours(NOW - 1000 * HOUR), NOW, NOW)
-    assert found == TimeWindow(NOW - 1000 * HOUR, NOW - 976 * HOUR)
-
-
-def test_a_file_that_is_still_being_written_has_no_end() -> None:
-    found = unreadable_span("rec", Neighbours(NOW - 10 * S), NOW, NOW, growing=True)
-    assert found == TimeWindow(NOW - 10 * S, MAX_NS)
-    found = unreadable_span("someones", Neighbours(), NOW, NOW, growing=True)
-    assert found == TimeWindow(NOW - 24 * HOUR, MAX_NS)
-
-
 def test_a_recording_tells_when_it_began_only_in_the_names_that_the_recorder_gives() -> None:
     assert named_start(OWN) == 1_789_995_600 * S
     assert named_start(f"{OWN}_2") == 1_789_995_600 * S

@@ -14,7 +14,6 @@ from tests.support.memories import asked, memory_of, replied
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
-    from ros2_memory.index.snapshot import Snapshot
 
 S = 10**9
 T0 = 1_700_000_000
@@ -79,21 +78,6 @@ def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory, tmp_path:
         memory, tmp_path, "get_position_at", {"timestamps": [T0], "topic": "/vision/*"}
     )
     assert json.loads(refused.text)["error"]
-
-
-def test_all_of_them_are_of_one_snapshot(
-    memory: Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked_for: list[int | None] = []
-    source = memory.index.snapshot
-
-    def counted(reach: int | None = None) -> Snapshot:
-        asked_for.append(reach)
-        return source(reach)
-
-    monkeypatch.setattr(memory.index, "snapshot", counted)
-    asked(memory, tmp_path, "get_position_at", timestamps=[T0 + 3, T0 + 25, T0 + 9])
-    assert asked_for == [(T0 + 25) * S]
 
 
 def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:

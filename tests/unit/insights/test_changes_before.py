@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
-
-import pytest
 
 from tests.support.bags import (
     Msg,
@@ -15,11 +12,9 @@ from tests.support.bags import (
     goals,
     log_entry,
     odom,
-    tf,
-    transform,
     write_splits,
 )
-from tests.support.memories import asked, each_way, memory_of, replied
+from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -151,25 +146,6 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
     assert [each["text"] for each in below] == ["/battery_state fell below 20%"]
 
 
-def test_goals_are_accepted_and_end(tmp_path: Path) -> None:
-    statuses = [(5, {1: RUNNING}), (10, {1: ABORTED, 2: 1}), (11, {1: ABORTED, 2: RUNNING})]
-    write_splits(tmp_path, [*driving(20, 20), *(goals(at(t), each) for t, each in statuses)])
-    assert told(before(tmp_path, 12.0)) == [
-        ("/drive goal aborted", 2.0),
-        ("/drive goal accepted", 2.0),
-    ]
-
-
-@each_way
-def test_a_state_is_known_by_the_message_long_before(tmp_path: Path, recalls: bool) -> None:
-    """A latched topic has a message whenever it changes, and no other."""
-    docked = [boolean(at(0), True, "/docked"), boolean(at(300), False, "/docked")]
-    write_splits(tmp_path, [*driving(320, 310, hz=2), *docked])
-    reply = before(tmp_path, 304.0, recalls=recalls)
-    assert told(reply) == [("/docked became false", 4.0)]
-    assert reply["state"] == {"/docked": False}
-
-
 def test_how_far_back_can_be_asked(tmp_path: Path) -> None:
     write_splits(tmp_path, ALL)
     assert told(before(tmp_path, 43.0, seconds_before=1)) == [
@@ -179,66 +155,6 @@ def test_how_far_back_can_be_asked(tmp_path: Path) -> None:
     assert ("/drive goal accepted", 38.0) not in told(before(tmp_path, 43.0))
     refused = before(tmp_path, 43.0, seconds_before=61)
     assert refused["error"] == "invalid_arguments"
-
-
-def test_a_warning_that_is_repeated_is_listed_once(tmp_path: Path) -> None:
-    late = [log_entry(at(20 + nth / 2), 30, "control", f"late by {nth} ms") for nth in range(30)]
-    write_splits(tmp_path, [*driving(60, 50), *late])
-    assert told(before(tmp_path, 30.0)) == [
-        ("warning of control: late by 0 ms (22 times in 10 s)", 0.0)
-    ]
-
-
-def test_places_of_the_robot_are_in_the_map(tmp_path: Path) -> None:
-    placed = [
-        tf(at(t / 2), transform(at(t / 2), "map", "odom", (10.0, 0.0, 0.0))) for t in range(80)
-    ]
-    write_splits(tmp_path, [*driving(40, 20), *placed])
-    robot = before(tmp_path, 30.0)["robot"]
-    assert (robot["x"], robot["frame_id"]) == (pytest.approx(18.0, abs=0.01), "map")
-
-
-def stopping(times: int) -> list[Msg]:
-    """Stops so often, for 5 s each, 7 s after the stop before."""
-    messages: list[Msg] = []
-    x = 0.0
-    for nth in range(times * 12 * 4):
-        x += 0.0 if nth / 4 % 12 > 6 else 0.1
-        messages.append(odom(at(nth / 4), x, 0.0, 0.0))
-    return messages
-
-
-def recap_of(folder: Path, seconds: float) -> tuple[list[dict[str, Any]], int]:
-    """Its stops, and how long the reply is."""
-    span = {"start": BEGIN / S, "end": BEGIN / S + seconds}
-    reply = replied(memory_of(folder), folder, "recap", span).text
-    stops = [each for each in json.loads(reply)["events"] if each["text"].startswith("stood")]
-    return stops, len(reply)
-
-
-def test_a_recap_of_many_stops_is_short(tmp_path: Path) -> None:
-    messages = stopping(40)
-    for nth in range(40):
-        for text in ("far", "the planner failed to find a way around " * 4):
-            messages.append(log_entry(at(12 * nth + 6) + len(text), 40, "x" * 40, text))
-    write_splits(tmp_path, messages)
-    stops, size = recap_of(tmp_path, 480)
-    assert size < 6_000
-    listed = [change for each in stops for change in each.get("before", ())]
-    assert 1_000 < sum(len(change["text"]) + 30 for change in listed) <= 1_200
-    assert any("before" not in each for each in stops)
-
-
-def test_what_went_wrong_has_room_before_goals_that_merely_succeeded(tmp_path: Path) -> None:
-    messages, topic = stopping(24), f"/{'d' * 60}/_action/status"
-    for nth in range(24):
-        messages.append(goals(at(12 * nth + 1), {nth + 1: RUNNING}, topic))
-        messages.append(goals(at(12 * nth + 6), {nth + 1: SUCCEEDED}, topic))
-    messages.append(log_entry(at(12 * 22 + 5), 40, "motor", "81 C"))
-    write_splits(tmp_path, messages)
-    stops, _ = recap_of(tmp_path, 24 * 12)
-    assert len([each for each in stops if "81 C" in str(each.get("before"))]) == 1
-    assert any("before" not in each for each in stops)
 
 
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:

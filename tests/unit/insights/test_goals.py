@@ -62,25 +62,10 @@ DAY = history(
 )
 
 
-def test_each_goal_is_told_with_how_it_ended(tmp_path: Path) -> None:
-    assert told(tmp_path, DAY, 0, 70, cut=2, recalls=False) == [
-        ("goal", "/drive goal succeeded after 10 s", 10, 20, False),
-        ("failed goal", "/drive goal aborted after 12 s", 30, 42, False),
-        ("failed goal", "/drive goal canceled after 6 s", 50, 56, False),
-        ("goal", "/drive goal accepted", 60, None, True),
-    ]
-
-
 def test_what_ended_before_a_window_is_not_told_and_what_began_before_is(tmp_path: Path) -> None:
     assert told(tmp_path, DAY, 35, 52, recalls=False) == [
         ("failed goal", "/drive goal aborted, accepted before", 42, None, False),
         ("goal", "/drive goal accepted", 50, None, True),
-    ]
-
-
-def test_the_first_message_of_all_tells_nothing_of_what_ended(tmp_path: Path) -> None:
-    assert told(tmp_path, history((10, {1: 6, 2: 2}), (15, {2: 4})), 0, 20, recalls=False) == [
-        ("goal", "/drive goal succeeded after 5 s", 10, 15, False)
     ]
 
 
@@ -120,31 +105,6 @@ def found_in(
         for each in found.sightings
         if isinstance(each.value, dict)
     ]
-
-
-ABORTED = (2, "aborted", 30, 42, True)
-CANCELED = (3, "canceled", 50, 56, True)
-
-
-@pytest.mark.parametrize(
-    ("condition", "value", "field", "expected"),
-    [
-        ("equals", 6, "status_list.status", [ABORTED]),
-        ("equals", 6, None, [ABORTED]),
-        ("equals", "Aborted", None, [ABORTED]),
-        ("contains", "abort", "status", [ABORTED]),
-        ("equals", "failed", None, [CANCELED, ABORTED]),
-        ("above", 4, "status_list.status", [CANCELED, ABORTED]),
-        ("equals", "succeeded", None, [(1, "succeeded", 10, 20, True)]),
-        ("equals", "executing", None, [(4, "executing", 60, 60, True)]),
-        ("equals", "canceling", None, []),
-    ],
-)
-def test_a_search_finds_goals_by_how_they_ended(
-    tmp_path: Path, condition: str, value: JsonValue, field: str | None, expected: list[Found]
-) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
-    assert found_in(memory_of(tmp_path), condition, value, field) == expected
 
 
 def test_a_search_of_a_window_finds_what_ended_in_it(tmp_path: Path) -> None:
@@ -224,17 +184,6 @@ def test_a_goal_that_its_server_lost_is_known_until_it_was_listed_last(tmp_path:
     asked = {"topic": TOPIC, "condition_type": "equals", "value": "executing"}
     reply = json.loads(replied(memory, tmp_path, "find_matches", asked).text)
     assert any("1 goal whose end was not published" in note for note in reply["notes"])
-
-
-def test_the_state_before_a_moment_has_no_goal_that_its_server_lost(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", history((10, {1: 2}), (15, {1: 2}), (30, {})))
-    memory = memory_of(tmp_path)
-    states = [
-        json.loads(replied(memory, tmp_path, "recap", given).text)["state"]
-        for at in (20, 33)
-        for given in [{"around": BEGIN / S + at, "seconds_before": 25}]
-    ]
-    assert states == [{"/drive goal": "active"}, {"/drive goal": "listed no more"}]
 
 
 def test_a_goal_that_goes_on_lasts_as_far_as_something_is_recorded(tmp_path: Path) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
 from datetime import datetime
-from random import Random
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -115,16 +113,6 @@ def _without_ages(value: Any) -> Any:
     return value
 
 
-def test_where_not_all_are_counted_in_each_there_are_at_least_so_many(
-    memory: Memory, folder: Path
-) -> None:
-    few = {**HELLO, "where": "den", "limit": 1, "between": "23:58-00:05"}
-    reply = asked(memory, folder, "find_matches", **SPAN, **few)
-    counts = [row.get("total", row.get("at_least")) for row in reply["windows"]]
-    assert any("at_least" in row for row in reply["windows"])
-    assert reply["all"] == {"at_least": sum(counts)}
-
-
 def test_without_bounds_it_is_all_that_is_recorded(memory: Memory, folder: Path) -> None:
     reply = asked(memory, folder, "visits", where="kitchen", between=["23:00", "01:00"])
     assert [row["local"] for row in reply["windows"]] == [
@@ -176,57 +164,12 @@ def test_days_that_were_not_asked_in_time_leave_no_total(memory: Memory, folder:
     assert reply["all"] == {"at_least": whole["windows"][0]["total"]}
 
 
-@pytest.mark.parametrize(
-    ("tool", "given", "said"),
-    [
-        ("visits", {"between": "evening"}, 'between was "evening", which is not two times of day'),
-        ("visits", {"between": ["19:00"]}, "is not two times of day"),
-        ("visits", {"between": ["19:00", 99]}, "is not two times of day"),
-        ("visits", {"between": 19}, "is not two times of day"),
-        ("visits", {"between": "24:00-03:00"}, "is not two times of day"),
-        ("find_things", {"between": "19:00-22:00"}, 'unknown argument "between"'),
-        ("recap", {"between": "19:00-22:00", "around": BEGIN}, "cannot be combined with around"),
-    ],
-)
-def test_what_are_no_hours_is_named(
-    memory: Memory, folder: Path, tool: str, given: dict[str, Any], said: str
-) -> None:
-    reply = asked(memory, folder, tool, **given)
-    assert reply["error"] == "invalid_arguments"
-    assert said in reply["detail"]
-
-
 def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None:
     for day in (0, 40):
         write(draw(day, 20), tmp_path / f"day_{day}", begin=BEGIN + day * DAY_S)
     memory = asked_of(tmp_path, stored=False)
     reply = asked(memory, tmp_path, "visits", where="kitchen", between="19:00-22:00")
     assert "between takes at most 31 days: ask about a shorter window" in reply["detail"]
-
-
-def test_that_positions_are_noisy_is_said_once_in_a_reply(tmp_path: Path) -> None:
-    draw = Random("noise")
-    for day in range(3):
-        poses = [
-            odom((BEGIN + day * DAY_S) * S + n * S // 5, n / 50 + draw.gauss(0, 0.03), 0.0)
-            for n in range(500)
-        ]
-        write_mcap(tmp_path / f"rec_{day}" / f"rec_{day}_0.mcap", poses)
-    memory = memory_of(tmp_path)
-    evenings = {**SPAN, "between": "23:00-01:00"}
-    compared = {
-        **dict(zip(("start", "end"), (BEGIN, BEGIN + 600), strict=True)),
-        **dict(zip(("with_start", "with_end"), (BEGIN + DAY_S, BEGIN + DAY_S + 600), strict=True)),
-    }
-    for tool, given in (
-        ("trajectory_summary", evenings),
-        ("recap", evenings),
-        ("compare", compared),
-    ):
-        reply = asked(memory, tmp_path, tool, **given)
-        assert json.dumps(reply).count("the positions are noisy") == 1
-        sums = [row["path_sum_m"] for row in reply.get("windows", ())]
-        assert len({*sums}) == len(sums)
 
 
 @pytest.mark.parametrize(

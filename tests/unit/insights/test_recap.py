@@ -1,13 +1,9 @@
 from __future__ import annotations
 
-import json
-import math
-import random
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -19,10 +15,8 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
-from ros2_memory.insights.recap import MOST_EVENTS, recap
-from ros2_memory.queries import trajectory_summary
+from ros2_memory.insights.recap import recap
 from ros2_memory.results import Event, Recap
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     STATUS_FLAGS,
     Msg,
@@ -50,10 +44,6 @@ def over(memory: Memory, begin: float, end: float) -> Recap:
     return recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
 
 
-def shown(folder: Path, answer: object) -> Any:
-    return json.loads(Replies(folder, 24_000).answer(answer).text)  # type: ignore[arg-type]
-
-
 def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
     return [(each.text, (each.start - BEGIN) / S) for each in events if each.kind == kind]
 
@@ -76,79 +66,6 @@ def _drive(
         messages.append(odom(BEGIN + round(time * S), x, 0.0, 0.0))
     write_splits(bag_dir, messages, 7.3)
     return [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
-
-
-def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path) -> None:
-    [(began, ended)] = _drive(tmp_path, [(8.745, 0.5), (8.0, 0.0), (9.0, 0.5)], begin=260)
-    memory = memory_of(tmp_path)
-    answer = over(memory, 260, 286)
-    [stop] = [each for each in answer.events if each.kind == "stop"]
-    assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.0201)
-    assert ((stop.end or 0) - BEGIN) / S == pytest.approx(ended, abs=0.0201)
-    reply = shown(tmp_path, answer)
-    assert reply["shortest_stop_s"] == 3.0
-    assert reply["stood_s"] == pytest.approx(8.0, abs=0.0401)
-    assert reply["events"][0]["duration_s"] == reply["stood_s"]
-
-
-def test_the_last_moment_of_a_stop_is_no_stop_of_the_window_that_begins_there(
-    tmp_path: Path,
-) -> None:
-    [(began, ended), _] = _drive(
-        tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5), (4.0, 0.0), (20.0, 0.5)]
-    )
-    memory = memory_of(tmp_path)
-
-    def stops(begin: float, end: float) -> list[float]:
-        reply = asked(memory, tmp_path, "recap", start=BEGIN / S + begin, end=BEGIN / S + end)
-        return [each["duration_s"] for each in reply["events"]]
-
-    assert stops(ended - 0.021, ended + 5) == []
-    assert stops(began - 5, began + 1) == []
-    # In one of two windows it is, wherever they meet, and in one that it fills.
-    assert stops(ended - 5, ended + 5) == [pytest.approx(5.0, abs=0.03)]
-    assert stops(20, 24) == [pytest.approx(2.0, abs=0.03)] == stops(24, 30)
-    assert stops(began + 4, began + 4.5) == [0.5]
-    at = BEGIN / S
-    reply = asked(
-        memory,
-        tmp_path,
-        "compare",
-        start=at + ended - 0.021,
-        end=at + ended + 5,
-        with_start=at + 20,
-        with_end=at + 27,
-    )
-    assert reply["way"]["standstills"] == {"this": 0, "with": 1}
-
-
-def test_a_stop_goes_on_where_it_does_after_the_window_or_up_to_the_newest_pose(
-    tmp_path: Path,
-) -> None:
-    [(began, ended), _] = _drive(tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5), (5.0, 0.0)])
-    memory = memory_of(tmp_path)
-
-    def goes_on(end: float) -> list[bool]:
-        answer = over(memory, began - 2, end)
-        return [each.goes_on for each in answer.events if each.kind == "stop"]
-
-    assert goes_on(ended - 1) == [True]
-    assert goes_on(ended) == [False]
-    assert goes_on(ended + 3) == [False]
-    assert goes_on(ended + 20) == [False, True]
-
-
-def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
-    write_mcap(
-        tmp_path / "bag.mcap", [odom(BEGIN + at * S, 1.0, 2.0, 0.0) for at in range(0, 20, 2)]
-    )
-    memory = memory_of(tmp_path)
-    answer = over(memory, 6.5, 7.5)
-    assert answer.stood == S
-    assert answer.distance_m is None
-    assert any("no poses in this time" in note for note in answer.notes)
-    parts = [over(memory, at, at + 0.5).stood or 0 for at in (n / 2 for n in range(36))]
-    assert sum(parts) == over(memory, 0, 18).stood == 18 * S
 
 
 @settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -180,66 +97,6 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
         assert sum(stood) == pytest.approx(whole.stood or 0, abs=0.02 * S)
 
 
-@pytest.mark.parametrize(("hz", "noise"), [(10, 0.2), (1, 0.005)])
-def test_noise_that_hides_where_the_robot_stood_is_named(
-    tmp_path: Path, hz: int, noise: float
-) -> None:
-    draw = random.Random(3)
-    messages = [
-        odom(BEGIN + nth * S // hz, draw.gauss(0, noise), draw.gauss(0, noise), 0.0)
-        for nth in range(300 * hz)
-    ]
-    write_splits(tmp_path, messages, 60)
-    memory = memory_of(tmp_path)
-    reply = shown(tmp_path, over(memory, 0, 300))
-    assert reply["stood_s"] is None
-    assert any("too noisy, or too few" in note for note in reply["notes"])
-
-
-@pytest.mark.parametrize("hz", [0.39, 0.2])
-def test_poses_that_are_too_far_apart_do_not_show_whether_the_robot_stood(
-    tmp_path: Path, hz: float
-) -> None:
-    """It stands for 200 s, and drives for 40 s."""
-    at = [n / hz for n in range(round(240 * hz))]
-    poses = [odom(BEGIN + round(each * S), max(each - 200, 0) / 2, 0.0) for each in at]
-    write_splits(tmp_path, poses, 300)
-    assert over(memory_of(tmp_path), 0, 240).stood is None
-
-
-def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_path: Path) -> None:
-    draw = random.Random(3)
-    write_mcap(
-        tmp_path / "bag.mcap",
-        [odom(BEGIN + nth * S // 10, nth * 0.05, draw.gauss(0, 0.02), 0.0) for nth in range(300)],
-    )
-    answer = over(memory_of(tmp_path), 0, 30)
-    assert answer.stood == 0
-    assert not any("stood_s" in note for note in answer.notes)
-
-
-def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(tmp_path: Path) -> None:
-    along = [math.nan if nth < 100 or 150 <= nth < 180 else nth * 0.05 for nth in range(300)]
-    write_splits(tmp_path, [odom(BEGIN + n * S // 10, x, 0.0, 0.0) for n, x in enumerate(along)])
-    memory = memory_of(tmp_path)
-    none = over(memory, 0, 9.95)
-    assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
-    assert none.notes == (
-        "100 poses left out: their coordinates are not valid (NaN or out of range)",
-    )
-    some = over(memory, 10, 30)
-    assert some.distance_m == pytest.approx(0.05 * 168, abs=0.06)
-    assert some.stood == 0
-    assert "30 poses left out: their coordinates are not valid (NaN or out of range)" in some.notes
-    assert any("1 gap without a valid pose" in note for note in some.notes)
-    assert not any("nothing was recorded" in note for note in some.notes)
-    summary = trajectory_summary(
-        memory, Call(), TimeRange(start_s=BEGIN / S + 10, end_s=BEGIN / S + 30)
-    )
-    of_summary = shown(tmp_path, summary)["notes"]
-    assert {note for note in some.notes if "pose" in note} <= set(of_summary)
-
-
 def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
     """The status of a vehicle after so many seconds, with these of its 40 booleans true."""
     body = make(
@@ -250,19 +107,6 @@ def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") 
         **{name: name in set_flags for name in STATUS_FLAGS},
     )
     return Msg(topic, "px4_msgs/msg/VehicleStatus", BEGIN + round(at * S), body)
-
-
-@pytest.mark.parametrize("flag", ["flag_15", "flag_16", "flag_39"])
-def test_every_boolean_of_a_status_message_is_followed(tmp_path: Path, flag: str) -> None:
-    times_s = [nth * 0.5 for nth in range(80)]
-    write_splits(tmp_path, [_status(at, *([flag] if 13 <= at < 26 else [])) for at in times_s])
-    memory = memory_of(tmp_path)
-    answer = over(memory, 0, 40)
-    assert times(answer.events, "flip") == [
-        (f"/fmu/out/vehicle_status {flag} became true", 13.0),
-        (f"/fmu/out/vehicle_status {flag} became false", 26.0),
-    ]
-    assert not any("vehicle_status" in note for note in answer.notes)
 
 
 def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:
@@ -292,13 +136,6 @@ def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path) -> None:
     )
 
 
-def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [log_entry(BEGIN + S, 40, "planner", "no path " * 40)])
-    [event] = over(memory_of(tmp_path), 0, 10).events
-    assert event.text.startswith("error: planner: no path no path")
-    assert event.text.endswith("…")
-
-
 def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(tmp_path: Path) -> None:
     """It saw scissors for 5 s of 65, and the table all the time."""
     rows = [(at / 5, "scissors") for at in range(60, 85)]
@@ -316,30 +153,6 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(tmp_
     # What the memory does not hold was not looked at.
     assert over(memory, 0, 80).throughout == ()
     assert over(memory, -10, 60).throughout == ()
-
-
-def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
-    blinking = [boolean(BEGIN + at * S, at % 2 == 0) for at in range(20)]
-    things = [
-        detections(BEGIN + at * S, [f"thing {at // 5}"] if at % 5 == 0 else []) for at in range(100)
-    ]
-    write_splits(tmp_path, [*blinking, *things], 100)
-    answer = over(memory_of(tmp_path), 0, 100)
-    assert len(answer.events) == MOST_EVENTS
-    assert len(times(answer.events, "flip")) == 19
-    assert dict(answer.counts) == {"on/off changes": 19, "sightings": 20}
-    assert any("left out, because there are too many: 14 sightings" in n for n in answer.notes)
-    assert [each.start for each in answer.events] == sorted(each.start for each in answer.events)
-    reply = shown(tmp_path, answer)
-    assert len(json.dumps(reply)) < 3_700
-    assert {*reply["events"][0]} == {"timestamp", "ago_s", "text", "duration_s", "score"}
-
-
-def test_a_stop_a_hair_below_0_is_reported_without_a_sign(tmp_path: Path) -> None:
-    stood = [odom(BEGIN + at * S // 2, -0.0001, 2.0, 0.0) for at in range(40)]
-    write_mcap(tmp_path / "bag.mcap", stood)
-    answer = [each.text for each in over(memory_of(tmp_path), 0, 30).events]
-    assert answer == ["stood at x 0.00, y 2.00"]
 
 
 def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> None:
@@ -542,21 +355,6 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
 
 
-def test_what_one_of_two_detectors_still_sees_is_in_view(tmp_path: Path) -> None:
-    messages = [
-        each
-        for at in range(100)
-        for each in (
-            detections(BEGIN + at * S - S // 5, ["cup"] if at > 60 else [], topic="/b"),
-            detections(BEGIN + at * S, ["cup"] if at >= 60 else [], topic="/a"),
-        )
-    ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    found = over(memory_of(tmp_path), 0, 99.5)
-    [cup] = [each for each in found.events if "cup" in each.text]
-    assert cup.goes_on
-
-
 @needs_recorded
 def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path) -> None:
     session = SESSIONS["session_mcap"]
@@ -582,24 +380,3 @@ def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path) -> None:
         else:
             assert event.end is not None
             assert abs(unix_from_ns(event.end - event.start) - length) < 0.05
-
-
-def test_a_gap_in_the_memory_is_reported(tmp_path: Path) -> None:
-    seconds = [*range(10), *range(100, 110)]
-    write_splits(tmp_path, [odom(BEGIN + t * S, 0.1 * t, 0.0, 0.0) for t in seconds])
-    answer = over(memory_of(tmp_path), 0, 120)
-    [gap] = [each for each in answer.events if each.kind == "gap"]
-    assert ((gap.start - BEGIN) / S, ((gap.end or 0) - BEGIN) / S) == (9.0, 100.0)
-
-
-def test_errors_in_logs_are_reported_once_with_their_count(tmp_path: Path) -> None:
-    said = [(1, 20, "all well"), (2, 40, "no path"), (3, 40, "no path"), (4, 50, "giving up")]
-    messages = [log_entry(BEGIN + at * S, level, "planner", msg) for at, level, msg in said]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    answer = over(memory_of(tmp_path), 0, 10)
-    assert times(answer.events, "error") == [
-        ("error: planner: no path (2 times)", 2.0),
-        ("error: planner: giving up", 4.0),
-    ]
-    assert answer.distance_m is None
-    assert any("the path is unknown" in note for note in answer.notes)

@@ -20,18 +20,14 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord, TriggerState
-from ros2_memory.config import load_settings
-from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
+from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights import saved_moments
 from ros2_memory.insights.saved_moments import (
-    MAX_LISTED,
     list_moments,
     remember_moment,
-    show_moment,
 )
-from ros2_memory.insights.status import MAX_MOMENTS
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
@@ -81,17 +77,6 @@ def shown(memory: Memory, folder: Path) -> Any:
     return json.loads(Replies(folder, 24_000).answer(list_moments(memory, Call())).text)
 
 
-def test_a_moment_of_another_recording_is_none_where_one_alone_answers(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
-    beating(tmp_path)
-    with recorder_at_work(tmp_path, SettableClock(NOW)):
-        name = remember(memory).moment
-    assert show_moment(memory, Call(), name).stored.folder.name == name
-    other = replace(memory, limits=replace(memory.limits, recording="theirs"))
-    with pytest.raises(InvalidArgumentsError, match="0 moments are saved"):
-        show_moment(other, Call(), name)
-
-
 def requests(bag_dir: Path) -> list[Path]:
     folder = bag_dir / REQUESTS_FOLDER
     return list(folder.iterdir()) if folder.exists() else []
@@ -138,13 +123,6 @@ def test_what_the_recorder_refuses_is_reported_with_its_reason(tmp_path: Path) -
     reply = Replies(tmp_path, 24_000).error(RefusedError("there is no room"))
     assert json.loads(reply.text) == {"error": "refused", "detail": "there is no room"}
     assert reply.is_error
-
-
-def test_where_nothing_is_recorded_nothing_can_be_kept(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, QuerySettings())
-    beating(tmp_path)
-    assert "recorder=none" in refusal(memory)
-    assert requests(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -202,36 +180,11 @@ def test_a_server_that_may_not_write_there_says_where(tmp_path: Path) -> None:
     assert ".episodic/requests" in refusal(memory)
 
 
-def test_with_simulated_time_now_is_the_newest_recorded_moment(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, replace(RECORDS, now="latest"))
-    beating(tmp_path)
-    with recorder_at_work(tmp_path, SettableClock(NOW)):
-        told = remember(memory, before=5)
-    assert (told.start, told.end) == (T0 + 54 * S, T0 + 59 * S)
-    assert told.bags == 1
-
-
 class TestTheList:
     def keep(self, bag_dir: Path, number: int, **more: Any) -> None:
         end = T0 + number * S
         wish = SaveRequest(f"{number:032x}", f"number {number}", end - S, end, NOW)
         write_saved_moment(make_moment_folder(bag_dir, wish), replace(SavedMoment(wish), **more))
-
-    def test_it_has_the_newest_first_and_counts_the_others(self, tmp_path: Path) -> None:
-        for number in range(MAX_LISTED + 3):
-            self.keep(tmp_path, number, pending=False)
-        told = shown(memory_of(tmp_path, clock=SettableClock(NOW)), tmp_path)
-        assert [each["label"] for each in told["moments"]][:2] == ["number 22", "number 21"]
-        assert len(told["moments"]) == MAX_LISTED
-        assert told["more"] == 3
-
-    def test_a_status_has_the_newest_and_counts_all(self, tmp_path: Path) -> None:
-        memory = memory_of(tmp_path, clock=SettableClock(NOW))
-        for number in range(MAX_MOMENTS + 2):
-            self.keep(tmp_path, number, pending=False)
-            status = asked(memory, tmp_path, "memory_status")
-            assert status["moments"] == shown(memory, tmp_path)["moments"][:MAX_MOMENTS]
-            assert status.get("moments_count") == (number + 1 if number >= MAX_MOMENTS else None)
 
     def test_rules_are_told_with_how_often_they_fired(self, tmp_path: Path) -> None:
         (tmp_path / ".episodic").mkdir()
@@ -273,27 +226,12 @@ class TestTheList:
         [told] = shown(memory_of(tmp_path, clock=SettableClock(NOW)), tmp_path)["moments"]
         assert (told["complete"], told["notes"]) == (False, ["the share was used up"])
 
-    def test_it_is_empty_where_nothing_is_kept(self, tmp_path: Path) -> None:
-        assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
-
     def test_a_file_in_the_place_of_the_folder_holds_none(self, tmp_path: Path) -> None:
         (tmp_path / MOMENTS_FOLDER).write_text("no folder")
         assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
 
 
 class TestTheTool:
-    @pytest.mark.parametrize(("preset", "offered"), [("robot", True), ("query_only", False)])
-    def test_it_is_on_where_the_robot_records(self, preset: str, offered: bool) -> None:
-        assert load_settings((), {"MEMORY_DEPLOYMENT": preset}).server.write_tools is offered
-
-    def test_it_is_offered_only_where_writing_is_allowed(self) -> None:
-        reading = {tool.name for tool in build_tools(QuerySettings())}
-        writing = {tool.name: tool for tool in build_tools(QuerySettings(), writing=True)}
-        assert writing.keys() - reading == {"remember_moment"}
-        assert [name for name, tool in writing.items() if tool.writes] == ["remember_moment"]
-        spec = build_tools(QuerySettings(), additions=False, writing=True)
-        assert not [tool for tool in spec if tool.writes]
-
     @pytest.mark.parametrize(
         ("given", "said"),
         [

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.insights.sightings import find_matches
-from tests.support.bags import Msg, log_entry, make, write_mcap
+from tests.support.bags import Msg, make, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import each_way, memory_of, with_store
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     pass
@@ -67,40 +67,3 @@ def test_messages_of_one_log_time_are_told_apart(seed: int, part: float) -> None
             for asked_for in {*thirds[:3]}:
                 found = find_matches(memory, Call(), "/load", "equals", asked_for, limit=50)
                 assert sum(each.messages for each in found.sightings) == thirds.count(asked_for)
-
-
-@each_way
-def test_a_sighting_shows_its_own_message_of_those_of_one_log_time(
-    tmp_path: Path, *, recalls: bool
-) -> None:
-    entries = [
-        log_entry(BEGIN, 30, "planner", "a stuck wheel"),
-        log_entry(BEGIN, 30, "planner", "all is well"),
-        log_entry(BEGIN, 30, "planner", "stuck again"),
-        log_entry(BEGIN, 30, "planner", "all is well"),
-    ]
-    loads = [
-        Msg("/load", FLOAT, BEGIN + at * S, make(FLOAT, data=load))
-        for at, load in [(0, 7.0), (1, 8.0), (1, 1.0), (1, 9.0), (1, 9.5), (1, 2.0)]
-    ]
-    write_mcap(tmp_path / "a" / "a_0.mcap", [*entries, *loads])
-    memory = memory_of(tmp_path, limits=LATEST, recalls=recalls)
-    for oldest_first in (False, True):
-        order = -1 if oldest_first else 1
-        found = find_matches(
-            memory, Call(), "/rosout", "contains", "stuck", oldest_first=oldest_first
-        )
-        texts = [each.matched for each in found.sightings]
-        assert texts[::order] == [("stuck again",), ("a stuck wheel",)]
-        found = find_matches(
-            memory,
-            Call(),
-            "/load",
-            "above",
-            5,
-            field="value",
-            fields=("value",),
-            oldest_first=oldest_first,
-        )
-        loads_shown = [each.value for each in found.sightings]
-        assert loads_shown[::order] == [{"value": 9.5}, {"value": 8}]

@@ -3,8 +3,6 @@ from __future__ import annotations
 import json
 import math
 import random
-from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -23,9 +21,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline, unix_from_ns
-from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -34,7 +30,6 @@ from ros2_memory.places.where import WhileCondition
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     boolean,
-    command,
     detections,
     diagnostics,
     log_entry,
@@ -48,7 +43,7 @@ from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.examples import examples
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -99,30 +94,6 @@ def seconds(memory: Memory, value: str, topic: str, **given: object) -> list[tup
     return [((each.first - BEGIN) / S, (each.last - BEGIN) / S) for each in answer.sightings]
 
 
-@each_way
-def test_detections_of_a_low_score_count_only_where_none_is_asked_for(
-    tmp_path: Path, recalls: bool
-) -> None:
-    scores = (0.9, 0.9, 0.4, 0.4, 0.9, 0.3)
-    write_mcap(
-        tmp_path / "bag.mcap",
-        [detections(BEGIN + at * S, ["cup"], score=score) for at, score in enumerate(scores)],
-    )
-    memory = memory_of(tmp_path, recalls=recalls)
-    assert seconds(memory, "cup", OBJECTS) == [(0, 5)]
-    assert seconds(memory, "cup", OBJECTS, min_score=0.4) == [(0, 4)]
-    assert seconds(memory, "cup", OBJECTS, min_score=0.9) == [(4, 4), (0, 1)]
-    assert seconds(memory, "cup", OBJECTS, min_score=0.95) == []
-    strict = replace(memory, limits=replace(memory.limits, min_score=0.5))
-    assert seconds(strict, "cup", OBJECTS) == [(4, 4), (0, 1)]
-    assert seconds(strict, "cup", OBJECTS, min_score=0) == [(0, 5)]
-    found = queries.find_last_match(strict, Call(), OBJECTS, "contains", "cup").found
-    assert found is not None
-    assert found.sample.time == BEGIN + 4 * S
-    [unsure] = find_matches(memory, Call(), OBJECTS, "contains", "cup").sightings
-    assert unsure.score == pytest.approx(0.3)
-
-
 def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["cup"], score=0.2)])
     memory = memory_of(tmp_path, limits=QuerySettings(min_score=0.5))
@@ -133,63 +104,11 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     assert note in queries.find_last_match(*asked).notes
 
 
-def test_never_of_a_plural_says_that_the_singular_was_found(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["coffee mug"])])
-    memory = memory_of(tmp_path)
-    for kind, words in product(("contains", "equals"), ("coffee mugs", "a coffee mug")):
-        asked = (memory, Call(), OBJECTS, kind, words)
-        note = f'"{words}" was not found, but "coffee mug" was, last at {BEGIN / S:.6f}'
-        assert find_matches(*asked).notes == (note,)
-        assert queries.find_last_match(*asked).notes == (note,)
-        assert note in count_matches(*asked, by="day").notes
-    never = (memory, Call(), OBJECTS, "contains", "scissors")
-    assert find_matches(*never).notes == ()
-    assert queries.find_last_match(*never).notes == ()
-
-
 def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["scissors"])])
     note = f'"the scissors" was not found, but "scissors" was, last at {BEGIN / S:.6f}'
     found = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "the scissors")
     assert found.notes == (note,)
-
-
-def test_never_of_a_plural_while_something_holds_claims_nothing_of_other_times(
-    tmp_path: Path,
-) -> None:
-    states = [boolean(BEGIN, data=True), boolean(BEGIN + 9 * S, data=False)]
-    write_mcap(tmp_path / "bag.mcap", [*states, detections(BEGIN + S, ["mugs"])])
-    question = (memory_of(tmp_path), Call(), OBJECTS, "contains", "mugs")
-    assert find_matches(*question).total == 1
-    never = find_matches(*question, during=[WhileCondition("/bumper", "equals", False)])
-    assert never.total == 0
-    assert never.notes == ()
-    counted = count_matches(
-        *question, by="day", during=[WhileCondition("/bumper", "equals", False)]
-    )
-    assert not any("was not found" in note for note in counted.notes)
-
-
-def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0), text(BEGIN, "[]", topic="/seen")])
-    memory = memory_of(tmp_path)
-    place: JsonValue = {"x": 9.0, "y": 9.0}
-    asked = (memory, Call(), "/odom", "near_position", place)
-    note = (
-        "near_position compared x and y (within 0.5 m) in the frame of each message: odom (/odom); "
-        "for a place in another frame, such as the map, ask visits, or give where"
-    )
-    assert note in find_matches(*asked).notes
-    high = find_matches(*asked[:3], "near_position", {"x": 1.0, "y": 2.0, "z": 9.0})
-    assert high.notes[0].startswith("near_position compared x, y and z (within 0.5 m)")
-    found = find_matches(*asked[:2], "/odom", "near_position", {"x": 1.0, "y": 2.0})
-    assert (len(found.sightings), note in found.notes) == (1, True)
-    during = WhileCondition("/odom", "near_position", place)
-    assert note in find_matches(*asked[:2], "/seen", "contains", "x", during=(during,)).notes
-    # By the specification its reply is null where nothing is in doubt.
-    assert queries.find_last_match(*asked).notes == ()
-    (tmp_path / "broken.mcap").write_bytes(b"no bag")
-    assert queries.find_last_match(memory_of(tmp_path), *asked[1:]).notes[-1] == note
 
 
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
@@ -253,50 +172,6 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 
 
-def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path) -> None:
-    """Of a topic that states it every 5 s, over two bags, with a silence in the second one."""
-    busy, idle = [10, 15, 25, 30, 55, 65], [0, 5, 20, 60]
-    messages = [
-        text(BEGIN + at * S, "busy" if at in busy else "idle", topic="/mode")
-        for at in sorted(busy + idle)
-    ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages[:4])
-    write_mcap(tmp_path / "rec" / "rec_1.mcap", messages[4:])
-    memory = memory_of(tmp_path)
-    state = {"topic": "/mode", "condition_type": "equals", "value": "busy"}
-    began = BEGIN / S
-
-    def lasted(**given: object) -> list[tuple[float, float, float]]:
-        reply = asked(memory, tmp_path, "find_matches", **state, **given)
-        return [
-            (each["first_seen"] - began, each["last_seen"] - began, each["duration_s"])
-            for each in reply["sightings"]
-        ]
-
-    # Over the bags' edge; up to a silence; and up to the newest message.
-    assert lasted() == [(65, 65, 0), (55, 55, 5), (25, 30, 5), (10, 15, 10)]
-    # To the end of the window, as far as that is known.
-    assert lasted(start=began + 10, end=began + 18) == [(10, 15, 8)]
-    assert lasted(end=began + 40) == [(25, 30, 5), (10, 15, 10)]
-    assert lasted(**{"while": state}) == lasted()
-    reply = asked(memory, tmp_path, "find_matches", **state, by="day")
-    seconds = reply["columns"].index("seconds")
-    assert reply["all"][seconds - 1] == 20
-
-
-def test_the_window_and_the_limit_bound_what_is_reported(tmp_path: Path) -> None:
-    said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
-    memory = spoken(tmp_path, *said)
-    at = BEGIN / S
-    assert seconds(memory, "cup", OBJECTS, start_s=at + 5, end_s=at + 9) == [(9, 9), (7, 7), (5, 5)]
-    answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=3)
-    assert [(each.last - BEGIN) // S for each in answer.sightings] == [19, 17, 15]
-    assert answer.more
-    assert answer.total is None
-    whole = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=10)
-    assert (whole.more, whole.total) == (False, 10)
-
-
 def test_the_last_seconds_count_from_now(tmp_path: Path) -> None:
     spoken(tmp_path, *((float(t), "cup" if t % 2 else "") for t in range(20)))
     memory = memory_of(tmp_path, clock=FixedClock(BEGIN + 25 * S))
@@ -307,38 +182,6 @@ def test_the_last_seconds_count_from_now(tmp_path: Path) -> None:
         find_matches(memory, Call(), OBJECTS, "contains", "cup", last_s=5.0, end_s=4.0)
     with pytest.raises(InvalidArgumentsError, match="is before start"):
         find_matches(memory, Call(), OBJECTS, "contains", "cup", start_s=5.0, end_s=4.0)
-
-
-def test_a_sighting_has_the_texts_of_its_last_message_that_matched(tmp_path: Path) -> None:
-    memory = spoken(tmp_path, (1, "phone"), (2, "Headphones cup phone Headphones"), (3, "cup"))
-    [both] = find_matches(memory, Call(), OBJECTS, "contains", "phone").sightings
-    assert both.matched == ("Headphones", "phone")
-    [one] = find_matches(memory, Call(), OBJECTS, "equals", "phone").sightings
-    assert one.matched == ("phone",)
-    [named] = find_matches(
-        memory, Call(), OBJECTS, "contains", "phone", field="detections.label"
-    ).sightings
-    assert named.matched == ("Headphones", "phone")
-    reply = asked(memory, tmp_path, "find_matches", topic=OBJECTS, condition_type="contains",
-                  value="phone")  # fmt: skip
-    assert reply["sightings"][0]["matched"] == ["Headphones", "phone"]
-
-
-def test_only_a_few_texts_are_shown_and_not_whole(tmp_path: Path) -> None:
-    memory = spoken(tmp_path, (1, " ".join(f"cup{n}" + "x" * 300 for n in range(8))))
-    reply = asked(memory, tmp_path, "find_matches", topic=OBJECTS, condition_type="contains",
-                  value="cup")  # fmt: skip
-    [seen] = reply["sightings"]
-    assert [len(each) for each in seen["matched"]] == [200] * 5
-    assert seen["matched_count"] == 8
-
-
-def test_what_is_no_text_has_no_matched_texts(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [boolean(BEGIN, True)])
-    memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "find_matches", topic="/bumper", condition_type="equals",
-                  value=True)  # fmt: skip
-    assert not {"matched", "value"} & reply["sightings"][0].keys()
 
 
 def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path) -> None:
@@ -355,28 +198,6 @@ def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: 
     }
     refused = asked(memory, tmp_path, "find_matches", topic="/odom", fields=["nope"], **fast)
     assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
-
-
-def test_a_thing_is_reported_in_the_map_where_transforms_lead_there(tmp_path: Path) -> None:
-    seen = detections(BEGIN + S, ["cup"], at=(1.0, 0.0, 0.5))
-    messages = [
-        odom(BEGIN + S - 1, 3.0, 0.0, 0.0),
-        tf(BEGIN, transform(BEGIN, "map", "odom", (10.0, 0.0, 0.0)), topic="/tf_static"),
-        tf(BEGIN, transform(BEGIN, "odom", "base_link", (3.0, 0.0, 0.0))),
-        tf(BEGIN + 2 * S, transform(BEGIN + 2 * S, "odom", "base_link", (3.0, 0.0, 0.0))),
-        seen,
-    ]
-    write_mcap(tmp_path / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
-    memory = memory_of(tmp_path)
-    [sighting] = find_matches(memory, Call(), seen.topic, "contains", "cup").sightings
-    assert sighting.thing is not None
-    assert sighting.thing.frame_id == "map"
-    assert sighting.thing.position == pytest.approx((14.0, 0.0, 0.5))
-    plain = replace(memory, limits=replace(memory.limits, map_frame=None))
-    [again] = find_matches(plain, Call(), seen.topic, "contains", "cup").sightings
-    assert again.thing is not None
-    assert again.thing.frame_id == "odom"
-    assert again.thing.position == pytest.approx((4.0, 0.0, 0.5))
 
 
 def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
@@ -544,89 +365,3 @@ def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
     refused = asked(memory, tmp_path, name, **asks, **{topic: "/bumper"})
     assert refused["error"] == "invalid_arguments"
     assert "names of levels are not known of std_msgs/msg/Bool" in refused["detail"]
-
-
-def test_a_condition_takes_the_path_of_a_field_in_the_message(tmp_path: Path) -> None:
-    driven = [odom(BEGIN + n * S, 0.0, n / 2) for n in range(4)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*driven, command(BEGIN, 0.5)])
-    memory = memory_of(tmp_path)
-    for topic, paths, limit in (
-        ("/odom", ("pose.pose.position.y", "position.y"), 0.9),
-        ("/cmd_vel", ("linear.x", "linear_velocity.x"), 0.4),
-    ):
-        raw, mapped = (
-            asked(
-                memory,
-                tmp_path,
-                "find_matches",
-                topic=topic,
-                condition_type="above",
-                value=limit,
-                field=path,
-            )["sightings"]
-            for path in paths
-        )
-        assert raw == mapped
-        assert len(raw) == 1
-
-
-@pytest.mark.parametrize("pause_s", [0.05, 2.0, 8.0])
-def test_a_sighting_across_a_restart_of_the_recording_has_the_robots_place(
-    tmp_path: Path, pause_s: float
-) -> None:
-    """The bumper is pressed from 40 s on, the recorder is started again at 50 s."""
-    for nth in range(2):
-        begin = BEGIN + round(nth * (50 + pause_s) * S)
-        steps = [(begin + step * S // 5, step) for step in range(250)]
-        messages = [odom(at, step * 0.1, float(nth)) for at, step in steps]
-        messages += [boolean(at, nth == 1 or step >= 200) for at, step in steps if step % 5 == 0]
-        write_mcap(tmp_path / f"run_{nth}" / f"run_{nth}_0.mcap", messages)
-    memory = memory_of(tmp_path)
-    asks = {"topic": "/bumper", "condition_type": "equals", "value": True}
-    [found] = asked(memory, tmp_path, "find_matches", **asks)["sightings"]
-    assert found["first_seen"] == BEGIN / S + 40
-    assert found["robot"] == pytest.approx(
-        {"at": "first_seen", "x": 20.0, "y": 0.0, "z": 0.0, "yaw_deg": 0.0, "frame_id": "odom"}
-    )
-    table = asked(memory, tmp_path, "find_matches", **asks, by="day")
-    row = dict(zip(table["columns"][1:], table["all"], strict=True))
-    unrecorded = pause_s + 0.2 if pause_s > 1 else 0.0
-    assert row["recorded_s"] == pytest.approx(100 + pause_s - 0.2 - unrecorded, abs=0.06)
-    assert row["recorded_s"] - 1.0 <= row["topic_s"] <= row["recorded_s"]
-
-
-def test_the_named_place_of_a_thing_is_told_with_its_coordinates(tmp_path: Path) -> None:
-    messages = []
-    for second in range(5):
-        at = BEGIN + second * S
-        messages += [
-            odom(at, 2.0, 0.0),
-            tf(at, transform(at, "odom", "base_link", (2.0, 0.0, 0.0))),
-        ]
-        messages += [detections(at, ["cup"], at=(1.0, 0.0, 0.5))]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    places = tuple(
-        Place(name, "odom", Circle(x, 0.0, 0.6)) for name, x in (("shelf", 3.0), ("chair", 2.0))
-    )
-    memory = memory_of(tmp_path, limits=QuerySettings(places=places))
-    asked_for = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
-    [sighting] = asked(memory, tmp_path, "find_matches", **asked_for)["sightings"]
-    assert sighting["place"] == {"x": 3.0, "y": 0.0, "z": 0.5, "in": "shelf", "frame_id": "odom"}
-    assert sighting["robot"]["in"] == "chair"
-
-
-def test_a_message_that_is_null_meets_no_condition(tmp_path: Path) -> None:
-    def fill(writer: Writer) -> None:
-        channel = writer.register_channel(
-            "/mode", "json", writer.register_schema("Mode", "jsonschema", b"{}")
-        )
-        for n, payload in enumerate([b'{"on": true}', b"null", b'{"on": false}']):
-            writer.add_message(channel, BEGIN + n * S, payload, BEGIN + n * S)
-
-    raw_mcap(tmp_path / "rec" / "rec_0.mcap", fill)
-    question = {"topic": "/mode", "condition_type": "equals", "value": True, "field": "on"}
-    for oldest_first in (False, True):
-        reply = asked(
-            memory_of(tmp_path), tmp_path, "find_matches", oldest_first=oldest_first, **question
-        )
-        assert [each["first_seen"] for each in reply["sightings"]] == [BEGIN / S]

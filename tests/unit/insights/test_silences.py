@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -46,36 +46,6 @@ def bag_dir(memory: Memory) -> Iterator[Path]:
     LOST.replace(memory.index.bag_dir, [])
 
 
-def row(end: float | None) -> dict[str, Any]:
-    return {
-        "topic": SEEN,
-        "start": BEGIN + 99.000001,
-        "end": end,
-        "silent_s": pytest.approx(91.0),
-    }
-
-
-def test_the_span_of_the_memory_lists_the_silence(memory: Memory, bag_dir: Path) -> None:
-    reply = asked(memory, bag_dir, "data_time_range")
-    assert reply["silences"] == [row(BEGIN + 190.000001)]
-    assert reply["gaps"] == []
-    assert asked(memory, bag_dir, "memory_status")["silences"] == reply["silences"]
-
-
-def test_messages_deleted_by_request_are_no_silence(memory: Memory, bag_dir: Path) -> None:
-    start, stop = (BEGIN + 100) * S, (BEGIN + 189) * S
-    lost = [Loss("/other", start, stop, 9, "forgotten"), Loss(SEEN, 0, BEGIN * S, 9, "forgotten")]
-    append_losses(bag_dir, lost)
-    assert asked(memory, bag_dir, "memory_status")["silences"] == [row(BEGIN + 190.000001)]
-    append_losses(bag_dir, [Loss(SEEN, start, stop, 90, "forgotten")])
-    status = asked(memory, bag_dir, "memory_status")
-    assert status["silences"] == []
-    assert "deleted by request" in status["doubts"]
-    assert f"{SEEN} was silent" not in status["doubts"]
-    [note] = asked(memory, bag_dir, "find_last_match", **NEVER)["notes"]
-    assert "deleted by request" in note
-
-
 def test_around_what_was_deleted_by_request_a_silence_stays_one(
     memory: Memory, bag_dir: Path
 ) -> None:
@@ -114,17 +84,6 @@ def test_never_seen_names_when_the_detector_was_silent(memory: Memory, bag_dir: 
     held = {"value_topic": "/odom", "condition_topic": SEEN}
     when = {**held, "condition_type": "contains", "value": "unicorn"}
     assert asked(memory, bag_dir, "get_value_when", **when)["notes"] == [note]
-
-
-def test_what_was_searched_without_the_silence_does_not_name_it(
-    memory: Memory, bag_dir: Path
-) -> None:
-    early = asked(memory, bag_dir, "find_last_match", **NEVER, before=BEGIN + 80)
-    late = asked(memory, bag_dir, "find_matches", **NEVER, start=BEGIN + 200, end=BEGIN + 290)
-    assert early is None
-    assert "silent" not in str(late.get("notes"))
-    other = {"topic": "/bumper", "condition_type": "equals", "value": False}
-    assert asked(memory, bag_dir, "find_last_match", **other) is None
 
 
 def test_several_topics_that_fall_silent_together_are_one_event(tmp_path: Path) -> None:

@@ -1,11 +1,9 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
-import anyio
 import pytest
 from mcap.writer import Writer
 
@@ -22,7 +20,6 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.status import memory_status
 from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.serving.health import Health
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     McapLayout,
@@ -30,9 +27,6 @@ from tests.support.bags import (
     boolean,
     log_entry,
     odom,
-    text,
-    tf,
-    transform,
     write_mcap,
 )
 from tests.support.clocks import SettableClock
@@ -51,7 +45,6 @@ BEGIN = 1_784_000_000 * S
 
 
 DRIVEN = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)]
-FLAGS = [boolean(BEGIN + t * 60 * S, True) for t in range(61)]
 
 
 def remembering(
@@ -89,18 +82,6 @@ def shown(memory: Memory, folder: Path) -> dict[str, Any]:
     return reply
 
 
-def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
-    beating(tmp_path, RecorderState.RECORDING, 59)
-    told = shown(memory, tmp_path)
-    assert told["doubts"] == "no loss or fault was found"
-    assert (told["recorder"], told["recorder_alive"]) == ("recording", True)
-    assert told["newest_age_s"] == 11.0
-    assert told["never_heard"] == ["/b"]
-    assert (told["restarts"], told["missing"]) == (0, [])
-    assert told["fell_silent"] == []
-
-
 def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> None:
     """The robot died at 10 s, and the recorder logs each split that it opens."""
     driven = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(11)]
@@ -114,28 +95,6 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     ahead = BEGIN + 365 * 86_400 * S
     write_mcap(tmp_path / "rec" / "ahead.mcap", [odom(ahead, 0.0, 0.0, 0.0)])
     assert shown(memory, tmp_path)["newest_age_s"] == 50.0
-
-
-def test_where_another_program_records_the_status_says_so(tmp_path: Path) -> None:
-    finished = shown(remembering(tmp_path, [text(BEGIN, "x")]), tmp_path)
-    assert finished["recorder"] is None
-    bag = tmp_path / "rec" / "rec_0.mcap"
-    write_mcap(bag, [text(BEGIN + each * S, "x") for each in range(50)])
-    written = bag.read_bytes()
-    clock = SettableClock(BEGIN + 60 * S)
-    memory = memory_of(tmp_path, clock=clock)
-    for second, end in ((59, 600), (62, 300)):
-        bag.write_bytes(written[:-end])
-        os.utime(bag, (BEGIN // S + second, BEGIN // S + second))
-        clock.at = BEGIN + (second + 1) * S
-        status = shown(memory, tmp_path)
-        # A file without an end that nobody was seen to write to may be left of a crash.
-        expected = "another recorder" if second == 62 else None
-        assert status["recorder"] == expected
-        assert not status["recorder_alive"]
-    beating(tmp_path, RecorderState.RECORDING, 59.0)
-    status = shown(memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S)), tmp_path)
-    assert status["recorder"] == "recording"
 
 
 def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole(
@@ -208,18 +167,6 @@ def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_p
     )
 
 
-def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
-    beating(tmp_path, RecorderState.RECORDING, 59, age_held="72 bags stay")
-    told = shown(memory, tmp_path)
-    assert told["notes"] == ["72 bags stay"]
-    assert told["doubts"] == "no loss or fault was found"
-    beating(tmp_path, RecorderState.RECORDING, 59, unshipped="2 bags were deleted unshipped")
-    assert shown(memory, tmp_path)["notes"] == ["2 bags were deleted unshipped"]
-    beating(tmp_path, RecorderState.STOPPED, -100, age_held="72 bags stay")
-    assert "notes" not in shown(memory, tmp_path)
-
-
 def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
     beating(tmp_path, RecorderState.RECORDING, 59, held_back="1 split is not served")
@@ -243,57 +190,6 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     assert ("the recorder died" in reply["doubts"]) == (now == "wall")
 
 
-def test_a_recorder_that_is_started_beside_a_server_of_bags_to_replay_is_shown(
-    tmp_path: Path,
-) -> None:
-    memory = remembering(tmp_path, seconds=60)
-    memory = replace(memory, limits=QuerySettings(now="latest"))
-    assert shown(memory, tmp_path)["recorder"] is None
-    beating(tmp_path, RecorderState.RECORDING, 59)
-    reply = shown(memory, tmp_path)
-    assert (reply["recorder"], reply["recorder_alive"]) == ("recording", True)
-    health = anyio.run(Health(memory, "1"))
-    assert health["recorder"]["live"] is True  # type: ignore[index,call-overload]
-
-
-def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
-    missing = tuple(f"/gone_{n:02}" for n in range(30))
-    beating(tmp_path, RecorderState.RECORDING, 59, restarts=3, missing=missing)
-    told = shown(memory, tmp_path)
-    assert told["restarts"] == 3
-    assert told["missing"] == [*missing[: len(told["missing"])]]
-    assert told["missing_count"] == 30
-
-
-@pytest.mark.parametrize(
-    ("state", "at", "more", "doubts"),
-    [
-        (RecorderState.RECORDING, -100, {}, "the recorder died"),
-        (RecorderState.PAUSED, 59, {}, "the recorder is paused: it gives no reason"),
-        (RecorderState.WAITING, 59, {"waiting_for": "no clock"}, "the recorder waits: no clock"),
-        (RecorderState.STOPPED, 59, {}, "no loss or fault was found"),
-    ],
-)
-def test_a_recorder_that_does_not_record_is_reported(
-    tmp_path: Path, state: RecorderState, at: float, more: dict[str, str], doubts: str
-) -> None:
-    memory = remembering(tmp_path)
-    beating(tmp_path, state, at, **more)
-    assert shown(memory, tmp_path)["doubts"] == doubts
-
-
-def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Path) -> None:
-    messages = [
-        *(odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(100)),
-        *(boolean(BEGIN + t * S, True) for t in range(80)),  # a second apart, silent for 20
-        *(text(BEGIN + t * S, "hi") for t in range(0, 90, 15)),  # 15 apart, silent for 24
-        tf(BEGIN, transform(BEGIN, "a", "b", (0, 0, 0)), topic="/tf_static"),
-    ]
-    answer = memory_status(remembering(tmp_path, messages), Call())
-    assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S),)
-
-
 def test_how_often_a_topic_comes_leaves_out_when_the_robot_was_off(tmp_path: Path) -> None:
     days = [BEGIN + day * 86_400 * S for day in range(3)]
     messages = [odom(day + t * S, 0.0, 0.0) for day in days for t in range(600)]
@@ -301,21 +197,6 @@ def test_how_often_a_topic_comes_leaves_out_when_the_robot_was_off(tmp_path: Pat
     memory = remembering(tmp_path, [*messages, *heard[:-10]])
     fallen = SilentTopic("/bumper", days[2] + 539 * S)
     assert memory_status(memory, Call()).fell_silent == (fallen,)
-
-
-@pytest.mark.parametrize(("docked_s", "fell"), [(190, []), (260, ["/odom"])])
-def test_what_a_docked_robot_does_not_say_did_not_fall_silent(
-    tmp_path: Path, docked_s: int, fell: list[str]
-) -> None:
-    """It drives for 100 s and is docked for 200 s, again and again; then for as long, or longer."""
-    for nth in range(40 + docked_s // 10):
-        seconds = range(10 * nth, 10 * nth + 10)
-        messages = [boolean(BEGIN + t * S, True) for t in seconds]
-        if nth < 40:
-            messages += [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in seconds if t % 300 < 100]
-        write_mcap(tmp_path / "a" / f"a_{nth}.mcap", messages)
-    answer = memory_status(memory_of(tmp_path), Call())
-    assert [each.topic for each in answer.fell_silent] == fell
 
 
 @pytest.mark.parametrize(("later", "fell"), [(0, ["/bumper"]), (S, [])])
@@ -332,25 +213,6 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
     assert [each.topic for each in answer.fell_silent] == fell
 
 
-def test_damaged_files_are_counted_and_reported(tmp_path: Path) -> None:
-    (tmp_path / "bad.mcap").write_bytes(b"no bag at all, whatever its name says")
-    told = shown(remembering(tmp_path, seconds=9e6), tmp_path)
-    assert told["damaged"] == 1
-    assert "1 damaged bag file" in told["doubts"]
-
-
-def test_an_empty_memory_has_a_status_too(tmp_path: Path) -> None:
-    told = shown(memory_of(tmp_path), tmp_path)
-    assert (told["earliest"], told["latest"], told["newest_age_s"]) == (None, None, None)
-    assert told["recorder"] is None
-    assert told["budget"] == {
-        "used_gb": 0.0,
-        "max_gb": None,
-        "foreign_gb": None,
-        "growth_gb_per_day": None,
-    }
-
-
 def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
     memory = remembering(tmp_path, kept=RetentionLimits(10**6, 7 * DAY))
     beating(tmp_path, RecorderState.RECORDING, 59, counted_bytes=4_900_000, state_bytes=4_700_000)
@@ -361,54 +223,7 @@ def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> N
     assert (budget["used_gb"], budget["state_gb"]) == (0.0002, 0.00005)
 
 
-def test_some_messages_at_once_show_no_growth(tmp_path: Path) -> None:
-    kept = RetentionLimits(10**9, 7 * DAY)
-    memory = remembering(tmp_path, [boolean(BEGIN + t, True) for t in range(2)], kept=kept)
-    beating(tmp_path, RecorderState.RECORDING, 1)
-    answer = memory_status(memory, Call())
-    assert answer.budget.used > 0
-    assert answer.budget.per_day is None
-
-
-def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, FLAGS)
-    size = (tmp_path / "bag.mcap").stat().st_size
-    beating(tmp_path, RecorderState.RECORDING, 59)
-    beside = (tmp_path / "recorder.json").stat().st_size
-    budget = RetentionLimits(max_total_bytes=size * 49 + beside, max_age_ns=7 * DAY)
-    memory = replace(memory, limits=replace(memory.limits, kept=budget))
-    answer = memory_status(memory, Call())
-    assert (answer.budget.used, answer.budget.state) == (size + beside, beside)
-    assert answer.budget.per_day == size * 24  # all within an hour
-    told = shown(memory, tmp_path)["budget"]
-    assert told["full_in_days"] == 2.0
-    assert told["keeps_days"] == 2.05
-    older = replace(memory.limits, kept=replace(budget, max_age_ns=DAY))
-    assert shown(replace(memory, limits=older), tmp_path)["budget"]["keeps_days"] == 1.0
-
-
 SOUND = "no loss or fault was found"
-
-
-@pytest.mark.parametrize(
-    ("state", "at"),
-    [
-        (None, 0),
-        (RecorderState.RECORDING, 0),
-        (RecorderState.STOPPED, 59),
-        (RecorderState.PAUSED, 59),
-    ],
-)
-def test_no_growth_is_predicted_of_bags_that_nobody_writes(
-    tmp_path: Path, state: RecorderState | None, at: float
-) -> None:
-    memory = remembering(tmp_path, FLAGS, kept=RetentionLimits(10**9, 7 * DAY))
-    if state is not None:
-        beating(tmp_path, state, at)
-    told = shown(memory, tmp_path)["budget"]
-    assert (told["max_gb"], told["growth_gb_per_day"]) == (1.0, None)
-    assert "full_in_days" not in told
-    assert "keeps_days" not in told
 
 
 @pytest.mark.parametrize("fills", [False, True])

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 S = 10**9
 NOW_S = 1_784_000_000
 AHEAD_S = NOW_S + 10 * 365 * 86_400
-UNSET_S = 100
 
 
 def write_bag(bag_dir: Path, number: int, begin_s: int, label: str, *, speech: bool = True) -> None:
@@ -54,30 +53,3 @@ def test_find_things_has_what_a_clock_ahead_dated_only_for_a_window_that_reaches
     assert "dated by a wrong clock" in str(reply["notes"])
     for window in ({"start": AHEAD_S}, {"end": AHEAD_S + 100}):
         assert "dog" in str(ask("find_things", **window))
-
-
-@pytest.mark.parametrize("ask", [AHEAD_S], indirect=True)
-def test_the_robot_is_where_it_is_now_not_where_a_clock_ahead_has_it(
-    ask: Callable[..., Any],
-) -> None:
-    then = ask("visits", x=43.0, y=0.0, radius_m=5.0)
-    assert not then["there_now"]
-    assert "ago_s" not in then["visits"][0]
-    now = ask("visits", x=23.0, y=0.0, radius_m=5.0)
-    assert now["there_now"]
-    assert now["visits"][0]["departed"] is None
-
-
-@pytest.mark.parametrize("ask", [AHEAD_S], indirect=True)
-def test_a_sighting_of_a_clock_ahead_was_not_some_time_ago(ask: Callable[..., Any]) -> None:
-    reply = ask("find_matches", topic="/said", condition_type="contains", value="home")
-    assert [row.get("ago_s") for row in reply["sightings"]] == [None, 2941.0]
-
-
-@pytest.mark.parametrize("ask", [AHEAD_S, UNSET_S], indirect=True)
-def test_the_state_of_the_memory_names_the_wrong_clock_and_what_fell_silent(
-    ask: Callable[..., Any],
-) -> None:
-    reply = ask("memory_status")
-    assert "1 bag is dated by a wrong clock" in reply["doubts"]
-    assert [row["topic"] for row in reply["fell_silent"]] == ["/said"]

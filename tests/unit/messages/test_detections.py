@@ -16,52 +16,6 @@ from ros2_memory.messages.detections import (
 )
 from tests.support.strategies import json_values
 
-
-def test_detections_with_a_label_and_a_point_are_things_in_the_frame_of_the_message() -> None:
-    value: JsonValue = {
-        "detections": [
-            {"label": "cup", "score": 0.9, "point": {"x": 1.0, "y": -2.0, "z": 0.5}},
-            {"label": "table", "bbox": [0, 1, 2, 3]},
-        ]
-    }
-    assert detections_of(value, "base_link") == (
-        Detection("cup", (1.0, -2.0, 0.5), "base_link", 0.9),
-        Detection("table", None, "base_link"),
-    )
-
-
-def test_a_detection_of_vision_msgs_is_its_best_hypothesis() -> None:
-    value: JsonValue = {
-        "frame_id": "map",
-        "detections": [
-            {
-                "header": {"frame_id": "camera"},
-                "results": [
-                    {"hypothesis": {"class_id": "mug", "score": 0.2}},
-                    {
-                        "hypothesis": {"class_id": "cup", "score": 0.7},
-                        "pose": {"pose": {"position": {"x": 0.0, "y": 0.0, "z": 0.0}}},
-                    },
-                ],
-                "bbox": {"center": {"position": {"x": 1.0, "y": 2.0, "z": 3.0}}},
-            }
-        ],
-    }
-    assert detections_of(value) == (Detection("cup", (1.0, 2.0, 3.0), "camera", 0.7),)
-
-
-def test_the_centre_of_a_box_in_an_image_is_no_place() -> None:
-    value: JsonValue = {
-        "detections": [
-            {
-                "results": [{"hypothesis": {"class_id": "cup", "score": 0.7}}],
-                "bbox": {"center": {"position": {"x": 320.0, "y": 240.0}, "theta": 0.0}},
-            }
-        ]
-    }
-    assert detections_of(value) == (Detection("cup", score=0.7),)
-
-
 AT: JsonValue = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}}
 
 
@@ -141,11 +95,6 @@ def test_detections_of_types_without_a_label_have_the_name_that_the_type_gives(
     value: JsonValue, expected: Detection
 ) -> None:
     assert detections_of([value], "camera") == (expected,)
-
-
-def test_a_point_that_nobody_filled_in_is_no_place() -> None:
-    value: JsonValue = [{"label": "cup", "point": {"x": 0.0, "y": 0.0, "z": 0.0}}]
-    assert detections_of(value) == (Detection("cup"),)
 
 
 @pytest.mark.parametrize(
@@ -248,25 +197,6 @@ def test_what_is_left_are_the_detections_that_do_not_score_less(
     for each in (value, json.dumps(value)):
         enough = [one for one in detections_of(each) if one.score is None or one.score >= least]
         assert [*detections_of(without_low_scores(each, least))] == enough
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        {"layout": {"dim": [{"label": "x", "size": 3, "stride": 3}]}, "data": [1, 2, 3]},
-        {"value": "I see a cup."},
-        {"value": "[not json"},
-        {"status": [{"level": 0, "name": "lidar", "message": "fine"}]},
-        {"intent": {"name": "fetch", "confidence": 0.9}},
-        {"markers": [{"ns": "path", "id": 7, "pose": {"position": {"x": 1, "y": 2, "z": 3}}}]},
-        {"x": 1.0, "y": 2.0},
-        True,
-        None,
-    ],
-    ids=str,
-)
-def test_other_messages_tell_of_no_things(value: JsonValue) -> None:
-    assert detections_of(value) == ()
 
 
 @given(json_values)

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ros2_memory import queries
-from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import AtTime
 from ros2_memory.places.visits import visits
-from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
+from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
 
@@ -30,26 +26,6 @@ PLACES = (
 
 def in_places(memory: Memory) -> Memory:
     return replace(memory, limits=replace(memory.limits, places=PLACES))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_visits_in_a_moving_map_are_when_the_robot_was_there(tmp_path: Path, seed: int) -> None:
-    truth = write_moving_map(tmp_path, seed, seconds=300)
-    memory = in_places(memory_of(tmp_path))
-    found = visits(memory, Call(), where="corner", limit=100)
-    there = truth.inside(4.0, 3.0, 0.5)
-    assert found.where == "corner"
-    # A correction that jumps is late at the ends of bags: less than a second for each.
-    assert found.duration / S == pytest.approx(len(there) / 5, abs=4.0)
-    assert found.total == len(found.visits)
-    near = [
-        at
-        for at in truth.inside(4.0, 3.0, 0.3)
-        if any(
-            (each.arrived or 0) <= at <= (each.departed or BEGIN + 300 * S) for each in found.visits
-        )
-    ]
-    assert len(near) >= 0.97 * len(truth.inside(4.0, 3.0, 0.3))
 
 
 @pytest.mark.parametrize("period_s", [3, 7])
@@ -109,48 +85,6 @@ def test_places_in_the_poses_own_frame_are_counted_with_those_of_the_map(moving:
         assert "dock" in str(asked(memory, memory.index.bag_dir, "visits", by=by, **window))
 
 
-def test_without_named_places_a_place_must_be_given(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 2, seconds=10)
-    memory = memory_of(tmp_path)
-    with pytest.raises(InvalidArgumentsError, match="no place is named"):
-        visits(memory, Call())
-    memory = replace(memory, limits=replace(memory.limits, places_file="/home/me/places.yaml"))
-    for unknown in (None, "attic"):
-        with pytest.raises(InvalidArgumentsError, match=r"here /home/me/places\.yaml"):
-            visits(memory, Call(), where=unknown)
-
-
-def test_the_poses_that_are_reported_in_a_place_are_visited(tmp_path: Path) -> None:
-    """A map that jumps by a metre once a second: positions and visits interpolate it alike."""
-    messages = []
-    for tick in range(1, 300):
-        at = BEGIN + tick * S // 10
-        messages.append(odom(at, 0.01 * tick, 0.0))
-        if tick % 10 == 1:
-            jump = 1.0 if tick // 10 % 3 == 0 else 0.0
-            messages.append(tf(at, transform(at, "map", "odom", (jump, 0.0, 0.0))))
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    memory = memory_of(tmp_path)
-    there = visits(memory, Call(), 2.0, 0.0, radius_m=0.3, frame_id="map", limit=100)
-    assert there.visits
-    inside = 0
-    for message in messages:
-        if message.topic != "/odom" or message.log_time > messages[-10].log_time:
-            continue
-        moment = AtTime(message.log_time / 1e9)
-        place = queries.position(memory, Call(), moment, frame_id="map").pose.position
-        if math.dist(place[:2], (2.0, 0.0)) < 0.3 - 1e-3:
-            inside += 1
-            assert any(
-                (visit.arrived or 0) <= message.log_time <= (visit.departed or 2**62)
-                for visit in there.visits
-            )
-    assert inside > 5
-    times = {message.log_time for message in messages}
-    assert {visit.arrived for visit in there.visits[:-1]} <= times
-    assert {visit.closest_at for visit in there.visits} <= times
-
-
 def spots(memory: Memory, **where: Circle) -> Memory:
     places = tuple(Place(name, "odom", region) for name, region in where.items())
     return replace(memory, limits=replace(memory.limits, places=places))
@@ -199,26 +133,6 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         later = {"with_start": BEGIN / S + 45, "with_end": BEGIN / S + 90}
         compared = asked(memory, tmp_path, "compare", **span | {"end": BEGIN / S + 45}, **later)
         assert compared["minutes"][name] == {"this": 0.5, "with": 0.0}
-
-
-@pytest.mark.parametrize("since", [0, 18])
-def test_what_two_recorders_of_one_robot_have_is_one_visit(tmp_path: Path, since: int) -> None:
-    """Now one, now the other receives a message first; the second may begin in a visit."""
-    poses = [odom(BEGIN + n * S // 5, min(n / 20, 9.0), 0.0) for n in range(300)]
-    late = [
-        replace(
-            each, log_time=each.log_time + (nth % 3 - 1) * S // 10_000, publish_time=each.log_time
-        )
-        for nth, each in enumerate(poses[since * 5 :])
-    ]
-    write_mcap(tmp_path / "one" / "one_0.mcap", poses[: 300 if not since else 110])
-    write_mcap(tmp_path / "two" / "two_0.mcap", late)
-    memory = spots(memory_of(tmp_path), spot=Circle(5.0, 0.0, 1.0))
-    reply = asked(memory, tmp_path, "visits", where="spot")
-    assert (reply["total"], reply["minutes"]) == (1, 0.13)
-    assert "robots" not in str(reply.get("notes"))
-    span = {"start": BEGIN / S, "end": BEGIN / S + 60}
-    assert asked(memory, tmp_path, "recap", where="spot", **span)["inside_s"] == 8.0
 
 
 @pytest.mark.parametrize("laps", [6, 130])

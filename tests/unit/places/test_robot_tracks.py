@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from random import Random
 from shutil import copytree
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
-from ros2_memory.places.robot_tracks import KnownTrack, TrackReader
+from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import write_mcap
 from tests.support.memories import memory_of, with_store
@@ -46,30 +45,6 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
         minute.sort(key=lambda each: each.log_time)
         write_mcap(folder / "rec" / f"rec_{number}.mcap", minute)
     return folder
-
-
-def track(memory: Memory, window: TimeWindow) -> KnownTrack:
-    return TrackReader(View(memory, Call()), "map").over(window)
-
-
-def assert_same(one: KnownTrack, other: KnownTrack) -> None:
-    assert one.left_out == other.left_out
-    for name in (each.name for each in fields(one.track)):
-        here, there = getattr(one.track, name), getattr(other.track, name)
-        assert np.array_equal(here, there, equal_nan=True), name
-
-
-def test_a_part_of_a_stored_track_is_as_one_that_is_made(bag_dir: Path) -> None:
-    plain = memory_of(bag_dir)
-    stored, most = with_store(plain, bag_dir), with_store(plain, bag_dir, part=0.6)
-    draw = Random(11)
-    for _ in range(12):
-        first, last = sorted(draw.uniform(-100, MINUTES * 60 + 100) for _ in range(2))
-        window = TimeWindow(BEGIN + round(first * S), BEGIN + round(last * S))
-        made = track(plain, window)
-        assert_same(track(stored, window), made)
-        assert_same(track(most, window), made)
-        assert (made.left_out > 0) == (first < UNPLACED and last > 0)
 
 
 class Unread(Rosbag2Reader):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,13 +21,11 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.places.visits import visits
 from ros2_memory.places.where import WhileCondition
 from ros2_memory.queries import position
 from tests.support.bags import (
     Msg,
     boolean,
-    detections,
     octets,
     odom,
     text,
@@ -133,27 +130,6 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
         assert rows["(elsewhere)"]["seconds"] > 0
 
 
-@pytest.mark.parametrize(
-    "where",
-    [
-        ["hall", "den"],
-        "hall, den",
-        "Den,  HALL",
-        '["hall", "den"]',
-        {"hall": "hall", "mine": "den"},
-        bounds("hall", "den"),
-        {**bounds("den"), "hall": "hall"},
-    ],
-    ids=str,
-)
-def test_places_are_named_or_given_by_their_bounds(
-    memory: Memory, folder: Path, world: World, where: Any
-) -> None:
-    reply = asked(memory, folder, "visits", where=where, limit=100)
-    assert reply["total"] == len(world.runs_in("hall", "den"))
-    assert sorted(reply["where"].split(", ")) == ["den", "hall"]
-
-
 def test_a_place_may_be_given_with_its_name_alone(
     memory: Memory, folder: Path, world: World
 ) -> None:
@@ -184,27 +160,6 @@ def test_things_in_any_of_several_places_say_in_which(memory: Memory, folder: Pa
         "cat": ("corner", ["hall"]),
     }
     assert found["labels"] == {"cat": 2, "cup": 2} or found["total"] >= 2
-
-
-def test_compare_has_the_minutes_in_each_and_recap_what_happened_in_any(
-    memory: Memory, folder: Path, world: World
-) -> None:
-    half = SECONDS // 2
-    ends = {"start": BEGIN, "end": BEGIN + half}
-    later = {"with_start": BEGIN + half, "with_end": BEGIN + SECONDS - 1}
-    minutes = asked(memory, folder, "compare", where=bounds("kitchen", "hall"), **ends, **later)
-    for room in ("kitchen", "hall"):
-        spent = [
-            sum(world.room(nth) == room for nth in part) / 60
-            for part in (range(half), range(half, SECONDS))
-        ]
-        if abs(spent[0] - spent[1]) > 0.1 * max(spent) + 0.3:
-            assert minutes["minutes"][room]["this"] == pytest.approx(spent[0], abs=0.15)
-            assert minutes["minutes"][room]["with"] == pytest.approx(spent[1], abs=0.15)
-    assert minutes["minutes"].keys() <= {"kitchen", "hall"}
-    told = asked(memory, folder, "recap", where="kitchen, den", **SPAN)
-    assert told["visits"] == len(world.runs_in("kitchen", "den"))
-    assert told["where"] == "kitchen, den"
 
 
 @pytest.mark.parametrize(
@@ -350,21 +305,6 @@ def test_matches_count_while_another_topic_meets_a_condition(
 
 
 @each_way
-def test_matches_of_a_topic_with_two_types_count_whichever_came_last(
-    tmp_path: Path, recalls: bool
-) -> None:
-    flags = [boolean(MAP_BEGIN + second * S, True, topic="/mixed") for second in range(3)]
-    words = [text(MAP_BEGIN, "undocked", "/dock"), text(MAP_BEGIN + 5 * S, "cup", "/mixed")]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*flags, *words])
-    memory = memory_of(tmp_path, recalls=recalls)
-    undocked = WhileCondition("/dock", "contains", "undocked")
-    [found] = find_matches(
-        memory, Call(), "/mixed", "contains", "cup", during=(undocked,)
-    ).sightings
-    assert found.last == MAP_BEGIN + 5 * S
-
-
-@each_way
 @pytest.mark.parametrize(
     ("during", "said"),
     [
@@ -390,34 +330,6 @@ def test_what_no_message_of_another_topic_can_meet_is_refused(
     for by in ({}, {"by": "hour"}):
         refused = asked(memory, tmp_path, "find_matches", **cup, **by)
         assert said in refused["detail"]
-
-
-def test_a_condition_is_met_by_messages_of_the_type_that_a_topic_had_before(
-    tmp_path: Path,
-) -> None:
-    before = [odom(MAP_BEGIN, 5.0, 0.0, topic="/was"), text(MAP_BEGIN + S, "cup")]
-    write_mcap(tmp_path / "rec_0.mcap", [*before, text(MAP_BEGIN + 9 * S, "now", "/was")])
-    during = {"topic": "/was", "condition_type": "above", "value": 1, "field": "position.x"}
-    cup = {"topic": "/chatter", "condition_type": "contains", "value": "cup", "while": during}
-    assert asked(memory_of(tmp_path), tmp_path, "find_matches", **cup)["total"] == 1
-
-
-def test_matches_count_while_the_robot_is_in_a_place(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 2, seconds=300)
-    memory = in_places(memory_of(tmp_path))
-    there = visits(memory, Call(), where="corner", limit=100).visits
-    found = find_matches(memory, Call(), CUPS, "contains", "cup", where="corner", limit=100)
-    assert len(found.sightings) in {len(there), len(there) - 1}  # some are shorter than a second
-    for each in found.sightings:
-        assert each.robot is not None
-        assert (each.robot.frame_id, each.robot.places) == ("map", ("corner", "room"))
-        assert any(
-            # A visit begins and ends at poses, between which the robot was inside a little longer.
-            (visit.arrived or 0) - S // 2 <= each.first
-            and each.last <= (visit.departed or 2**62) + S // 2
-            for visit in there
-        )
-    assert all(after.last < before.first for before, after in pairwise(found.sightings))
 
 
 def test_the_frame_of_the_robot_is_the_map_or_the_one_asked_for(tmp_path: Path) -> None:
@@ -450,22 +362,3 @@ def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_anot
     assert reply["in"] == "room"
     with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
         position(memory, Call(), AtTime(at_s=at / S), frame_id="moon")
-
-
-@pytest.mark.parametrize("tool", ["find_matches", "find_last_match"])
-def test_a_misspelt_field_inside_a_list_that_is_empty_now_is_refused(
-    tmp_path: Path, tool: str
-) -> None:
-    seen = [detections(MAP_BEGIN + nth * S, ["cup"]) for nth in range(5)]
-    empty = [detections(MAP_BEGIN + nth * S, []) for nth in range(5, 9)]
-    write_mcap(tmp_path / "rec_0.mcap", [*seen, *empty])
-    question: dict[str, Any] = {
-        "topic": seen[0].topic,
-        "condition_type": "contains",
-        "value": "scissors",
-    }
-    refused = asked(memory_of(tmp_path), tmp_path, tool, field="detections.name", **question)
-    assert refused["error"] == "invalid_arguments"
-    assert "detections.label" in refused["detail"]
-    known = asked(memory_of(tmp_path), tmp_path, tool, field="detections.label", **question)
-    assert not (known or {}).get("error")

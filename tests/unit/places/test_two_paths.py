@@ -73,24 +73,6 @@ def test_the_farthest_point_is_as_far_as_any_laid_along_the_way(
         assert np.hypot(*(other - here).T).min() == pytest.approx(point.away_m, abs=0.03)
 
 
-def test_only_the_window_and_the_region_count_and_no_way_is_drawn_across_a_gap() -> None:
-    way = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)], [(30.0, 10.0, 5.0), (40.0, 0.0, 5.0)])
-    still = track([(0.0, 0.0, 0.0)])
-    assert farthest_apart((way, EVER), (still, EVER))[0] == (10.0, 5.0, 30 * S, math.hypot(10, 5))
-    early = farthest_apart((way, TimeWindow(0, 4 * S)), (still, EVER))[0]
-    assert early is not None
-    assert early.x == pytest.approx(4.0, abs=0.1)
-    low = farthest_apart((way, EVER), (still, EVER), Rectangle(2.0, 3.0, -1.0, 4.0))[0]
-    assert low is not None
-    assert low.x == pytest.approx(3.0, abs=0.1)
-    assert low.y == 0.0
-    # Nobody knows whether it was half way across.
-    middle = track([(20.0, 10.0, 2.5)])
-    across = farthest_apart((middle, EVER), (way, EVER))[0]
-    assert across is not None
-    assert across.away_m == 2.5
-
-
 def test_a_vertex_that_was_jumped_to_and_from_is_no_place_of_the_way() -> None:
     way = track([(0.0, 0.0, 0.0), (9.9, 1.0, 0.0), (10.0, 50.0, 0.0), (10.1, 1.0, 0.0)])
     way = dataclasses.replace(way, fastest_mps=10.0)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import os
 import random
 from dataclasses import replace
 from pathlib import Path
@@ -14,18 +13,15 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.robot_track import TOLERANCE_M
 from ros2_memory.core.errors import (
-    InvalidArgumentsError,
     UndecodableError,
 )
 from ros2_memory.core.regions import Circle, Place
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.places.visits import visits
-from tests.support.bags import Msg, odom, text, tf, transform, write_mcap, write_splits
+from tests.support.bags import Msg, odom, tf, transform, write_mcap, write_splits
 from tests.support.clocks import SettableClock
-from tests.support.closed_form import SESSIONS, written_session
 from tests.support.examples import LONG
 from tests.support.memories import asked, each_way, memory_of, with_store
-from tests.support.shared_bags import needs_recorded
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -47,46 +43,6 @@ def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list
 def remembering(folder: Path, messages: list[Msg], *, split_s: float = 10.0) -> Memory:
     write_splits(folder, messages, split_s)
     return memory_of(folder)
-
-
-def spans(memory: Memory, x: float, y: float = 0.0, **given: Any) -> list[tuple[float, float]]:
-    """Arrivals and departures in seconds after BEGIN; NaN where still there or not known."""
-    return [
-        (
-            math.nan if each.arrived is None else (each.arrived - BEGIN) / S,
-            math.nan if each.departed is None else (each.departed - BEGIN) / S,
-        )
-        for each in visits(memory, Call(), x, y, **given).visits
-    ]
-
-
-@pytest.mark.parametrize(
-    "recorded", [False, pytest.param(True, marks=needs_recorded)], ids=["written", "recorded"]
-)
-def test_visits_of_a_session_are_the_closed_form(tmp_path: Path, recorded: bool) -> None:
-    if recorded:
-        session = SESSIONS["session_mcap"]
-        for bag in session.folder.glob("*.mcap"):
-            (tmp_path / bag.name).write_bytes(bag.read_bytes())
-    else:
-        session = written_session(tmp_path / "written")
-    memory = memory_of(tmp_path)
-    answer = visits(memory, Call(), 0.0, 4.0, radius_m=0.5)
-    lap, half = 2 * math.pi / 0.25, 2 * math.asin(0.5 / 4) / 0.25
-    middles = [lap / 2 + lap * nth for nth in range(3)]
-    assert answer.frame_id == "odom"
-    assert not answer.more
-    assert len(answer.visits) == len(middles)
-    for visit, middle in zip(answer.visits, reversed(middles), strict=True):
-        assert visit.arrived is not None
-        assert visit.departed is not None
-        assert visit.closest_at is not None
-        assert visit.closest_m is not None
-        assert abs(session.since(visit.arrived / S) - (middle - half)) < 0.06
-        assert abs(session.since(visit.departed / S) - (middle + half)) < 0.06
-        assert abs(session.since(visit.closest_at / S) - middle) < 0.06
-        assert visit.closest_m < 0.05
-        assert visit.restarts == 0
 
 
 def at(memory: Memory, now: int) -> Memory:
@@ -111,17 +67,6 @@ def test_a_robot_that_is_there_still_has_not_departed(
     assert "notes" not in shown
 
 
-@pytest.mark.parametrize("x", [10.0, 3.0])
-def test_a_time_that_ends_before_the_newest_pose_does_not_say_where_the_robot_is(
-    tmp_path: Path, x: float
-) -> None:
-    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
-    shown = asked(memory, tmp_path, "visits", x=x, y=0.0, radius_m=1.0, end=BEGIN / S + 40)
-    assert "there_now" not in shown
-    [visit] = shown["visits"]
-    assert visit.get("still_inside", False) is (x == 10.0)
-
-
 def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     """A year ago, or minutes: its newest pose is its last one there, and a note says so."""
     memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
@@ -138,39 +83,6 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     assert elsewhere.notes == ()
 
 
-def test_places_may_be_in_utm(tmp_path: Path) -> None:
-    north = 5.4e6
-    poses = [odom(BEGIN + n * S // 5, 5e5 + n / 10, north) for n in range(150)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
-    memory = memory_of(tmp_path)
-    assert spans(memory, 5e5 + 10, north, radius_m=0.55) == [(19.0, 21.0)]
-    # No robot on Earth is here.
-    assert not visits(memory, Call(), 1e9, 0.0, radius_m=1e9 - 1e8).visits
-
-
-def test_a_robot_that_no_pose_shows_while_others_go_on_may_have_left(tmp_path: Path) -> None:
-    poses = line((20, 0.5), (10, 0.0))
-    for said, is_there in ((35, True), (45, False)):
-        words = [text(BEGIN + at * S, "on") for at in range(said)]
-        memory = remembering(tmp_path / str(said), [*poses, *words])
-        memory = at(memory, BEGIN + said * S)
-        shown = asked(memory, tmp_path, "visits", **THERE)
-        assert shown["there_now"] is is_there
-        assert (shown["visits"][0]["departed"] is None) is is_there
-
-
-def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> None:
-    there = line((10, 0.0), (2, 1.0), (2, -1.0), (10, 0.0), (30, 1.0))
-    memory = remembering(tmp_path, there)
-    [(arrived, departed)] = spans(memory, 0.0, radius_m=1.0)
-    assert arrived == 0.0
-    assert departed == pytest.approx(25.0, abs=0.21)
-    memory = remembering(
-        tmp_path / "longer", line((10, 0.0), (5, 1.0), (5, -1.0), (10, 0.0), (30, 1.0))
-    )
-    assert len(spans(memory, 0.0, radius_m=1.0)) == 2
-
-
 def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_path: Path) -> None:
     first = line((10, 0.0), (20, 0.5))
     second = line((10, 0.0), (20, 0.5), begin=1000.0)
@@ -182,14 +94,6 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_pat
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
-def test_a_robot_that_drives_on_through_a_long_bag_did_not_restart(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, line((8, 0.5), (7, -0.2)), split_s=20.0)
-    recalled = with_store(memory, tmp_path)
-    for each in (memory, recalled):
-        answer = visits(each, Call(), 0.0, 0.0, radius_m=1.0)
-        assert [visit.restarts for visit in answer.visits] == [0]
-
-
 def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
     first = line((10, 0.0), (20, 0.5))
     second = line((10, 0.0), (20, 0.5), begin=1000.0)
@@ -199,18 +103,6 @@ def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
     assert answer.frame_id == "map"
     assert [each.restarts for each in answer.visits] == [0, 0]
     assert answer.total == 2
-
-
-def test_a_place_may_be_named_in_the_frame_of_the_poses(tmp_path: Path) -> None:
-    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 1.0, 0.0)), topic="/tf_static")
-    memory = remembering(tmp_path, [fixed, *line((10, 0.0), (20, 0.5))])
-    in_map = visits(memory, Call(), 5.0, 1.0, frame_id="map", radius_m=1.0)
-    in_odom = visits(memory, Call(), 0.0, 0.0, frame_id="odom", radius_m=1.0)
-    assert (in_map.frame_id, in_odom.frame_id) == ("map", "odom")
-    assert in_map.visits == in_odom.visits
-    assert visits(memory, Call(), 5.0, 1.0, radius_m=1.0) == in_map
-    with pytest.raises(InvalidArgumentsError, match=r'frame_id was "laser" .* in map or odom only'):
-        visits(memory, Call(), 0.0, 0.0, frame_id="laser")
 
 
 def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_path: Path) -> None:
@@ -364,25 +256,6 @@ def test_a_pose_that_cannot_be_decoded_hides_no_visit(
         visits(remembering(tmp_path / "torn", torn), Call(), 0.0, 0.0)
 
 
-def test_a_bag_left_open_is_named_only_where_its_time_is_asked_for(tmp_path: Path) -> None:
-    for nth in range(2):
-        begin = 1_784_000_000 + 1000 * nth
-        messages = [odom((begin + at) * 10**9, 0.0, 0.0) for at in range(20)]
-        write_mcap(tmp_path / f"rec_{nth}" / f"rec_{nth}_0.mcap", messages)
-    cut = tmp_path / "rec_0" / "rec_0_0.mcap"
-    cut.write_bytes(cut.read_bytes()[:-60])
-    os.utime(cut, (1_784_000_020, 1_784_000_020))
-    memory = memory_of(tmp_path)
-
-    def is_named(start: float) -> bool:
-        around = {"start": start, "end": start + 20.0}
-        reply = asked(memory, tmp_path, "visits", x=0.0, y=0.0, radius_m=1.0, **around)
-        return any("readable part is used" in note for note in reply.get("notes", []))
-
-    assert is_named(1_784_000_000.0)
-    assert not is_named(1_784_001_000.0)
-
-
 def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path: Path) -> None:
     """Its poses are 1 cm inside or outside, at random; the track is within 5 cm of them."""
     draw = random.Random(3)
@@ -395,40 +268,6 @@ def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path:
         [(inside[0], inside[-1])],
         [(inside[0], None)],
     )
-
-
-def test_a_region_that_only_the_line_between_two_poses_touches_is_not_visited(
-    tmp_path: Path,
-) -> None:
-    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + n * S, float(n), 0.0) for n in range(10)])
-    memory = memory_of(tmp_path)
-    for x, expected in (([4.4, 4.6], 0), ([4.4, 5.1], 1)):
-        where = {"x": x, "y": [-0.2, 0.2]}
-        assert asked(memory, tmp_path, "visits", where=where)["total"] == expected
-        by_day = asked(memory, tmp_path, "visits", where=where, by="day")
-        counted = dict(zip(by_day["columns"][1:], by_day["all"], strict=True))
-        assert (counted["entries"], counted["exits"]) == (expected, expected)
-
-
-@each_way
-@pytest.mark.parametrize(("fastest_mps", "driven_m"), [(10.0, 1.4), (5.0, 0.0)])
-def test_what_lies_between_two_poses_is_not_visited_be_it_driven_or_a_jump(
-    tmp_path: Path, recalls: bool, fastest_mps: float, driven_m: float
-) -> None:
-    """The robot stands, and is 1.4 m farther after 0.2 s: that is 7 m/s."""
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", line((5, 0.0), (0.2, 7.0), (5, 0.0)))
-    memory = memory_of(
-        tmp_path, limits=QuerySettings(max_plausible_speed_mps=fastest_mps), recalls=recalls
-    )
-    span = {"start": BEGIN // S, "end": BEGIN // S + 12}
-    way = asked(memory, tmp_path, "trajectory_summary", **span)
-    assert way["distance_m"] == pytest.approx(driven_m)
-    for radius_m, expected in ((0.3, 0), (0.8, 1)):
-        place = {"x": 0.7, "y": 0.0, "radius_m": radius_m, **span}
-        assert asked(memory, tmp_path, "visits", **place)["total"] == expected
-        counted = asked(memory, tmp_path, "visits", **place, by="hour")
-        [row] = counted["rows"]
-        assert (row[counted["columns"].index("minutes")] > 0) == (expected > 0)
 
 
 @pytest.mark.parametrize("body", ["base_link", "chassis"])
@@ -457,21 +296,6 @@ def test_by_transforms_alone_the_robot_is_what_moves_in_odometry(tmp_path: Path,
     for asks in ({"where": "dock"}, {"x": 10.0, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"}):
         seen = asked(memory, tmp_path, "visits", **asks)
         assert (seen["frame_id"], seen["total"]) == ("odom", 1)
-
-
-def test_a_frame_is_the_same_with_a_slash_and_without_one(tmp_path: Path) -> None:
-    poses = [odom(BEGIN + nth * S // 5, nth * 0.1, 0.0) for nth in range(200)]
-    for each in poses:
-        body: Any = each.body
-        body.header.frame_id = "/odom"
-    write_mcap(tmp_path / "rec/rec_0.mcap", poses)
-    memory = memory_of(tmp_path)
-    places = (Place("spot", "odom", Circle(10.0, 0.0, 1.0)),)
-    memory = replace(memory, limits=replace(memory.limits, places=places))
-    assert asked(memory, tmp_path, "visits", where="spot")["total"] == 1
-    near = {"topic": "/odom", "condition_type": "near_position"}
-    value = {"x": 10, "y": 0, "frame_id": "odom"}
-    assert asked(memory, tmp_path, "find_last_match", value=value, **near)["timestamp"]
 
 
 def test_hours_of_the_day_are_local(tmp_path: Path) -> None:

@@ -25,14 +25,13 @@ from tests.support.bags import (
     make,
     odom,
     point,
-    quaternion,
     text,
     tf,
     transform,
     write_splits,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, replied
+from tests.support.memories import asked, memory_of, replied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -143,68 +142,9 @@ def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> 
     assert ask(tmp_path / "none", label="cup")["notes"] == [note]
 
 
-@each_way
-def test_of_detections_without_a_label_it_is_said_that_none_is_known(
-    tmp_path: Path, *, recalls: bool
-) -> None:
-    echo = make("radar_msgs/msg/RadarReturn", range=2.0, azimuth=0.1, amplitude=40.0)
-    messages = [each for each in looked(0, 3, HERE) if "vision" not in each.topic]
-    for at in (BEGIN * S, (BEGIN + 1) * S):
-        body = make("radar_msgs/msg/RadarScan", header=header(at, "base_link"), returns=[echo])
-        messages.append(Msg("/radar", "radar_msgs/msg/RadarScan", at, body))
-    write_splits(tmp_path, messages)
-    reply = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "find_things")
-    [note] = reply["notes"]
-    assert "no message has a detection" in note
-
-
-@each_way
-def test_markers_are_found_by_their_number(tmp_path: Path, *, recalls: bool) -> None:
-    april, aruco = "apriltag_msgs/msg/AprilTagDetection", "aruco_opencv_msgs/msg/ArucoDetection"
-    pose = make("geometry_msgs/msg/Pose", position=point(2.0, 0.0, 0.5), orientation=quaternion(0))
-    messages = [each for each in looked(0, 20, HERE) if "vision" not in each.topic]
-    for at in range(BEGIN * S, (BEGIN + 20) * S, S):
-        tag = make(april, family="36h11", id=7, decision_margin=40.0)
-        marker = make("aruco_opencv_msgs/msg/MarkerPose", marker_id=11, pose=pose)
-        tags = make(f"{april}Array", header=header(at, "base_link"), detections=[tag])
-        markers = make(aruco, header=header(at, "base_link"), markers=[marker])
-        messages += [Msg("/tags", f"{april}Array", at, tags), Msg("/markers", aruco, at, markers)]
-    write_splits(tmp_path, messages)
-    reply = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "find_things")
-    [thing] = reply["things"]
-    assert (thing["label"], thing["place"]) == ("11", {"x": 3.0, "y": 0.0, "z": 0.5})
-    [note] = reply["notes"]
-    assert note.startswith("detected, but could not be placed: 7 (20 times")
-
-
 CUP_AS_JSON = json.dumps(
     {"frame_id": "map", "detections": [{"label": "cup", "position": {"x": 3, "y": 0, "z": 1}}]}
 )
-
-
-@pytest.mark.parametrize("recalls", [False, True])
-def test_a_detector_that_sees_nothing_for_ten_minutes_goes_on_looking(
-    tmp_path: Path, *, recalls: bool
-) -> None:
-    """Its type does not say what it is, and neither do other topics that hold JSON."""
-
-    def said(at: int, topic: str, data: str) -> list[Msg]:
-        robot = [each for each in scene(at, HERE, ()) if "vision" not in each.topic]
-        return [*robot, text((BEGIN + at) * S, data, topic)]
-
-    there = [each for at in range(350, 380) for each in said(at, "/seen", CUP_AS_JSON)]
-    later = {
-        topic: [each for at in range(1100, 1130) for each in said(at, topic, '{"detections": []}')]
-        for topic in ("/seen", "/other")
-    }
-    states = {}
-    for topic, some in later.items():
-        write_splits(tmp_path / topic[1:], [*there, *some])
-        memory = memory_of(tmp_path / topic[1:], recalls=recalls)
-        [cup] = asked(memory, tmp_path / topic[1:], "find_things", label="cup")["things"]
-        states[topic] = cup["still_there"]
-    assert states["/seen"].keys() == {"not_seen_where_expected", "looks"}
-    assert states["/other"].keys() == {"in_view"}
 
 
 def test_where_the_robots_pose_is_not_known_a_thing_of_long_ago_is_not_in_view(
@@ -215,19 +155,6 @@ def test_where_the_robots_pose_is_not_known_a_thing_of_long_ago_is_not_in_view(
         tmp_path, [text((BEGIN + at) * S, each) for at, each in enumerate(said)], label="cup"
     )["things"]
     assert cup["still_there"].keys() == {"not_looked_at_since"}
-
-
-def test_transforms_alone_say_from_where_a_detector_looked(tmp_path: Path) -> None:
-    there, gone = looked(0, 30, HERE, ("cup", 3.0, 0.0)), looked(30, 90, HERE)
-    elsewhere = looked(30, 90, AWAY, ("chair", -2.0, 0.0))
-    states = []
-    for nth, later in enumerate((gone, elsewhere)):
-        messages = [each for each in [*there, *later] if each.topic != "/odom"]
-        write_splits(tmp_path / str(nth), messages)
-        [cup] = ask(tmp_path / str(nth), label="cup")["things"]
-        assert cup["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
-        states.append([*cup["still_there"]])
-    assert states == [["not_seen_where_expected", "looks"], ["not_looked_at_since"]]
 
 
 @pytest.mark.parametrize(
@@ -293,162 +220,6 @@ def test_of_too_many_labels_at_once_it_is_said_that_some_are_left_out(
     assert reply["notes"] == [left_out]
 
 
-def test_long_labels_are_told_apart_by_all_that_is_looked_at(tmp_path: Path) -> None:
-    said = "the one on the small round table in front of the kitchen's window, beside the " * 3
-    seen = [(said + "mug", 3.0, 0.5), (said + "plate", 3.0, -1.0), ("x" * 300, 4.0, 0.0)]
-    write_splits(tmp_path, looked(0, 3, HERE, *seen))
-    for label, x, y in seen:
-        [thing] = ask(tmp_path, label=label)["things"]
-        assert (thing["place"]["x"], thing["place"]["y"]) == (x, y)
-    assert thing["label"] == "x" * 255 + "…"
-
-
-@pytest.mark.parametrize("middle", [(0.0, 0.0), (500_000.0, 5_300_000.0), (-4e6, -9.9e6)])
-def test_things_are_told_alike_however_far_the_origin_of_the_map_is(
-    tmp_path: Path, middle: tuple[float, float]
-) -> None:
-    """As in UTM, whose origin is on the equator."""
-    x, y = middle
-    here, mug, moved = (x + 1.0, y, 0.0), ("mug", x + 3.0, y + 0.5), ("mug", x + 3.0, y - 0.8)
-    write_splits(
-        tmp_path,
-        [*looked(0, 60, here, mug, in_map=False), *looked(60, 120, here, moved, in_map=False)],
-    )
-    [thing] = ask(tmp_path)["things"]
-    assert thing["place"] == {"x": x + 3.0, "y": y - 0.8, "z": 0.7}
-    assert (thing["count"], thing["moved_times"], thing["spread_m"]) == (120, 1, 0.0)
-
-
-def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path) -> None:
-    beside, one = ("chair", 3.0, 0.4), ("chair", 3.0, 0.0)
-    reply = told_of(tmp_path / "two", looked(0, 30, HERE, one, beside), label="chair")
-    assert (reply["total"], reply["labels"]) == (2, {"chair": 2})
-    [chairs] = reply["things"]
-    assert chairs["at_once"] == 2
-    assert "moves" not in chairs
-    # A detector that now and then has a thing twice is no second thing.
-    now_and_then = [
-        message
-        for at in range(30)
-        for message in scene(at, HERE, [one, beside] if at in {5, 16, 17, 18} else [one])
-    ]
-    reply = told_of(tmp_path / "double", now_and_then, label="chair")
-    assert reply["total"] == 1
-    assert "at_once" not in reply["things"][0]
-
-
-@pytest.mark.parametrize(("before", "after"), [(3, 1), (1, 2)])
-def test_things_side_by_side_are_counted_as_of_the_end(
-    tmp_path: Path, before: int, after: int
-) -> None:
-    cups = [("cup", 3.0, nth * 0.25) for nth in range(3)]
-    seen = [*looked(0, 240, HERE, *cups[:before]), *looked(240, 360, HERE, *cups[:after])]
-    write_splits(tmp_path, seen, 60.0)
-    assert ask(tmp_path, label="cup")["total"] == after
-    assert ask(tmp_path, label="cup", end=BEGIN + 230)["total"] == before
-
-
-def test_a_slow_detector_counts_things_side_by_side(tmp_path: Path) -> None:
-    cups = ("cup", 3.0, 0.0), ("cup", 3.0, 0.3)
-    messages = [each for at in range(0, 300, 7) for each in looked(at, at + 1, HERE, *cups)]
-    assert told_of(tmp_path, messages, label="cup")["total"] == 2
-
-
-def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
-    mug, moved = ("mug", 3.0, 0.5), ("mug", -2.0, 0.5)
-    messages = [
-        *looked(0, 20, HERE, mug),
-        *looked(20, 30, AWAY),
-        *looked(30, 40, HERE),
-        *looked(40, 60, AWAY, moved),
-    ]
-    [thing] = told_of(tmp_path, messages, label="mug")["things"]
-    assert thing["moved_times"] == 1
-    assert thing["moved"] == [
-        {
-            "from": BEGIN,
-            "to": BEGIN + 19,
-            "place": {"x": 3.0, "y": 0.5},
-            "in": "kitchen",
-            "times": 20,
-        },
-        {"from": BEGIN + 40, "to": BEGIN + 59, "place": {"x": -2.0, "y": 0.5}, "times": 20},
-    ]
-    assert ask(tmp_path, label="mug", where="kitchen")["things"] == []
-
-
-def test_a_thing_that_was_taken_away_and_brought_back_has_its_place_twice(tmp_path: Path) -> None:
-    mug = ("mug", 3.0, 0.5)
-    away = [*looked(0, 20, HERE, mug), *looked(30, 50, AWAY), *looked(60, 80, HERE, mug)]
-    write_splits(tmp_path / "unseen", away)
-    assert "moved" not in ask(tmp_path / "unseen", label="mug")["things"][0]
-    missed = [*looked(0, 20, HERE, mug), *looked(30, 50, HERE), *looked(60, 80, HERE, mug)]
-    [thing] = told_of(tmp_path / "missed", missed, label="mug")["things"]
-    assert [(each["from"], each["to"]) for each in thing["moved"]] == [
-        (BEGIN, BEGIN + 19),
-        (BEGIN + 60, BEGIN + 79),
-    ]
-    assert thing["count"] == 40
-    [before] = ask(tmp_path, label="mug", where="kitchen", end=BEGIN + 25)["things"]
-    assert before["place"]["x"] == 3.0
-    assert "not_seen_where_expected" in before["still_there"]
-
-
-def test_a_thing_is_said_to_be_missed_only_after_looks_from_where_it_was_seen(
-    tmp_path: Path,
-) -> None:
-    mug = ("mug", 3.0, 0.5)
-    seen = looked(0, 20, HERE, mug)
-    [thing] = told_of(tmp_path / "away", [*seen, *looked(20, 60, AWAY)], label="mug")["things"]
-    assert thing["still_there"] == {"not_looked_at_since": BEGIN + 19}
-    [thing] = told_of(tmp_path / "missed", [*seen, *looked(20, 60, HERE)], label="mug")["things"]
-    # Two looks in ten seconds of the clock, which count as a whole.
-    assert thing["still_there"] == {"not_seen_where_expected": BEGIN + 29, "looks": 40}
-
-
-@pytest.mark.parametrize("beside_m", [0.0, 0.02, 0.6])
-def test_a_place_is_looked_at_from_where_it_was_seen_however_poses_are_divided(
-    tmp_path: Path, beside_m: float
-) -> None:
-    """The robot stands where four cells of poses meet: what it is off by is another cell."""
-    before, after = (0.99, -0.01, -0.02), (0.99 + beside_m, -0.01 + beside_m, -0.02 + beside_m)
-    stay = [("book", 4.0, 1.5), ("vase", 4.0, -1.0)]
-    seen = looked(0, 20, before, ("mug", 3.0, 0.5), *stay)
-    [mug] = told_of(tmp_path, [*seen, *looked(20, 50, after, *stay)], label="mug")["things"]
-    state = "not_looked_at_since" if beside_m > 0.5 else "not_seen_where_expected"
-    assert state in mug["still_there"]
-
-
-def test_floors_on_top_of_each_other_are_told_apart(tmp_path: Path) -> None:
-    chair, cup, bed = ("chair", 4.0, -0.5), ("cup", 3.0, 0.5), ("bed", 3.0, 0.5)
-    write_splits(
-        tmp_path,
-        [
-            *looked(0, 60, HERE, chair, cup),
-            *looked(100, 160, HERE, chair, bed, height=3.0),
-            *looked(200, 230, HERE, chair, cup),
-            *looked(300, 400, HERE, chair, bed, height=3.0),
-        ],
-    )
-    things = ask(tmp_path)["things"]
-    assert [(each["label"], each["place"]["z"], each["count"]) for each in things] == [
-        *(("bed", 3.7, 160), ("chair", 3.7, 160)),
-        *(("chair", 0.7, 90), ("cup", 0.7, 90)),
-    ]
-    states = [[*each["still_there"]] for each in things]
-    assert states == [["in_view"]] * 2 + [["not_looked_at_since"]] * 2
-    assert not any("moved" in each for each in things)
-
-
-def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path) -> None:
-    [thing] = told_of(
-        tmp_path, looked(0, 60, HERE, ("mug", 3.0, 0.5)), label="mug", end=BEGIN + 25
-    )["things"]
-    assert thing["still_there"] == {"seen_since": BEGIN + 59}
-    assert thing["last_seen"] == BEGIN + 29  # ten seconds count as a whole
-    assert ask(tmp_path, label="mug", end=BEGIN - 5)["reason"] == "outside_range"
-
-
 LATER: list[list[Seen]] = [
     [("mug", 3.25, 0.5), ("chair", 4.0, -1.0)],
     [("mug", 3.0, 0.5), ("mug", 3.3, 0.6), ("mug", 3.6, 0.4), ("chair", 4.2, -1.1)],
@@ -509,41 +280,6 @@ def test_people_are_counted_in_the_region_that_is_asked_for(tmp_path: Path) -> N
     assert ask(tmp_path, label="cup", near={"label": "person", "radius_m": 1})["total"] == 1
 
 
-def test_an_unknown_label_is_answered_with_those_that_there_are(tmp_path: Path) -> None:
-    reply = told_of(tmp_path, looked(0, 20, HERE, ("headphones", 3.0, 0.5)), label="phone")
-    assert reply["things"] == []
-    near = "there are: headphones; did you mean headphones?"
-    assert reply["notes"] == [f'no detector reported "phone"; {near}']
-
-
-@pytest.mark.parametrize("latency_s", [1, 6])
-def test_what_a_slow_detector_sees_is_placed_by_the_stamps_of_its_images(
-    tmp_path: Path, latency_s: int
-) -> None:
-    """A robot drives by at 1 m/s; a large model takes seconds for an image."""
-    messages: list[Msg] = []
-    for second in range(60):
-        poses_and_cup = scene(second, (float(second), 0.0, 0.0), [("cup", 30.0, 1.0)])
-        *poses, cup = poses_and_cup
-        messages += [*poses, replace(cup, log_time=cup.log_time + latency_s * S)]
-    messages.sort(key=lambda message: message.log_time)
-    [thing] = told_of(tmp_path, messages, label="cup")["things"]
-    assert (thing["place"]["x"], thing["place"]["y"]) == (30.0, 1.0)
-
-
-def test_several_labels_are_asked_for_at_once(tmp_path: Path) -> None:
-    write_splits(
-        tmp_path, looked(0, 20, HERE, ("mug", 3.0, 0.5), ("book", 3.0, -1.0), ("cup", 4.0, 2.0))
-    )
-    reply = ask(tmp_path, label=["mug", "Book", "keys"])
-    assert sorted(each["label"] for each in reply["things"]) == ["book", "mug"]
-    assert (reply["total"], reply["labels"]) == (2, {"book": 1, "mug": 1})
-    [note] = reply["notes"]
-    assert note.startswith('"keys": no detector reported "keys"')
-    assert ask(tmp_path, label='["mug", "book"]')["total"] == 2
-    assert ask(tmp_path, label=["mug"]) == ask(tmp_path, label="mug")
-
-
 def alternating(*labels: str, y: float = 0.5, begin: int = 0) -> list[Msg]:
     """A thing that each message names otherwise, with 5 cm of noise."""
     draw = Random(1)
@@ -559,20 +295,6 @@ def alternating(*labels: str, y: float = 0.5, begin: int = 0) -> list[Msg]:
 
 
 PLAIN = QuerySettings()
-
-
-@pytest.mark.parametrize(("short", "long"), [("mug", "coffee mug"), ("phone", "cell phone")])
-def test_two_labels_that_a_detector_gives_to_one_thing_are_one_row(
-    tmp_path: Path, short: str, long: str
-) -> None:
-    write_splits(tmp_path, alternating(short, long, short) + looked(40, 50, AWAY))
-    for label in (short, long, None):
-        reply = ask(tmp_path, PLAIN, **({} if label is None else {"label": label}))
-        [thing] = reply["things"]
-        assert (thing["label"], thing["labels"]) == (short, {short: 27, long: 13})
-        assert (thing["count"], thing["still_there"]) == (40, {"not_looked_at_since": BEGIN + 39})
-        assert not thing.keys() & {"also_seen_as", "misread_as"}
-        assert (reply["labels"], "notes" in reply) == ({short: 1}, False)
 
 
 MUG, COFFEE_MUG = ("mug", 3.0, 0.5), ("coffee mug", 3.1, 0.5)
@@ -648,17 +370,6 @@ def test_labels_without_a_place_are_named(tmp_path: Path) -> None:
     assert "did you mean scissors (open)?" in note
 
 
-def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -> None:
-    for run in range(2):
-        begin = run * 100
-        messages = looked(begin, begin + 20, HERE, ("mug", 3.0, 0.5), in_map=False)
-        write_splits(tmp_path, messages, name=f"run{run}")
-    reply = ask(tmp_path, label="mug")
-    assert reply["frame_id"] == "odom"
-    assert reply["total"] == 2
-    assert "each run of odometry" in reply["notes"][0]
-
-
 def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
     tmp_path: Path,
 ) -> None:
@@ -724,58 +435,6 @@ def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Pat
     assert notes[-1] == "it was detected 30 times in all, and not once in this window"
 
 
-@pytest.mark.parametrize("scores", [(0.8,), (0.9,), (0.7, 0.8), (0.31, 0.33, 0.35)])
-def test_the_median_score_is_known_to_a_twentieth(
-    tmp_path: Path, scores: tuple[float, ...]
-) -> None:
-    [cup] = told_of(tmp_path, scored(scores))["things"]
-    assert cup["score"]["best"] == max(scores)
-    assert min(scores) - 0.05 <= cup["score"]["median"] <= max(scores)
-    assert len(scores) > 1 or cup["score"]["median"] == scores[0]
-
-
-def scored(scores: Sequence[float]) -> list[Msg]:
-    return [
-        each
-        for at in range(24)
-        for each in scene(at, HERE, [("cup", 3.0, 0.5)], score=scores[at % len(scores)])
-    ]
-
-
-def test_scores_are_those_of_the_detections_that_count(tmp_path: Path) -> None:
-    [cup] = told_of(tmp_path, scored((0.1, 0.1, 0.1, 0.9)), min_score=0.5)["things"]
-    assert (cup["count"], cup["score"]) == (6, {"best": 0.9, "median": 0.9})
-    [cup] = ask(tmp_path)["things"]
-    assert (cup["count"], cup["score"]) == (24, {"best": 0.9, "median": 0.125})
-
-
-def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:
-    seen = (("table", 3.0, 0.5), ("mug", 3.3, 0.9), ("mug", 5.0, -1.0), ("plate", 2.6, 0.5))
-    write_splits(tmp_path, looked(0, 30, HERE, *seen))
-
-    def near(what: object, **given: Any) -> list[tuple[str, float]]:
-        reply = ask(tmp_path, near=what, **given)
-        assert reply["total"] == len(reply["things"]) == sum(reply.get("labels", {}).values())
-        return sorted((each["label"], each["near_m"]) for each in reply["things"])
-
-    assert near({"label": "Tables", "radius_m": 0.6}) == [("mug", 0.5), ("plate", 0.4)]
-    assert near("table", label="mug") == [("mug", 0.5)]
-    assert near({"x": 3.0, "y": 0.5, "radius_m": 0.45}) == [("plate", 0.4), ("table", 0.0)]
-    assert near('{"x": 5.0, "y": -1.0, "radius_m": 0.2}') == [("mug", 0.0)]
-    # No thing is near itself, but near another of its label; and where it is counts.
-    assert near({"label": "plate", "radius_m": 9}, label="plate") == []
-    assert near({"label": "mug", "radius_m": 9}, label="mug") == [("mug", 2.55), ("mug", 2.55)]
-    there = {"x": 3.4, "y": 0.9, "radius_m": 0.2}
-    assert near("table", where=there) == [("mug", 0.5)]
-    beside = {"label": "plates", "radius_m": 0.1}
-    assert near(beside, label="mug") == []
-    assert any("within 0.1 m" in note for note in ask(tmp_path, near=beside, label="mug")["notes"])
-    assert near("tabel") == []
-    notes = ask(tmp_path, near="tabel")["notes"]
-    assert 'near: there is no thing "tabel" in this window' in notes
-    assert any("did you mean table?" in note for note in notes)
-
-
 @pytest.mark.parametrize(
     "near",
     [
@@ -820,17 +479,6 @@ def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
     next_morning = evening - 86_400 + 13 * 3600 + 1800
     [mug] = ask(tmp_path, label="mug", end=next_morning)["things"]
     assert mug["usually"][0]["hours"] == "07-10"
-
-
-def test_a_thing_that_is_moved_without_a_routine_has_no_pattern(tmp_path: Path) -> None:
-    chance = Random(3)
-    messages: list[Msg] = []
-    for nth in range(84):
-        at = nth // 6 * 86_400 + (7 + nth % 6) * 3600
-        messages += looked(at, at + 4, HERE, ("mug", 3.0, chance.choice([0.5, -1.0])))
-    write_splits(tmp_path, messages, split_s=86_400.0)
-    [mug] = ask(tmp_path, label="mug")["things"]
-    assert mug["usually"] == "no pattern"
 
 
 @pytest.mark.parametrize("every", [1, 2])
@@ -891,16 +539,3 @@ def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
     reply = ask(tmp_path, QuerySettings(places=(KITCHEN, table)))
     [mug] = reply["things"]
     assert (mug["in"], mug["also_in"]) == ("table", ["kitchen"])
-
-
-def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
-    walk = [
-        message
-        for at in range(30)
-        for message in scene(at, HERE, [("person", 2.0 + at * 0.3, 0.0), ("person", 3.0, 1.0)])
-    ]
-    write_splits(tmp_path, walk)
-    [people] = ask(tmp_path, label="people")["things"]
-    assert people["moves"] is True
-    assert people["at_once"] == 2
-    assert "still_there" not in people

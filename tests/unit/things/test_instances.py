@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
-from ros2_memory.analysis.sights import SLICE_NS, Sights
+from ros2_memory.analysis.sights import Sights
 from ros2_memory.things.instances import estimate
 from ros2_memory.things.labels import Labels
 from tests.support.sights import (
@@ -48,13 +46,6 @@ def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None
     assert mug.missed_by == 117 * 10**9
 
 
-@pytest.mark.parametrize("slices", [255, 256, 257])
-def test_slices_are_told_apart_where_their_number_just_fits_into_a_byte(slices: int) -> None:
-    messages = [Message("/d", nth * SLICE_NS, HERE, seen_at(2, 0)) for nth in range(slices)]
-    [mug] = estimate(whole([sights_of_messages(messages)]), LABELS).instances
-    assert [stay.count for stay in mug.stays] == [slices]
-
-
 def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_always_seen() -> None:
     rarely = [
         bag_of(*[(HERE, seen_at(2, 0) if each % 5 == 0 else []) for each in range(20)], start=t)
@@ -63,16 +54,6 @@ def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_alwa
     empty = bag_of(*[(HERE, [])] * 12, start=100)
     [mug] = estimate(whole([*rarely, empty]), LABELS).instances
     assert mug.missed_by is None
-
-
-@pytest.mark.parametrize("middle_deg", [0.0, 1.5, 180.5, 83.5])
-def test_seen_from_has_the_mean_heading_also_across_the_full_circle(middle_deg: float) -> None:
-    poses = [(0.0, 0.0, math.radians(middle_deg + off_deg)) for off_deg in (-3, 3)] * 20
-    found = estimate(whole([bag_of(*((pose, seen_at(2, 0)) for pose in poses))]), LABELS)
-    [mug] = found.instances
-    robot = found.seen_from(mug.stays[0].spots)
-    assert robot is not None
-    assert math.remainder(robot[2] - math.radians(middle_deg), math.tau) == pytest.approx(0)
 
 
 def test_a_name_that_is_rarely_given_to_a_thing_is_its_other_name() -> None:
@@ -99,16 +80,6 @@ def test_a_second_thing_that_comes_beside_one_after_long_is_a_second_thing(away_
     both = [(HERE, [*seen_at(2, 0), *seen_at(2, away_m)])] * 60
     found = estimate(whole([bag_of(*alone, *both)]), LABELS).instances
     assert [(len(each.stays), each.stays[0].count) for each in found] == [(1, 1860), (1, 60)]
-
-
-def test_a_detector_that_has_a_thing_twice_now_and_then_makes_no_second_one() -> None:
-    messages = [
-        (HERE, [*seen_at(2, 0), *seen_at(2, 0.7)] if nth % 4 == 0 else seen_at(2, 0))
-        for nth in range(600)
-    ]
-    alone = [(HERE, seen_at(2, 0))] * 1800
-    [mug] = estimate(whole([bag_of(*alone, *messages)]), LABELS).instances
-    assert len(mug.stays) == 1
 
 
 def test_a_second_thing_that_comes_close_beside_one_after_long_stands_with_it() -> None:

@@ -112,29 +112,6 @@ def labels_and_notes(memory: Memory, deadline: Deadline) -> tuple[set[str], list
     return {each.label for each in found.things}, notes
 
 
-def test_of_too_many_sightings_the_newest_are_compared(
-    crowded: Memory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    every = {label for label, *_ in THINGS}
-    assert labels_and_notes(crowded, Deadline.after(60)) == (every, [])
-    monkeypatch.setattr(known, "_MOST_SPOTS", 3)
-    again = replace(crowded, index=memory_of(crowded.index.bag_dir, limits=NAMED).index)
-    for _ in range(2):  # the second time it is known
-        labels, [note] = labels_and_notes(again, Deadline.after(60))
-        assert labels == {label for label, *_ in THINGS[5:]}
-        assert str(begin_of(5)) in note
-
-
-def test_where_comparing_takes_too_long_fewer_are_compared_from_then_on(
-    crowded: Memory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
-    newest = {label for label, *_ in THINGS[7:]}
-    labels, [note] = labels_and_notes(crowded, Deadline.after(60))
-    assert labels == newest
-    assert str(begin_of(7)) in note
-
-
 class WithoutEstimates(ByteLru[tuple[Timeline, object]]):
     """Keeps only how many sightings can be compared in time."""
 
@@ -156,15 +133,6 @@ def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     monkeypatch.setattr(known, "_ESTIMATING_S", 1e6)
     compared = [len(labels_and_notes(crowded, Deadline.after(60))[0]) for _ in range(5)]
     assert compared == [1, 2, 4, 8, 8]
-
-
-def test_a_call_without_an_end_compares_all(
-    crowded: Memory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
-    labels, notes = labels_and_notes(crowded, Deadline.never())
-    assert labels == {label for label, *_ in THINGS}
-    assert notes == []
 
 
 def test_of_a_window_before_what_was_compared_no_never_is_said(

@@ -73,27 +73,6 @@ def place_at(usual: UsualPlace) -> int:
     return place_of(1000 * usual.place[0], 1000 * usual.place[1])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_routine_says_better_than_the_last_place_where_it_is(seed: int) -> None:
-    """By Brier's score over hours that were not known then."""
-    drawn = month(seed, by_routine)
-    times, seen, places = drawn
-    chance = np.random.default_rng(seed)
-    scores, by_last_place = [], []
-    for hour in chance.integers(KNOWN_DAYS * 24, DAYS * 24, 30).tolist():
-        at = hour * HOUR
-        usual = told(drawn, at)
-        assert usual, "a routine is found"
-        likely = np.zeros(len(PLACES))
-        for each in usual:
-            likely[place_at(each)] = each.likely
-        likely[places[hour]] -= 1
-        scores.append((likely**2).sum())
-        last = place_of(*seen[times < at][-1])
-        by_last_place.append(0 if last == places[hour] else 2)
-    assert np.mean(scores) < 0.75 * np.mean(by_last_place)
-
-
 def test_its_places_have_their_hours_and_shares() -> None:
     usual = told(month(1, by_routine), KNOWN_DAYS * DAY + 12 * HOUR)
     assert usual is not None
@@ -118,11 +97,3 @@ def test_of_few_days_or_of_one_place_nothing_is_said() -> None:
     assert (
         usual_places(times, np.broadcast_to(seen[0], seen.shape), DAYS * DAY, lambda _: 0) is None
     )
-
-
-def test_hours_are_those_of_local_time() -> None:
-    times, seen, _ = month(1, by_routine)
-    here = usual_places(times, seen, DAYS * DAY, lambda _: 0)
-    west = usual_places(times + 5 * HOUR, seen, DAYS * DAY + 5 * HOUR, lambda _: -5 * 3600)
-    assert here
-    assert west == here

@@ -25,9 +25,9 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.model import Pose, Sample, SetAside
+from ros2_memory.core.model import Sample, SetAside
 from ros2_memory.core.reply import LocalTimes
-from ros2_memory.core.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
+from ros2_memory.core.timebase import NS_PER_S, unix_rounded_up
 from ros2_memory.results import Answer
 from ros2_memory.tools.replies import Replies
 
@@ -43,10 +43,6 @@ def said(answer: Answer, replies: Replies = REPLIES) -> Any:
     reply = replies.answer(answer)
     assert not reply.is_error
     return json.loads(reply.text)
-
-
-def value(at: int = T0, shown_value: Any = 1.5, **more: Any) -> results.TopicValue:
-    return results.TopicValue("/a", "std_msgs/msg/Float64", Sample(at, shown_value), **more)
 
 
 def row(number: int) -> results.TopicRow:
@@ -82,47 +78,6 @@ def trajectory(**other: Any) -> results.TrajectorySummary:
         "invalid": 0,
     }
     return results.TrajectorySummary("/odom", "odom", T0, T0 + 1, Trajectory(**way | other))
-
-
-HALF = math.sqrt(0.5)
-NOWHERE = Pose((1.234567, math.nan, -0.00001), (0.0, 0.0, HALF, HALF), "odom")
-
-
-@pytest.mark.parametrize(
-    ("answer", "text"),
-    [
-        pytest.param((), "[]", id="no topics are an empty list"),
-        pytest.param(
-            results.Position("/odom", T0, NOWHERE, age=2 * NS_PER_S),
-            '{"x":1.2346,"y":null,"z":0.0,"yaw_deg":90.0,"timestamp":1784023200.0,'
-            '"topic":"/odom","frame_id":"odom","age_s":2.0}',
-            id="a position is in metres and degrees, with null for what is not known",
-        ),
-        pytest.param(results.Match(None), "null", id="a complete search without a match"),
-        pytest.param(
-            results.Match(None, notes=("a.mcap is damaged",)),
-            '{"timestamp":null,"value":null,"notes":["a.mcap is damaged"]}',
-            id="an incomplete search without a match says what it missed",
-        ),
-        pytest.param(
-            results.Match(
-                value(age=NS_PER_S, notes=("b.mcap was left open", "thinned")),
-                notes=("b.mcap was left open",),
-            ),
-            '{"timestamp":1784023200.0,"value":1.5,"topic":"/a","type":"std_msgs/msg/Float64",'
-            '"age_s":1.0,"notes":["b.mcap was left open","thinned"]}',
-            id="a match says when, what and where, with each note once",
-        ),
-        pytest.param(
-            results.ValueWhen(value(), notes=("/odom held no message yet",)),
-            '{"timestamp":1784023200.0,"matched":1.5,"value":null,"value_timestamp":null,'
-            '"condition_topic":"/a","value_topic":null,"notes":["/odom held no message yet"]}',
-            id="a topic that held nothing yet gives a null value",
-        ),
-    ],
-)
-def test_the_text_of_an_answer(answer: Answer, text: str) -> None:
-    assert REPLIES.answer(answer).text == text
 
 
 @pytest.mark.parametrize(
@@ -196,12 +151,6 @@ def test_topics_are_always_a_list_of_rows_of_five_keys_with_the_busiest_first(
     assert rest["last_ts"] == unix_rounded_up(max(row.last for row in left_out))
 
 
-def test_a_timestamp_is_rounded_up_so_that_it_finds_its_own_message() -> None:
-    at = T0 + 123_456_001
-    assert ns_from_unix(said(value(at))["timestamp"]) >= at
-    assert said(value(at))["timestamp"] == 1784023200.123457
-
-
 def test_long_lists_of_files_show_the_last_ones_and_their_number() -> None:
     damaged = tuple(SetAside(BAGS / f"{n:03}.mcap", "torn") for n in range(50))
     shown = said(results.DataTimeRange(T0, T0, T0, 1, (), (), (), damaged, (), 0))
@@ -228,11 +177,6 @@ def test_a_range_with_fields_is_a_table() -> None:
     assert "samples" not in shown
 
 
-def sighted(first: int, last: int, now: int) -> results.Sightings:
-    seen = results.Sighting("/a", first, last, last, 3, True, None, None)
-    return results.Sightings((seen,), more=False, total=1, start=first, end=now, now=now)
-
-
 HOUR = 3600 * NS_PER_S
 
 
@@ -243,17 +187,6 @@ def utc() -> Iterator[None]:
         time.tzset()
         yield
     time.tzset()
-
-
-@pytest.mark.usefixtures("utc")
-def test_what_spans_more_than_half_a_day_has_local_times() -> None:
-    near = said(sighted(T0, T0 + NS_PER_S, T0 + 12 * HOUR))
-    assert "local" not in near
-    assert "local" not in near["sightings"][0]
-    far = said(sighted(T0, T0 + NS_PER_S, T0 + 13 * HOUR))
-    assert far["sightings"][0]["local"] == "Tue 2026-07-14 10:00:00 - 10:00:01"
-    assert far["local"] == "Tue 2026-07-14 10:00:00 - 23:00:00"
-    assert far["sightings"][0]["first_seen"] == near["sightings"][0]["first_seen"]
 
 
 @pytest.mark.usefixtures("utc")

@@ -6,7 +6,7 @@ import json
 import re
 import time
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -14,7 +14,7 @@ from ros2_memory import cli
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of
-from tests.support.rooms import BEGIN, SEEN, asked_of, draw, write
+from tests.support.rooms import BEGIN, asked_of, draw, write
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
 
 DAY_S = 86_400
-TIMES = ("timestamp", "first_seen", "arrived")
 
 
 @pytest.fixture(scope="module")
@@ -37,77 +36,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def memory(folder: Path) -> Memory:
     return asked_of(folder, stored=False)
-
-
-def rows_of(value: Any) -> Iterator[dict[str, Any]]:
-    """The objects with a Unix time."""
-    if isinstance(value, list):
-        for each in value:
-            yield from rows_of(each)
-    elif isinstance(value, dict):
-        if not value.keys().isdisjoint(TIMES):
-            yield value
-        for each in value.values():
-            yield from rows_of(each)
-
-
-@pytest.mark.parametrize(
-    ("tool", "given"),
-    [
-        ("get_topic_in_range", {"topic": "/chatter"}),
-        ("trajectory_summary", {}),
-        ("find_matches", {"topic": SEEN, "condition_type": "contains", "value": "cup"}),
-        ("visits", {"where": "kitchen"}),
-    ],
-)
-def test_local_time_stands_beside_unix_time_where_days_must_be_told_apart(
-    memory: Memory, folder: Path, tool: str, given: dict[str, Any]
-) -> None:
-    both = asked(memory, folder, tool, start=BEGIN, end=BEGIN + 2 * DAY_S, **given)
-    rows = [*rows_of(both)]
-    assert rows
-    for row in rows:
-        assert row.get("local"), row
-        key = next(key for key in TIMES if key in row)
-        if row[key] is not None:
-            local = datetime.fromtimestamp(row[key], UTC).astimezone()
-            assert row["local"].startswith(f"{local:%a %Y-%m-%d}")
-
-
-def days_said(reply: Any) -> list[str]:
-    return [row["local"] for row in _objects(reply) if "local" in row]
-
-
-def _objects(value: Any) -> Iterator[dict[str, Any]]:
-    if isinstance(value, list):
-        for part in value:
-            yield from _objects(part)
-    elif isinstance(value, dict):
-        yield value
-        for part in value.values():
-            yield from _objects(part)
-
-
-@pytest.mark.parametrize(
-    ("tool", "given"),
-    [
-        ("find_things", {}),
-        ("visits", {}),
-        ("compare", {"with_start": BEGIN, "with_end": BEGIN + DAY_S - 1, "start": BEGIN + DAY_S}),
-    ],
-)
-def test_rows_of_things_and_places_say_each_day_once(
-    memory: Memory, folder: Path, tool: str, given: dict[str, Any]
-) -> None:
-    span = {"start": BEGIN, "end": BEGIN + 2 * DAY_S, **given}
-    reply = asked(memory, folder, tool, **span)
-    said = days_said(reply)
-    days = [
-        f"{datetime.fromtimestamp(BEGIN + day * DAY_S, UTC).astimezone():%a %Y-%m-%d}"
-        for day in range(2)
-    ]
-    assert said
-    assert [sum(day in text for text in said) for day in days] == [1, 1]
 
 
 def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does_not(
@@ -178,29 +106,6 @@ def utc(seconds: int, decimals: str = "") -> str:
     return f"{datetime.fromtimestamp(T0 + seconds, UTC):%Y-%m-%dT%H:%M:%S}{decimals}Z"
 
 
-@pytest.mark.parametrize(
-    ("tool", "given"),
-    [
-        ("find_matches", {"topic": "/flag", "condition_type": "equals", "value": True}),
-        ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"]}),
-        ("visits", {"x": 5.0, "y": 0.0, "radius_m": 2.0}),
-    ],
-)
-def test_times_of_a_row_by_hour_find_messages_of_their_second_and_in_unix_seconds_their_own(
-    drive: Memory, tmp_path: Path, tool: str, given: dict[str, Any]
-) -> None:
-    table = asked(drive, tmp_path, tool, start=T0, end=T0 + 30, by="hour", **given)
-    row = dict(zip(table["columns"], table["rows"][0], strict=True))
-    times = [name for name in row if f"{name}_unix" in row]
-    assert times
-    for name in times:
-        unix = row[f"{name}_unix"]
-        found = asked(drive, tmp_path, "get_position_at", timestamp=row[name])
-        assert int(found["timestamp"]) == int(unix), name
-        found = asked(drive, tmp_path, "get_position_at", timestamp=unix)
-        assert found["timestamp"] == unix, name
-
-
 def test_at_a_text_is_up_to_the_end_of_its_last_decimal(drive: Memory, tmp_path: Path) -> None:
     def x_at(timestamp: object, **given: object) -> object:
         return asked(drive, tmp_path, "get_position_at", timestamp=timestamp, **given).get("x")
@@ -215,26 +120,6 @@ def test_at_a_text_is_up_to_the_end_of_its_last_decimal(drive: Memory, tmp_path:
     assert "tolerance_s of at least 0.055" in str(
         asked(drive, tmp_path, "get_position_at", timestamp=utc(20), tolerance_s=0.05)
     )
-
-
-@pytest.mark.parametrize("decimals", ["", ".0", ".000000"])
-def test_what_is_interpolated_and_where_windows_end_is_exact(
-    drive: Memory, tmp_path: Path, decimals: str
-) -> None:
-    frames = {"parent": "odom", "child": "base"}
-    assert asked(
-        drive, tmp_path, "get_transform_at", timestamp=utc(5, decimals), **frames
-    ) == asked(drive, tmp_path, "get_transform_at", timestamp=T0 + 5, **frames)
-    for tool, given in (
-        ("trajectory_summary", {}),
-        ("get_topic_in_range", {"topic": "/odom"}),
-        ("recap", {}),
-        ("compare", {"with_start": utc(10, decimals), "with_end": utc(15, decimals)}),
-    ):
-        reply = asked(drive, tmp_path, tool, start=utc(5, decimals), end=utc(10, decimals), **given)
-        numbers = {key: T0 + 10 + 5 * (key == "with_end") for key in given if key != "topic"}
-        exact = asked(drive, tmp_path, tool, start=T0 + 5, end=T0 + 10, **({**given, **numbers}))
-        assert reply == exact, tool
 
 
 @pytest.mark.usefixtures("berlin")

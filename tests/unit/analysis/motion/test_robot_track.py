@@ -131,27 +131,6 @@ def test_a_robot_that_stands_has_two_vertices_in_ten_seconds() -> None:
     assert len(track_of(times, level, level, level).times) == 20
 
 
-def test_a_long_silence_begins_a_piece() -> None:
-    times = np.array([0, 1, 2, 30, 31], np.int64) * S + START
-    track = track_of(times, np.zeros(5), np.zeros(5), np.zeros(5))
-    assert track.times[track.begins].tolist() == [START, START + 30 * S]
-    assert [ends.tolist() for ends in track.pieces] == [
-        [START, START + 30 * S],
-        [START + 2 * S, START + 31 * S],
-    ]
-
-
-def test_an_unknown_heading_stays_unknown() -> None:
-    times = np.arange(3, dtype=np.int64) * S + START
-    assert np.isnan(track_of(times, np.zeros(3), np.zeros(3), np.full(3, np.nan)).heading).all()
-
-
-def test_poses_that_are_no_place_are_left_out() -> None:
-    times = np.arange(4, dtype=np.int64) * S + START
-    x = np.array([0.0, np.nan, 1e9, 1.0])
-    assert track_of(times, x, np.zeros(4), np.zeros(4)).x.tolist() == [0.0, 1.0]
-
-
 def test_of_poses_of_one_time_the_first_counts_in_one_table_and_in_two() -> None:
     times = np.array([0, 1, 1, 2], np.int64) * S + START
     x = np.array([0.0, 1.0, 5.0, 2.0])

@@ -118,26 +118,6 @@ def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     assert len(long) <= len(found) <= len(possible)
 
 
-@pytest.mark.parametrize("hz", [20, 50])
-@pytest.mark.parametrize(("noise", "speed"), [(0.003, 0.1), (0.01, 0.3), (0.02, 1.0)])
-def test_noise_moves_the_ends_of_a_standstill_by_less_than_a_second(
-    hz: int, noise: float, speed: float
-) -> None:
-    for phase in range(0, 16, 3):
-        legs = [(8.0, speed), (7.3, 0.0), (8.0, speed)]
-        made = world(legs, hz=hz, begin=100 + phase / 8, noise=noise)
-        [found] = spans(standstills_of(made.poses))
-        assert found == pytest.approx(made.standing[0], abs=0.8)
-
-
-@pytest.mark.parametrize("hz", [2, 3, 4, 5, 7])
-@pytest.mark.parametrize("noise", [0.001, 0.003])
-def test_few_poses_a_second_with_noise_show_where_the_robot_stood(hz: int, noise: float) -> None:
-    made = world([(25.0, 0.4), (120.0, 0.0), (25.0, 0.4)], hz=hz, begin=100, noise=noise)
-    [found] = spans(standstills_of(made.poses))
-    assert found == pytest.approx(made.standing[0], abs=0.8)
-
-
 @pytest.mark.parametrize("hz", [2, 4, 5])
 @pytest.mark.parametrize(("radius", "speed"), [(0.1, 0.06), (0.3, 0.1), (1.0, 0.4)])
 def test_a_robot_that_turns_in_circles_with_few_poses_does_not_stand(
@@ -168,21 +148,6 @@ def test_how_often_poses_come_at_another_time_changes_nothing() -> None:
     assert standstills_of(rare.poses + often.poses, blocks=20) == alone
 
 
-def test_long_standing_with_noise_of_a_centimetre_is_one_standstill() -> None:
-    poses = world([(900.0, 0.0)], noise=0.01).poses
-    [found] = standstills_of(poses)
-    assert (found.end - found.start) / S == pytest.approx(900, abs=0.1)
-    assert found.box.diagonal < 0.05
-    assert math.dist(found.box.centre, (0, 2, 0)) < 0.01
-
-
-@pytest.mark.parametrize("speed", [0.004, 0.0065, 0.01, 0.05])
-@pytest.mark.parametrize("hz", [10, 50])
-def test_a_robot_that_creeps_does_not_stand(speed: float, hz: int) -> None:
-    poses = world([(361.0, speed)], hz=hz).poses
-    assert standstills_of(poses) == ()
-
-
 @pytest.mark.parametrize("speed", [0.004, 0.005, 0.008])
 @pytest.mark.parametrize("noise", [0.0, 0.001])
 def test_a_creep_between_two_stops_is_parted_from_both(speed: float, noise: float) -> None:
@@ -190,12 +155,6 @@ def test_a_creep_between_two_stops_is_parted_from_both(speed: float, noise: floa
     found = standstills_of(made.poses)
     assert stood(found) == pytest.approx(40, abs=14)
     assert all(each.end / S <= 127 or each.start / S >= 173 for each in found)
-
-
-@pytest.mark.parametrize("speed", [0.02, 0.03, 0.05])
-def test_a_robot_that_creeps_under_noise_does_not_stand(speed: float) -> None:
-    made = world([(361.0, speed)], noise=0.01)
-    assert stood(standstills_of(made.poses)) < 4
 
 
 @settings(max_examples=examples(20), deadline=None)
@@ -253,33 +212,6 @@ def test_standstills_under_any_noise_are_in_order_and_disjoint(poses: Poses, blo
     assert standstills_of(poses, blocks) == found
 
 
-@pytest.mark.parametrize(
-    ("poses", "expected"),
-    [
-        ([(S, (0.0, 0.0, 0.0))], []),
-        ([(nth * S, (math.nan, 0.0, 0.0)) for nth in range(9)], []),
-        # Poses once a second.
-        (world([(30, 0.5)], hz=1).poses, []),
-        (world([(29, 0.0)], hz=1).poses, [(100.0, 129.0)]),
-        # A silence ends it, a drift does not.
-        (
-            world([(5, 0.0)]).poses + world([(5, 0.0)], begin=200).poses,
-            [(100.0, 105.0), (200.0, 205.0)],
-        ),
-        (world([(300.0, 0.002)]).poses, [(100.0, 400.0)]),
-    ],
-    ids=count(),
-)
-def test_how_long_a_robot_stood(poses: Poses, expected: list[tuple[float, float]]) -> None:
-    assert spans(standstills_of(poses)) == [pytest.approx(each, abs=0.5) for each in expected]
-
-
-def test_a_jump_ends_a_standstill() -> None:
-    made = world([(5, 0.0)]).poses
-    poses = made + [(time + 5 * S + S // 50, (x + 3, y, z)) for time, (x, y, z) in made]
-    assert [round(each.box.centre[0], 3) for each in standstills_of(poses)] == [0.0, 3.0]
-
-
 BEGIN = 1_784_000_000 * S
 Pose = tuple[int, tuple[float, float, float], tuple[float, float, float, float]]
 
@@ -308,21 +240,6 @@ def found(poses: list[Pose]) -> list[SpeedDrop]:
     return [*speed_drops(posed(rows, [turn for *_, turn in poses]))]
 
 
-def test_a_robot_that_suddenly_slows_down_is_noticed_with_its_speeds() -> None:
-    [drop] = found(driven((5.2, 0.5, 0), (2.5, 0.05, 0), (5, 0.5, 0)))
-    assert (drop.time - BEGIN) / S == pytest.approx(5.2, abs=0.6)
-    assert drop.before_mps == pytest.approx(0.5, abs=0.01)
-    assert drop.after_mps == pytest.approx(0.05, abs=0.01)
-
-
-def test_a_drone_that_sinks_where_it_flew_has_the_speed_at_which_it_sinks() -> None:
-    flown = [(BEGIN + n * S // 20, (0.15 * n, 0.0, 30.0)) for n in range(100)]
-    sinking = [(BEGIN + n * S // 20, (15.0, 0.0, 30.0 - 0.05 * (n - 100))) for n in range(100, 200)]
-    upright = [(0.0, 0.0, 0.0, 1.0)] * 200
-    [drop] = speed_drops(posed([*flown, *sinking], upright))
-    assert (drop.before_mps, drop.after_mps) == pytest.approx((3.0, 1.0), abs=0.05)
-
-
 @pytest.mark.parametrize(
     "poses",
     [
@@ -346,11 +263,6 @@ def test_a_drone_that_sinks_where_it_flew_has_the_speed_at_which_it_sinks() -> N
 )
 def test_what_is_no_sudden_loss_of_speed(poses: list[Pose]) -> None:
     assert found(poses) == []
-
-
-def test_poses_without_orientation_show_some() -> None:
-    poses = driven((5, 0.5, 0), (2, 0.0, 0.8))
-    assert len(speed_drops(posed((at, place) for at, place, _ in poses))) == 1
 
 
 @given(
