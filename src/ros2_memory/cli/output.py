@@ -49,6 +49,7 @@ _MOST_ROWS: Final = 10
 """Of a list that is cut."""
 _ENDLESS: Final = 10_000
 """Characters of a terminal that is wide enough for any table."""
+_TIME_OF_DAY_WIDTH: Final = 15
 _MIN_TEXT_WIDTH: Final = 16
 """Columns that a text keeps where a table is wider than the terminal."""
 _ALL: Final = "all"
@@ -56,6 +57,16 @@ _ALL: Final = "all"
 _KEYS_OF_TIMES: Final = frozenset({"start", "end", "earliest", "latest", "first_ts", "last_ts"})
 _VECTOR_KEYS: Final = frozenset({"x", "y", "z", "w", "yaw_deg", "frame_id"})
 _TIME_IN_NOTE: Final = re.compile(r"\b\d{10}\.\d{3,9}\b")
+_COMMANDS: Final = {
+    "data_time_range": "`ros2-memory info`",
+    "list_recorded_topics": "`ros2-memory topics`",
+}
+"""What a person runs in place of a tool that a sentence names."""
+_LISTS_TOOLS: Final = "the tools are: "
+"""In a sentence that lists the tools, each by its name."""
+_WITH_TOOLS: Final = frozenset({"problems", "doubts"})
+"""Keys of sentences that may name tools."""
+_TOOL_IN_NOTE: Final = re.compile(rf"(?<![\w/])(?:{'|'.join(_COMMANDS)})\b")
 
 
 def print_line(line: str) -> None:
@@ -157,7 +168,10 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
         elif key == "detail" and isinstance(inner, str):  # why there is no answer
             lines.add_row(key, Text(with_local_times(inner)))
         else:
-            lines.add_row(Text(escape(key)), Text(_format_line(key, inner, now)))
+            line = _format_line(key, inner, now)
+            lines.add_row(
+                Text(escape(key)), Text(with_commands(line) if key in _WITH_TOOLS else line)
+            )
     if lines.row_count:
         console.print(lines)
     for key, rows in lists.items():
@@ -172,8 +186,16 @@ def _objects(values: Sequence[JsonValue]) -> list[dict[str, JsonValue]]:
 
 
 def with_local_times(sentence: str) -> str:
-    """Returns a sentence for a terminal, with times in this machine's zone."""
-    return escape(_TIME_IN_NOTE.sub(lambda time: format_time(float(time[0])), sentence))
+    """Returns a sentence for a terminal, with times in this machine's zone, and commands."""
+    local = _TIME_IN_NOTE.sub(lambda time: format_time(float(time[0])), sentence)
+    return escape(with_commands(local))
+
+
+def with_commands(sentence: str) -> str:
+    """Returns a sentence with commands for the tools that it names, where there is one."""
+    if _LISTS_TOOLS in sentence:
+        return sentence
+    return _TOOL_IN_NOTE.sub(lambda tool: _COMMANDS[tool[0]], sentence)
 
 
 def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
@@ -203,11 +225,13 @@ def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> No
     flattened = [_flattened(row) for row in rows]
     if len(_all_keys(flattened)) > _MAX_COLUMNS:
         flattened = [{**row} for row in rows]
-    table = _table(flattened)
     endless = console.options.update_width(_ENDLESS)
-    if Measurement.get(console, endless, table).minimum <= console.width:
-        console.print(table)
-        return
+    for breaks_times in (False, True):
+        table = _table(flattened, breaks_times=breaks_times)
+        needed = Measurement.get(console, endless, table)
+        if (needed.minimum if breaks_times else needed.maximum) <= console.width:
+            console.print(table)
+            return
     for row in rows:
         console.print()
         _print_object(console, row, None)
@@ -244,21 +268,31 @@ def _format_for_key(key: str, value: JsonValue) -> str:
     return format_value(value)
 
 
-def _table(rows: Sequence[Mapping[str, JsonValue]]) -> Table:
-    """Returns objects as rows; their keys, in order of appearance, are the columns."""
+def _table(rows: Sequence[Mapping[str, JsonValue]], *, breaks_times: bool) -> Table:
+    """Returns objects as rows; their keys, in order of appearance, are the columns.
+
+    A time may break between its date and its time of day.
+    """
     table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     columns = []
     for key in _all_keys(rows):
         values = [row.get(key) for row in rows]
-        is_numeric = all(isinstance(value, int | float | None) for value in values)
+        has_times = any(map(_is_time, values))
+        is_numeric = not has_times and all(
+            isinstance(value, int | float) and not isinstance(value, bool)
+            for value in values
+            if value is not None
+        )
         cells = [_format_for_key(key, value) for value in values]
+        if has_times and breaks_times:
+            cells = [cell.replace("T", "\n") for cell in cells]
         width = max(map(len, (key, *chain(*map(str.split, cells)))))
         table.add_column(
             Text(escape(key)),
-            justify="right" if is_numeric and not any(map(_is_time, values)) else "left",
+            justify="right" if is_numeric else "left",
             overflow="fold",
             no_wrap=is_numeric,
-            min_width=min(width, _MIN_TEXT_WIDTH),
+            min_width=_TIME_OF_DAY_WIDTH if has_times else min(width, _MIN_TEXT_WIDTH),
         )
         columns.append(map(Text, cells))
     for row in zip(*columns, strict=True):

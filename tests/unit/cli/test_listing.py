@@ -93,8 +93,8 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("cat /odom gone", "gone: there is no such file or folder"),
         ("cat a /odom", "/odom: there is no such file or folder"),
         # People read commands where an error names a tool.
-        ("cat /odom empty", "; data_time_range lists"),
-        ("cat /nothing a", "; list_recorded_topics lists"),
+        ("cat /odom empty", "; `ros2-memory info` lists"),
+        ("cat /nothing a", "; `ros2-memory topics` lists"),
         ("cat '/\x1b[31m' .", "/\\x1b[31m"),
         ("export .", "give one of --mcap FILE and --parquet DIR"),
         ("export . --mcap x --parquet b", "give one of --mcap FILE and --parquet DIR"),

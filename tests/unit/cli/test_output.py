@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.cli.output import format_time, format_value, print_reply
+from ros2_memory.cli.output import format_time, format_value, print_reply, with_commands
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,6 +83,13 @@ def test_a_time_of_a_clock_that_was_never_set_has_its_unit(shown: Shown) -> None
     assert "0 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
 
 
+def test_a_list_of_tools_stays_one_and_a_tool_to_ask_becomes_a_command() -> None:
+    assert with_commands("the tools are: list_recorded_topics, visits").endswith(
+        "list_recorded_topics, visits"
+    )
+    assert with_commands("list_recorded_topics lists all") == "`ros2-memory topics` lists all"
+
+
 def test_counts_by_day_are_a_table_whose_last_row_is_of_all(shown: Shown) -> None:
     """Of a time that stands there twice, as text and exactly, people get the exact one."""
     reply: JsonValue = {
@@ -103,6 +110,15 @@ def test_counts_by_day_are_a_table_whose_last_row_is_of_all(shown: Shown) -> Non
 def test_what_there_is_not_is_reported_in_words(shown: Shown) -> None:
     assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
     assert shown([]) == "none"
+
+
+def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time(shown: Shown) -> None:
+    rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
+    output = shown(rows)
+    day, _, time = format_time(T0).partition("T")
+    assert [line.count(day) for line in output.splitlines() if day in line] == [2]
+    assert [line.count(time) for line in output.splitlines() if time in line] == [2]
+    assert "12345" in output
 
 
 def test_rows_that_are_too_wide_for_a_table_stand_one_below_the_other(shown: Shown) -> None:
