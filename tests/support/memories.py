@@ -33,7 +33,7 @@ from ros2_memory.tools.replies import Replies, Reply
 from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from ros2_memory.storage.base import BagReader
 
@@ -135,10 +135,31 @@ def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:
 
 
 def assert_same_counts(reply: Any, expected: Any, *, of_means: float = 1e-3) -> None:
-    """Both replies are the same; means are, to what columns round numbers to."""
-    assert _without_means(reply) == _without_means(expected)
+    """Both replies are the same; means and scores are, to what columns round numbers to."""
+    assert _without_scores(_without_means(reply)) == _without_scores(_without_means(expected))
     for row, other in zip(_means(reply), _means(expected), strict=True):
         assert row == pytest.approx(other, abs=of_means)
+    assert [*_scores(reply)] == pytest.approx([*_scores(expected)], abs=2e-4)
+
+
+def _without_scores(reply: Any) -> Any:
+    if isinstance(reply, list):
+        return [_without_scores(each) for each in reply]
+    if isinstance(reply, dict):
+        scored = isinstance(reply.get("score"), float)
+        return {
+            key: None if scored and key == "score" else _without_scores(each)
+            for key, each in reply.items()
+        }
+    return reply
+
+
+def _scores(reply: Any) -> Iterator[float]:
+    if isinstance(reply, list | dict):
+        for each in reply.values() if isinstance(reply, dict) else reply:
+            yield from _scores(each)
+    if isinstance(reply, dict) and isinstance(reply.get("score"), float):
+        yield reply["score"]
 
 
 def _of_means(reply: Any) -> list[int]:

@@ -15,7 +15,7 @@ class TestRefusals:
             ("datas.now=wall", ["datas: unknown key", "recording, data, reader"]),
             ("data.nwo=wall", ["data.nwo: unknown key", "now, tf_clock"]),
             ("+data.nwo=wall", ["data.nwo: unknown key"]),
-            ("storage.cache=1", ["storage.cache: unknown key", "cache_mb"]),
+            ("storage.cache=1", ["storage.cache: unknown key", "_target_"]),
             ("~data.now", ["data.now: missing"]),
             ("~server", ["server: missing"]),
             ("~nothing", ["'nothing' does not exist"]),

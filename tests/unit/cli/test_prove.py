@@ -103,7 +103,7 @@ def test_what_lay_between_recordings_needs_a_folder(
 def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "bags").mkdir()
     refused = exits(2, f"prove 'visits x=1 y=1' -o {tmp_path}/proof {tmp_path}/bags")
-    assert "contains no bag with messages; data_time_range" in refused.err
+    assert "contains no bag with messages; `ros2-memory info`" in refused.err
 
 
 @pytest.mark.parametrize(
