@@ -543,9 +543,10 @@ def _stand_together(place: Ints, spots: Ints) -> list[bool]:
     """
     together = []
     for in_slice in np.split(spots, np.flatnonzero(np.diff(place)) + 1):
-        has_several = np.flatnonzero(in_slice > 1)
-        begin, end = np.percentile(has_several, MIDDLE) if has_several.size else (0, len(spots))
-        in_part = _SEVERAL_IN_PART * (end - begin) < has_several.size >= _FEWEST_IN_PART
+        several = np.flatnonzero(in_slice > 1)
+        begin, end = np.percentile(several, MIDDLE) if several.size else (0, len(spots))
+        inside = np.count_nonzero((several >= begin) & (several <= end))
+        in_part = inside > _SEVERAL_IN_PART * (end - begin) and several.size >= _FEWEST_IN_PART
         share_of_all = (in_slice - 1).sum() / len(in_slice)
         together.append(bool(in_part or share_of_all > _SEVERAL_SHARE))
     return together
@@ -835,6 +836,7 @@ def _add_poorly_localised(
             for instance in instances
         ]
         newest = [stays[-1] for stays in begun if stays]
+        newest = [stay for stay in newest if abs(stay.z - spot[Spot.Z]) <= STOREY_MM]
         away_mm = [math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]) for stay in newest]
         if away_mm and min(away_mm) <= GATE_MM:
             stay = newest[away_mm.index(min(away_mm))]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from ros2_memory.analysis.sights import Sights
+from ros2_memory.analysis.sights import Sights, fixes_of
 from ros2_memory.things.instances import estimate
 from ros2_memory.things.labels import Labels
 from tests.support.sights import (
@@ -99,3 +100,12 @@ def test_what_was_seen_once_from_each_of_three_poses_and_mostly_not_is_no_thing(
         seen = [seen_at(4, 0)] if nth < 3 else [[]]
         bags.append(bag_of(*[(pose, things) for things in (*seen, *[[]] * 4)], start=100 * nth))
     assert estimate(whole(bags), LABELS).instances == []
+
+
+def test_what_is_seen_upstairs_while_localisation_is_poor_is_no_sighting_of_what_is_below() -> None:
+    below = bag_of(*[(HERE, seen_at(2, 0))] * 20)
+    upstairs = bag_of((HERE, [PlacedDetection("mug", (2.0, 0.0, 3.7))]), start=100)
+    times = np.array([95, 106], np.int64) * 10**9
+    vague = fixes_of(times, np.zeros((2, 3)), np.array([2.0, 2.0]))
+    [mug] = estimate(whole([below, upstairs, vague]), LABELS).instances
+    assert mug.stays[-1].last == 19 * 10**9
