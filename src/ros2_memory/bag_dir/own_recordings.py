@@ -106,13 +106,15 @@ class ListRow:
     ended: StrictBool = False
 
     def holds(self, file: str) -> bool:
-        """Returns whether a bag file is of the recording, by its name; it lies in its directory."""
+        """Returns whether a file of the recording's directory is one of its bags, by its name."""
         if self.adopted and self.bags is None:
             return True
         name, bags = file.removesuffix(COMPRESSED), self.bags or ()
-        place, number = bisect_left(bags, name), split_number(self.recording, name)
+        at = bisect_left(bags, name)
+        is_listed = at < len(bags) and bags[at] == name
+        number = split_number(self.recording, name)
         is_split = number is not None and (self.splits is None or number < self.splits)
-        return is_split or bags[place : place + 1] == (name,)
+        return is_split or is_listed
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
         """Returns the line of the directory with these bags adopted."""

@@ -199,17 +199,19 @@ def with_times(
     Raises:
         InvalidArgumentsError: a text is no time.
     """
-    return {key: _in_seconds(value, schemas.get(key), now) for key, value in arguments.items()}
+    return {
+        key: _with_parsed_times(value, schemas.get(key), now) for key, value in arguments.items()
+    }
 
 
-def _in_seconds(value: object, schema: object, now: float) -> object:
-    kind, items = (
-        schema.get(key) if isinstance(schema, dict) else None for key in ("type", "items")
-    )
+def _with_parsed_times(value: object, schema: object, now: float) -> object:
+    """Returns an argument with the times and durations in it parsed, as its schema has them."""
+    schema = schema if isinstance(schema, dict) else {}
+    kind, items = schema.get("type"), schema.get("items")
     if isinstance(value, list):
-        return [_in_seconds(inner, items, now) for inner in value]
+        return [_with_parsed_times(inner, items, now) for inner in value]
     if isinstance(value, str) and kind == "array":
-        return _in_seconds(value, items, now)
+        return _with_parsed_times(value, items, now)
     if isinstance(value, str) and kind == "number":
         seconds = parse_duration(value)
         return value if seconds is None else seconds

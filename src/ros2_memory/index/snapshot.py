@@ -271,7 +271,7 @@ class Snapshot:
 
     def _unread_span(self, aside: SetAside, *, growing: bool) -> TimeWindow | None:
         if aside.until is not None:
-            return TimeWindow(min(aside.until + 1, MAX_NS), MAX_NS)
+            return _after(aside.until)
         near = self._neighbours(aside)
         recording = aside.path.parent.name
         return unreadable_span(recording, near, aside.written, self.scanned_at, growing=growing)
@@ -293,7 +293,7 @@ class Snapshot:
 
     def _bounds(self, aside: SetAside) -> TimeWindow | None:
         if aside.until is not None:
-            return self._unread_span(aside, growing=True)
+            return _after(aside.until)
         name = split_of(str(aside.path))
         # Files that `ros2 bag record` did not number may lie in any order.
         is_split = name is not None and is_recording(name.series)
@@ -304,3 +304,8 @@ class Snapshot:
         folder = str(aside.path.parent)
         segments = (segment for segment in self.timeline.segments if folder in segment.bags.folders)
         return neighbours(str(aside.path), segments)
+
+
+def _after(until: Ns) -> TimeWindow:
+    """Returns the times behind what was read of a file that goes on."""
+    return TimeWindow(min(until + 1, MAX_NS), MAX_NS)

@@ -307,7 +307,7 @@ def packed_messages(
 
 
 def unpacked_messages(data: bytes, channel: Channel) -> Batch:
-    """Returns the messages that were packed so; all payloads are empty where none were packed.
+    """Returns the messages that `packed_messages` packed; without payloads all are empty.
 
     Raises:
         ValueError: the bytes are damaged, or of a later format.
@@ -333,7 +333,8 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
     places = np.cumsum(column(8)) if form == _PLACED else np.arange(count)
     sizes, payloads = np.zeros(count, np.int64), b""
     if is_whole:
-        sizes, payloads = column(4), content[at:]
+        sizes = column(4)
+        payloads = content[at:]
         if len(payloads) != sizes.sum():
             raise ValueError("packed messages are cut short")
         if count and (sizes == sizes[0]).all():

@@ -320,9 +320,11 @@ class FileReader(BagReader):
             raise UndecodableError(channel.topic, channel.type, reason) from error
 
     def definition(self, channel: Channel) -> Definition | None:
-        """Returns the fields of the channel's messages, or None."""
-        message_type = self._type_of(channel) if channel.encoding == "cdr" else ""
-        return None if isinstance(message_type, str) else message_type.fields
+        """Returns the fields of the channel's messages; None if not CDR, or of no known type."""
+        if channel.encoding != "cdr":
+            return None
+        found = self._type_of(channel)
+        return None if isinstance(found, str) else found.fields
 
     def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
         _, cached = self._known.get(id(channel), (channel, None))
