@@ -58,7 +58,7 @@ _DROPPED: Final = "beyond the share of the store (store.max_share)"
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
 _WRITTEN_BYTES: Final = 16 << 20
-"""Of parts that were just written so many compressed bytes are held, until what follows is made."""
+"""So many compressed bytes of parts just written stay in memory until what follows is made."""
 _MOST_DAMAGED: Final = 10_000
 """Files whose damage is remembered."""
 
