@@ -201,7 +201,7 @@ def _said(sentence: str, t: float, moment: float, call: CallContext) -> str:
     forward, turning = robot.twist(t)
     way, rate = "backwards" if forward < 0 else "forwards", math.degrees(turning)
     turn = f"turning {'left' if rate > 0 else 'right'} at {abs(rate):.0f} degrees/s"
-    told = sentence.format(
+    text = sentence.format(
         when=f"at {local:%H:%M:%S}, {call.age_s(moment):.1f} s ago",
         place=f"in the {robot.place(t)}, at x {_metres(x)}, y {_metres(y)} in odom",
         facing=f"{math.degrees(yaw):.0f} degrees",
@@ -209,7 +209,7 @@ def _said(sentence: str, t: float, moment: float, call: CallContext) -> str:
         charge=f"{robot.battery(t):.1%}",
         objects=", ".join(thing.label for thing in robot.seen(t)) or "nothing",
     )
-    return told[0].upper() + told[1:]
+    return text[0].upper() + text[1:]
 
 
 def _metres(value: float) -> str:

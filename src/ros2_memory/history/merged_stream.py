@@ -102,7 +102,8 @@ class MergedStream:
     def _segment_windows(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """Returns the window cut where segments begin, to hold few bags at a time.
 
-        And behind the first, and before the last message in each: many ask for no more.
+        It is also cut after the first and before the last message of each segment: many callers
+        read no other.
         """
         edges = {window.start, window.stop}
         for segment in self._timeline.segments_in(window):

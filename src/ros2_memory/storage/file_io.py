@@ -74,7 +74,7 @@ class OpenFile:
         self.key = FileKey(str(path), status.st_size, *times)
         self._whole = b""
         if at_once and self.size <= _AT_ONCE_BYTES:
-            with suppress(OSError):  # whoever reads a part of it meets the error, too
+            with suppress(OSError):  # reading a part of it raises it, too
                 self._whole = os.pread(self._descriptor, self.size, 0)
 
     def __enter__(self) -> Self:
