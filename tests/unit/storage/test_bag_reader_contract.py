@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -371,12 +372,22 @@ def test_threads_that_read_at_once_all_get_the_same(shelf: Shelf, tmp_path: Path
 def test_an_iteration_given_up_closes_the_file(shelf: Shelf, tmp_path: Path) -> None:
     reader, path = shelf.stocked(tmp_path, [text(time, "x") for time in range(20)])
     read(reader, path, ["/chatter"])
-    before = len(list(Path("/proc/self/fd").iterdir()))
+    before = open_files()
     records = reader.records(path, ["/chatter"], TimeWindow.everything())
     next(records)
-    assert len(list(Path("/proc/self/fd").iterdir())) > before
+    opened = open_files() - before
+    assert opened
     del records
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    assert not open_files() & opened
+
+
+def open_files() -> set[tuple[str, str]]:
+    """The descriptors of this process, each with what it leads to."""
+    found = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # that of the listing itself is closed by now
+            found.add((descriptor.name, str(descriptor.readlink())))
+    return found
 
 
 @on_every_shelf
