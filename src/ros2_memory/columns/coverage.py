@@ -38,12 +38,14 @@ class CoveredSegment(NamedTuple):
         numbers: of its bags; -1 of those that are not stored.
         hashed: of which bags copies can be recognised.
         missing: the bags that are not stored.
+        to_store: those of them that can be: they are closed, or cut short by a crash.
     """
 
     segment: Segment
     numbers: IntArray
     hashed: NDArray[np.bool_]
     missing: tuple[BagFile, ...]
+    to_store: tuple[BagFile, ...]
 
 
 class Coverage:
@@ -52,12 +54,14 @@ class Coverage:
     Attributes:
         state: of the store.
         missing: the bags that are not stored, in order of time.
+        to_store: those of them that can be stored.
     """
 
     def __init__(self, state: State, segments: Sequence[CoveredSegment]) -> None:
         self.state = state
         self.segments = tuple(segments)
         self.missing = tuple(chain.from_iterable(covered.missing for covered in segments))
+        self.to_store = tuple(chain.from_iterable(covered.to_store for covered in segments))
         numbers = [covered.numbers for covered in segments]
         all_numbers = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
         order = np.argsort(all_numbers, kind="stable")
@@ -176,7 +180,12 @@ class Covering:
 
     def _covered_segment(self, segment: Segment, rows: IntArray) -> CoveredSegment:
         """Returns what is known of a segment, of whose bags `rows_of` returns these rows."""
-        is_stored: NDArray[np.bool_] = segment.bags.are(BagState.CLOSED) & (rows >= 0)
-        missing = tuple(segment.bags.at(~is_stored))
+        bags = segment.bags
+        can_be_stored = bags.are(BagState.CLOSED)
+        left_open = np.flatnonzero(bags.are(BagState.INCOMPLETE))
+        # A database goes on in its journal, which may change while its own file does not.
+        can_be_stored[left_open] = [file.endswith(".mcap") for file in bags.files(left_open)]
+        is_stored: NDArray[np.bool_] = can_be_stored & (rows >= 0)
+        missing = (tuple(bags.at(which)) for which in (~is_stored, can_be_stored & ~is_stored))
         numbers = np.where(is_stored, (rows >> 1) + self.store.offset, -1)
-        return CoveredSegment(segment, numbers, is_stored & (rows & 1 > 0), missing)
+        return CoveredSegment(segment, numbers, is_stored & (rows & 1 > 0), *missing)

@@ -133,8 +133,8 @@ class Filling:
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
             return []
-        bags = [bag for bag in coverage.missing if bag.state is BagState.CLOSED]
-        bags += [bag for bag in coverage.unhashed() if self._is_shared(bag, timeline)]
+        unhashed = (bag for bag in coverage.unhashed() if self._is_shared(bag, timeline))
+        bags = [*coverage.to_store, *unhashed]
         bags = [bag for bag in bags if not self._is_refused(self._key(bag))]
         return self._fitting(sorted(bags, key=in_time, reverse=True))
 

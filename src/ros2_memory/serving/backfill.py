@@ -165,9 +165,8 @@ class Backfill:
     def _follow(self, filling: Filling, timeline: Timeline) -> bool:
         columns = self.memory.scanner
         coverage = columns.coverage(timeline)
-        missing = () if coverage is None else coverage.missing
-        # Others than closed ones are never stored.
-        waiting = [bag.start for bag in missing if bag.state is BagState.CLOSED]
+        to_store = () if coverage is None else coverage.to_store
+        waiting = [bag.start for bag in to_store]
         make_fragments(self.memory, filling.whole_since(), waiting)
         filling.thin()
         filling.trim()

@@ -13,15 +13,17 @@ import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
+from ros2_memory.bootstrap import build_repairer
 from ros2_memory.columns import decode, fill
 from ros2_memory.columns.decode import Group, undecoded
-from ros2_memory.columns.fill import StoreLimits
+from ros2_memory.columns.fill import Progress, StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.walk import LevelColumns, walked
 from ros2_memory.columns.writing import ReadBag
+from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap import bulk
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import McapLayout, odom, text, write_db3, write_mcap
 from tests.support.column_worlds import World, check_all, store_file, times
 
 if TYPE_CHECKING:
@@ -88,6 +90,44 @@ def test_copies_of_a_long_bag_are_recognised_before_it_is_stored_again(tmp_path:
     ]
     write_mcap(tmp_path / "rec_b" / "rec_b_0.mcap", again)
     assert check_all(world) == 300
+
+
+# Bags that a crash cut short
+
+
+def test_what_a_crash_left_of_a_bag_is_stored_until_the_bag_is_closed(tmp_path: Path) -> None:
+    write_bag(tmp_path, 0)
+    path = tmp_path / "rec" / "rec_1.mcap"
+    poses = [odom(T0 + (60 + n) * S, n / 7, 0.0) for n in range(30)]
+    write_mcap(path, poses, McapLayout(chunk_size=400, finish=False))
+    os.utime(path, ns=(T0, T0))
+    world = World.of(tmp_path)
+    [_, cut] = world.memory.index.snapshot().timeline.bags
+    assert cut.state is BagState.INCOMPLETE
+    assert world.fill() == 2
+    assert world.stored() == {"rec/rec_0.mcap", "rec/rec_1.mcap"}
+    assert world.filling.progress(world.memory.index.snapshot().timeline) == Progress(1, 1)
+    assert check_all(world) > 0
+    assert count(world, "part", "whole") == count(world, "part")
+
+    assert build_repairer().repair(path)
+    again = World.of(tmp_path)
+    assert again.stored() == {"rec/rec_0.mcap"}
+    assert again.fill() == 1
+    check_all(again)
+
+
+def test_a_database_beside_its_journal_is_not_stored(tmp_path: Path) -> None:
+    """What is read of it changes with that, while its own file does not."""
+    path = tmp_path / "rec" / "rec_0.db3"
+    write_db3(path, [odom(T0 + n * S, 0.0, 0.0) for n in range(9)])
+    path.with_name(f"{path.name}-wal").write_bytes(b"half")
+    for file in path.parent.iterdir():
+        os.utime(file, ns=(T0, T0))
+    world = World.of(tmp_path)
+    [bag] = world.memory.index.snapshot().timeline.bags
+    assert bag.state is BagState.INCOMPLETE
+    assert world.fill() == 0
 
 
 # Erasing, screening
