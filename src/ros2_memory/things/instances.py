@@ -536,19 +536,20 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
             yield rows_there
 
 
-def _stand_together(place: Ints, spots: Ints) -> list[bool]:
+def _stand_together(place: Ints, spots: Ints) -> Flags:
     """Returns of which places slices have several spots: in all of time, or in one part of it.
 
     `spots` are those in each slice of a place, in order of time; places are in order.
     """
-    together = []
-    for in_slice in np.split(spots, np.flatnonzero(np.diff(place)) + 1):
-        several = np.flatnonzero(in_slice > 1)
-        begin, end = np.percentile(several, MIDDLE) if several.size else (0, len(spots))
+    sizes = np.bincount(place)
+    together: Flags = np.bincount(place, spots - 1) > _SEVERAL_SHARE * sizes
+    begins = np.cumsum(sizes) - sizes
+    often = np.bincount(place, spots > 1) >= _FEWEST_IN_PART
+    for number in np.flatnonzero(often & ~together).tolist():
+        several = np.flatnonzero(spots[begins[number] :][: sizes[number]] > 1)
+        begin, end = np.percentile(several, MIDDLE)
         inside = np.count_nonzero((several >= begin) & (several <= end))
-        in_part = inside > _SEVERAL_IN_PART * (end - begin) and several.size >= _FEWEST_IN_PART
-        share_of_all = (in_slice - 1).sum() / len(in_slice)
-        together.append(bool(in_part or share_of_all > _SEVERAL_SHARE))
+        together[number] = inside > _SEVERAL_IN_PART * (end - begin)
     return together
 
 

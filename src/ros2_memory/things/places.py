@@ -99,42 +99,41 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
 
     `centre` and `mass` are of cells, the densest first.
     """
+    x, y = centre.T.copy()
     is_free = np.ones(len(mass), bool)
-    peaks, masses = np.empty((_MAX_PLACES, 2)), np.empty(_MAX_PLACES)
+    peaks, masses = np.empty((2, _MAX_PLACES)), np.empty(_MAX_PLACES)
     count = 0
     for cell in range(len(mass)):
         if not is_free[cell]:
             continue
-        # The cells before it are claimed.
-        near = np.flatnonzero(
-            is_free[cell:] & (_away_squared(centre[cell:], centre[cell]) <= _PEAK_MM**2)
-        )
-        near += cell
-        # As `numpy.average`, which takes ten times as long for few rows.
-        peak = mass[near] @ centre[near] / mass[near].sum()
-        is_claimed = is_free & (_away_squared(centre, peak) <= _CLAIM_MM**2)
+        near = is_free & (_squared(x - x[cell], y - y[cell]) <= _PEAK_MM**2)
+        weights = mass * near
+        peak = np.array((weights @ x, weights @ y)) / weights.sum()
+        away_from_peak = _squared(x - peak[0], y - peak[1])
+        is_claimed = is_free & (away_from_peak <= _CLAIM_MM**2)
         is_claimed[cell] = True
-        weight = float(mass[is_claimed].sum())
-        is_free[is_claimed] = False
-        away, others = _away_squared(peaks[:count], peak), masses[:count]
+        weight = float(mass @ is_claimed)
+        is_free &= ~is_claimed
+        others = masses[:count]
+        away = _squared(peaks[0, :count] - peak[0], peaks[1, :count] - peak[1])
         is_near = away <= GATE_MM**2
         if is_near.any():  # mostly it is not
             # Peaks that are so heavy that one this light may be their noise.
             is_halo = is_near & (others > weight / _HALO_SHARE)
             is_scatter = (away <= _SCATTER_MM**2) & (others + weight < _FEW)
-            heavy = peaks[:count][is_halo | is_scatter]
+            heavy = peaks[:, :count].T[is_halo | is_scatter].tolist()
             if any(
                 weight < _FEW
-                or spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2)
+                or spots.share(is_claimed, _squared(x - other_x, y - other_y) <= _CLAIM_MM**2)
                 <= _OWN_SHARE
-                for other in heavy
+                for other_x, other_y in heavy
             ):
                 continue
-        peaks[count], masses[count] = peak, weight
+        peaks[:, count], masses[count] = peak, weight
         count += 1
         if count == _MAX_PLACES:
             break
-    return peaks[:count]
+    return peaks[:, :count].T
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:
@@ -145,31 +144,27 @@ def _density(cells: Ints, mass: Floats) -> Floats:
     keys = (cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1])
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    density = np.zeros(len(cells))
-    for dx, dy in product(range(-reach, reach + 1), repeat=2):
-        if dx * dx + dy * dy <= reach * reach:
-            near = keys + dx * width + dy
-            row = np.minimum(np.searchsorted(ordered, near), len(ordered) - 1)
-            # Whole numbers, whose sums do not depend on their order.
-            density += np.where(ordered[row] == near, mass[order[row]], 0.0)
+    around = [*product(range(-reach, reach + 1), repeat=2)]
+    steps = [dx * width + dy for dx, dy in around if dx * dx + dy * dy <= reach * reach]
+    near = np.array(steps)[:, None] + keys
+    row = np.minimum(np.searchsorted(ordered, near), len(ordered) - 1)
+    # Whole numbers, whose sums do not depend on their order.
+    density: Floats = np.where(ordered[row] == near, mass[order[row]], 0.0).sum(axis=0)
     return density
 
 
-def _away_squared(points: Floats, middle: Floats) -> Floats:
-    dx, dy = points[:, 0] - middle[0], points[:, 1] - middle[1]
-    away: Floats = dx * dx + dy * dy  # several times as fast as `numpy.hypot`
-    return away
+def _squared(dx: Floats, dy: Floats) -> Floats:
+    return dx * dx + dy * dy  # several times as fast as `numpy.hypot`
 
 
 def _nearest(points: Floats, peaks: Floats) -> tuple[Ints, Floats]:
     """Returns the nearest peak of each point, and its squared distance (mm²)."""
-    nearest = np.zeros(len(points), np.int64)
-    least = np.full(len(points), np.inf)
-    for number, peak in enumerate(peaks):
-        away = _away_squared(points, peak)
-        is_closer = away < least
-        nearest[is_closer] = number
-        least[is_closer] = away[is_closer]
+    x, y = points.T.copy()
+    nearest, least = np.zeros(len(x), np.int64), np.full(len(x), np.inf)
+    for number, (peak_x, peak_y) in enumerate(peaks.tolist()):
+        away = _squared(x - peak_x, y - peak_y)
+        np.copyto(nearest, number, where=away < least)
+        np.minimum(least, away, out=least)
     return nearest, least
 
 

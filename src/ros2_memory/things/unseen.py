@@ -42,6 +42,7 @@ from ros2_memory.history.reverse_search import (
     position_frames,
     score_limit,
 )
+from ros2_memory.history.scan import scan
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.pose_frames import axes_of
 from ros2_memory.things.labels import plain, singular
@@ -116,11 +117,18 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
             newest = view.stream.newest(topic, window)
             first = None if newest is None else view.stream.first([topic], window)
             for stored in filter(None, (newest, first)):
-                view.bags.decode(stored, failures)
+                if not _has_columns(view, topic, stored.time):
+                    view.bags.decode(stored, failures)
     reasons = {failure.topic: failure.reason for failure in failures}
     for topic, reason in reasons.items():
         view.notes.add_lack(Note(_UNDECODED, topic, reason))
     return frozenset(reasons)
+
+
+def _has_columns(view: View, topic: str, at: Ns) -> bool:
+    """Returns whether messages were decoded; their type need not be compiled for that again."""
+    at_once = [*scan(view, topic, TimeWindow(at, at + 1), copies=True)]
+    return bool(at_once) and all("" not in rows.table.left_out for rows in at_once)
 
 
 def notes_on_never(
