@@ -6,7 +6,7 @@ timeline serves every later timeline that still has it.
 
 from __future__ import annotations
 
-from itertools import chain
+from functools import cached_property
 from threading import Lock
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -19,12 +19,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from ros2_memory.columns.store import ColumnStore, State
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.segment import Segment, TopicExtent
     from ros2_memory.index.timeline import Timeline
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import IntArray, Mask
 
 
 _NEVER: Final = TimeWindow(0, 0)
@@ -37,15 +36,23 @@ class CoveredSegment(NamedTuple):
         segment: of the timeline.
         numbers: of its bags; -1 of those that are not stored.
         hashed: of which bags copies can be recognised.
-        missing: the bags that are not stored.
-        to_store: those of them that can be: they are closed, or cut short by a crash.
+        to_store: which bags are not stored and can be: they are closed, or cut short by a crash.
     """
 
     segment: Segment
     numbers: IntArray
-    hashed: NDArray[np.bool_]
-    missing: tuple[BagFile, ...]
-    to_store: tuple[BagFile, ...]
+    hashed: Mask
+    to_store: Mask
+
+    @property
+    def missing(self) -> Mask:
+        """Which bags are not stored."""
+        return self.numbers < 0
+
+    def misses_in(self, window: TimeWindow) -> bool:
+        """Returns whether a bag that is not stored may begin in a window."""
+        starts = self.segment.bags.starts[self.missing]
+        return bool(starts.size) and window.overlaps(int(starts.min()), int(starts.max()))
 
 
 class Coverage:
@@ -53,15 +60,11 @@ class Coverage:
 
     Attributes:
         state: of the store.
-        missing: the bags that are not stored, in order of time.
-        to_store: those of them that can be stored.
     """
 
     def __init__(self, state: State, segments: Sequence[CoveredSegment]) -> None:
         self.state = state
         self.segments = tuple(segments)
-        self.missing = tuple(chain.from_iterable(covered.missing for covered in segments))
-        self.to_store = tuple(chain.from_iterable(covered.to_store for covered in segments))
         numbers = [covered.numbers for covered in segments]
         all_numbers = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
         order = np.argsort(all_numbers, kind="stable")
@@ -70,16 +73,31 @@ class Coverage:
         self._order: IntArray = order[np.searchsorted(all_numbers[order], 0) :]
         self._numbers: IntArray = all_numbers[self._order]
 
+    @cached_property
+    def missing(self) -> Sequence[BagFile]:
+        """The bags that are not stored, in order of time."""
+        return [bag for each in self.segments for bag in each.segment.bags.at(each.missing)]
+
+    @cached_property
+    def to_store(self) -> Sequence[BagFile]:
+        """Those of them that can be stored."""
+        return [bag for each in self.segments for bag in each.segment.bags.at(each.to_store)]
+
+    def starts_to_store(self) -> list[Ns]:
+        """Returns the log times (ns) of the first messages of the bags that can be stored."""
+        return [
+            start for each in self.segments for start in each.segment.bags.starts[each.to_store]
+        ]
+
     def missing_extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that are not stored as `Timeline.extents` yields all."""
         for covered in self.segments:
-            if covered.missing:
-                bags, is_missing = covered.segment.bags, covered.numbers < 0
-                is_missing &= (bags.starts < window.stop) & (bags.ends >= window.start)
-                if is_missing.any():
-                    yield from covered.segment.extents(topic, window, is_missing)
+            bags, is_missing = covered.segment.bags, covered.missing
+            is_missing &= (bags.starts < window.stop) & (bags.ends >= window.start)
+            if is_missing.any():
+                yield from covered.segment.extents(topic, window, is_missing)
 
-    def _are_there(self, numbers: IntArray) -> NDArray[np.bool_]:
+    def _are_there(self, numbers: IntArray) -> Mask:
         """Returns which of some numbers are of bags of the timeline."""
         if not self._numbers.size:
             return np.zeros(numbers.shape, np.bool_)
@@ -149,7 +167,12 @@ class Covering:
                 if covered_timeline is timeline and coverage.state == state:
                     return coverage
                 if coverage.state.deletion != state.deletion:
-                    self._by_id = {}
+                    numbers = self.store.numbers()
+                    self._by_id = {
+                        key: covered
+                        for key, covered in self._by_id.items()
+                        if np.isin(covered.numbers[~covered.missing], numbers).all()
+                    }
             segments = self._covered_segments(timeline, state)
             coverage = Coverage(state, segments)
             if self.store.failures != failures:
@@ -167,10 +190,7 @@ class Covering:
             for segment in timeline.segments
             if (covered := self._by_id.get(id(segment))) is not None
             and covered.segment is segment
-            and not (
-                covered.missing
-                and changed.overlaps(covered.missing[0].start, covered.missing[-1].start)
-            )
+            and not covered.misses_in(changed)
         }
         unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
         rows = self.store.rows_of([segment.bags for segment in unknown], self._root, state.deletion)
@@ -185,7 +205,8 @@ class Covering:
         left_open = np.flatnonzero(bags.are(BagState.INCOMPLETE))
         # A database goes on in its journal, which may change while its own file does not.
         can_be_stored[left_open] = [file.endswith(".mcap") for file in bags.files(left_open)]
-        is_stored: NDArray[np.bool_] = can_be_stored & (rows >= 0)
-        missing = (tuple(bags.at(which)) for which in (~is_stored, can_be_stored & ~is_stored))
+        is_stored: Mask = can_be_stored & (rows >= 0)
         numbers = np.where(is_stored, (rows >> 1) + self.store.offset, -1)
-        return CoveredSegment(segment, numbers, is_stored & (rows & 1 > 0), *missing)
+        return CoveredSegment(
+            segment, numbers, is_stored & (rows & 1 > 0), can_be_stored & ~is_stored
+        )

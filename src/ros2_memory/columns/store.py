@@ -19,7 +19,6 @@ import json
 import os
 from functools import partial
 from itertools import accumulate, islice, pairwise
-from operator import attrgetter
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -68,7 +67,6 @@ LONG_NS: Final[Ns] = 2 * PART_NS
 _UNKNOWN: Final = -2
 _FEW: Final = 2048
 """Bags that are looked up one by one; for more of them all stored ones are read."""
-_stamps = attrgetter("size", "mtime_ns", "sidecar_ns", "start", "end")
 
 T = TypeVar("T")
 DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
@@ -264,9 +262,10 @@ class ColumnStore(Database):
         """
         loaded = [bags.taken(deletion) for bags in parts]
         keys = [
-            (relative(bag.file, bag_dir), *_stamps(bag))
+            (relative(file, bag_dir), *stamps)
             for bags, rows in zip(parts, loaded, strict=True)
-            for bag in (bags if rows is None else ())
+            if rows is None
+            for file, stamps in zip(bags.files(), bags.stamps.tolist(), strict=True)
         ]
         stored: dict[Key, int] = {}
         if keys:
@@ -281,6 +280,12 @@ class ColumnStore(Database):
         asked = iter([stored.get(key, -1) for key in keys])
         for bags, rows in zip(parts, loaded, strict=True):
             yield np.fromiter(islice(asked, len(bags)), np.int64) if rows is None else rows
+
+    def numbers(self) -> IntArray:
+        """Returns the numbers of all bags that are stored, or were in part."""
+        none: list[int] = []
+        ids = self._asked(lambda rows: [row for (row,) in rows], none, "SELECT id FROM bag")
+        return np.array(ids, np.int64) + self.offset
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""

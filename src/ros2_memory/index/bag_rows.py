@@ -99,6 +99,11 @@ class BagRows:
         return self._numbers[:3].T
 
     @property
+    def stamps(self) -> Ints:
+        """By bag, `contents` and the log times of its first and last message."""
+        return self._numbers[:5].T
+
+    @property
     def starts(self) -> Ints:
         """Log time of the first message in each bag."""
         return np.asarray(self._numbers[3])

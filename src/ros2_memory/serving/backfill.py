@@ -165,8 +165,7 @@ class Backfill:
     def _follow(self, filling: Filling, timeline: Timeline) -> bool:
         columns = self.memory.scanner
         coverage = columns.coverage(timeline)
-        to_store = () if coverage is None else coverage.to_store
-        waiting = [bag.start for bag in to_store]
+        waiting = [] if coverage is None else coverage.starts_to_store()
         make_fragments(self.memory, filling.whole_since(), waiting)
         filling.thin()
         filling.trim()

@@ -188,14 +188,13 @@ class Watching:
         self._needed = tuple(dict.fromkeys(topics))
         self._scans: list[Scan] = []
         self._may_be_repeated = view.stream.may_be_repeated(self._topics)
-        files = chain.from_iterable(segment.bags.files() for segment in timeline.segments)
-        rows = [
-            row
-            for row, file in enumerate(files)
+        is_asked = np.ones(len(timeline.bags), np.bool_)
+        if any(segment.recorded is not segment for segment in timeline.segments):
             # Carried messages that nothing is seen by reach over all of the history.
-            if not is_carried(file) or any(map(timeline.bags[row].summary.of, self._needed))
-        ]
-        self._bags = np.array(rows, np.int64)
+            for row, bag in enumerate(timeline.bags):
+                has_any = not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
+                is_asked[row] = has_any
+        self._bags = np.flatnonzero(is_asked)
         self._folder_of = timeline.folder_numbers[self._bags]
         self._firsts, self._lasts = timeline.starts[self._bags], timeline.ends[self._bags]
         self._latest = np.maximum.accumulate(self._lasts)
