@@ -14,6 +14,7 @@ from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.stored import StoredTable
+from ros2_memory.columns.writing import Level
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.history.context import Call, Memory
@@ -87,7 +88,7 @@ class World:
         """Stores bags, all that wait, each in parts of its own; returns how many."""
         timeline = self.memory.index.snapshot().timeline
         some = self.filling.waiting(timeline) if bags is None else bags
-        return sum(self.filling.fill(Batch([bag], whole=False), timeline) for bag in some)
+        return sum(self.filling.fill(Batch([bag], Level.BAG), timeline) for bag in some)
 
     def prune(self) -> None:
         self.filling.prune(self.memory.index.snapshot().timeline)

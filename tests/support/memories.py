@@ -18,6 +18,7 @@ from ros2_memory.bootstrap import build_dispatcher, build_memory
 from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.columns.writing import Level
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
@@ -120,7 +121,7 @@ def stored_columns(
     stop = round(part * len(waiting))
     left_out = waiting[stop:]
     for bag in waiting[:stop][::-1]:
-        filling.fill(Batch([bag], whole=False), timeline)
+        filling.fill(Batch([bag], Level.BAG), timeline)
     for batch in filling.batches(timeline):
         if not {*batch.bags} & {*left_out}:
             filling.fill(batch, timeline)

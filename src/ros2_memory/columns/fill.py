@@ -1,4 +1,4 @@
-"""Fills the store: decodes each closed bag that is missing, and bags of ten minutes together."""
+"""Fills the store: decodes each closed bag that is missing, and bags of an hour together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore, relative
-from ros2_memory.columns.writing import PART_NS, ReadBag
+from ros2_memory.columns.writing import Level, ReadBag
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
@@ -25,9 +25,10 @@ from ros2_memory.index.scan import Stamp, settled
 from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.columns.table import Table
     from ros2_memory.index.timeline import Timeline
@@ -40,7 +41,7 @@ RETRY_NS: Final[Ns] = 600 * NS_PER_S
 IN_MEMORY_BYTES: Final = 64 << 20
 """What the store may take where no file can be written."""
 _MOST_HELD: Final = 64 << 20
-"""Bytes of columns after which bags become parts, though more of their ten minutes wait."""
+"""Bytes of columns after which bags become parts, though more of their hour wait."""
 _TRIMMED_TO: Final = 0.9
 """A store above its limit is trimmed to this share of it."""
 _MOST_REFUSED: Final = 10_000
@@ -75,13 +76,13 @@ class Progress:
 
 
 class Batch(NamedTuple):
-    """Bags of one recording that are stored in the same parts.
+    """Bags of one recording that are stored in the same parts, of some level.
 
-    `whole`: their ten minutes are over, and these are all bags of them that no whole parts have.
+    But for one of `Level.BAG`, its slot is over, and it has all its bags without such parts.
     """
 
     bags: Sequence[BagFile]
-    whole: bool
+    level: Level
 
 
 class Filling:
@@ -152,23 +153,30 @@ class Filling:
     def batches(self, timeline: Timeline) -> list[Batch]:
         """Returns the bags to be stored, the newest first: alone until their ten minutes are over.
 
-        Then with those beside them that were stored alone.
+        Then with those beside them that were stored alone, and so again once their hour is over.
         """
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
             return []
-        stored = [coverage.bag(number) for number in self.store.unmerged()]
-        alone = [bag for bag in stored if bag and not self._is_refused(self._key(bag))]
-        slots: dict[tuple[str, Ns], list[BagFile]] = defaultdict(list)
-        batches: list[Batch] = []
-        for bag in [*self.waiting(timeline), *alone]:
-            slots[self._slot(bag)].append(bag)
-        for (_, begin), bags in slots.items():
-            if self._is_over(begin, timeline):
-                batches.append(Batch(bags, whole=True))
+        waiting, batches = self.waiting(timeline), list[Batch]()
+        left = [*waiting, *self._below(Level.HOUR, coverage)]
+        for bags in _by_slot(left, Level.HOUR):
+            if self._is_over(bags[0], Level.HOUR, timeline):
+                batches.append(Batch(bags, Level.HOUR))
+        in_hours = {bag.file for batch in batches for bag in batch.bags}
+        alone = self._below(Level.TEN_MINUTES, coverage)
+        left = [bag for bag in (*waiting, *alone) if bag.file not in in_hours]
+        for bags in _by_slot(left, Level.TEN_MINUTES):
+            if self._is_over(bags[0], Level.TEN_MINUTES, timeline):
+                batches.append(Batch(bags, Level.TEN_MINUTES))
             else:
-                batches += [Batch([bag], whole=False) for bag in bags if bag not in alone]
+                batches += [Batch([bag], Level.BAG) for bag in bags if bag not in alone]
         return batches
+
+    def _below(self, level: Level, coverage: Coverage) -> list[BagFile]:
+        """Returns the bags that have parts below a level."""
+        stored = map(coverage.bag, self.store.below(level))
+        return [bag for bag in stored if bag and not self._is_refused(self._key(bag))]
 
     def fill(self, batch: Batch, timeline: Timeline) -> int:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
@@ -235,7 +243,8 @@ class Filling:
             if oldest is None:
                 break
             # A part goes with the last of its bags, so these go together.
-            before = oldest // PART_NS * PART_NS + PART_NS
+            length = Level.HOUR.length
+            before = oldest // length * length + length
             keys = self.store.beginning_before(before)
             if not self.store.delete([key.path for key in keys]):
                 break
@@ -289,33 +298,38 @@ class Filling:
         return False
 
     def _fill_alone(self, batch: Batch, timeline: Timeline) -> int:
-        return sum(self.fill(Batch([bag], batch.whole), timeline) for bag in batch.bags)
+        return sum(self.fill(Batch([bag], batch.level), timeline) for bag in batch.bags)
 
     def _put(
         self, pending: Sequence[ReadBag], group: Group, batch: Batch, timeline: Timeline
     ) -> int:
         """Stores bags of a batch in parts together; each alone where the database refuses that."""
-        bags, whole = [to_store.bag for to_store in pending], batch.whole
+        bags, level = [to_store.bag for to_store in pending], batch.level
         if not bags:
             return 0
         begun, refusals = time.perf_counter_ns(), self.store.refusals
-        written = self.store.put(pending, group.tables(), whole=whole)
+        written = self.store.put(pending, group.tables(), level)
         if self.store.refusals > refusals:
             if len(bags) > 1:
-                return self._fill_alone(Batch(bags, whole), timeline)
+                return self._fill_alone(Batch(bags, level), timeline)
             self._refuse(bags[0], self.store.refused_for or "")
-        if written.parts and whole:
-            begin = self._slot(bags[0])[1]
-            self._merged.append((begin, begin + PART_NS))
+        if written.parts and level > Level.BAG:
+            begin = _slot(bags[0], level)[1]
+            self._merged.append((begin, begin + level.length))
             self._whole_parts.append(([*written.parts], bags))
             self._scanner.remember(written.parts)
         if written.bags:
             spent = ms_from_ns(time.perf_counter_ns() - begun)
-            log.debug("bags_stored", bags=written.bags, whole=whole, duration_ms=round(spent, 3))
+            log.debug(
+                "bags_stored",
+                bags=written.bags,
+                slot_s=level.length // NS_PER_S,
+                duration_ms=round(spent, 3),
+            )
         return written.bags
 
     def _put_long(self, to_store: ReadBag, groups: Iterator[list[Table]]) -> bool:
-        """Stores a bag as parts of ten minutes each, group by group."""
+        """Stores a bag as parts of an hour each, group by group."""
         bag = to_store.bag
         refusals = self.store.refusals
         stored, taken = self.store.merged_bytes()
@@ -358,13 +372,10 @@ class Filling:
             self._shared = timeline, files
         return bag.file in files
 
-    def _is_over(self, begin: Ns, timeline: Timeline) -> bool:
-        """Returns whether no bag that belongs to ten minutes is to be expected."""
+    def _is_over(self, bag: BagFile, level: Level, timeline: Timeline) -> bool:
+        """Returns whether no other bag that belongs to the slot of a bag is to be expected."""
         newest = timeline.segments[-1].latest
-        return max(newest, self._clock.now()) >= begin + PART_NS
-
-    def _slot(self, bag: BagFile) -> tuple[str, Ns]:
-        return bag.file.rpartition("/")[0], bag.start // PART_NS * PART_NS
+        return max(newest, self._clock.now()) >= _slot(bag, level)[1] + level.length
 
     def _fitting(self, bags: Sequence[BagFile]) -> list[BagFile]:
         """Returns which of these bags may be stored, the newest first.
@@ -406,6 +417,18 @@ class Filling:
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
+
+
+def _slot(bag: BagFile, level: Level) -> tuple[str, Ns]:
+    return bag.file.rpartition("/")[0], bag.start // level.length * level.length
+
+
+def _by_slot(bags: Iterable[BagFile], level: Level) -> list[list[BagFile]]:
+    """Returns bags, each once, by the slot in which they have parts together."""
+    slots: dict[tuple[str, Ns], list[BagFile]] = defaultdict(list)
+    for bag in dict.fromkeys(bags):
+        slots[_slot(bag, level)].append(bag)
+    return [*slots.values()]
 
 
 def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:

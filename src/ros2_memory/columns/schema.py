@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 PRAGMAS: Final = (
-    "page_size = 1024",
+    "page_size = 4096",
     "cache_size = -256",  # KiB: a server may have hundreds open, and the kernel has their pages
     "auto_vacuum = INCREMENTAL",
     "secure_delete = ON",
@@ -40,9 +40,9 @@ CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TE
   text BLOB NOT NULL, UNIQUE (type, encoding, text));
 CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL, whole INTEGER NOT NULL);
+  bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL, level INTEGER NOT NULL);
 CREATE INDEX part_of_topic ON part (topic, first_ns, last_ns);
-CREATE INDEX part_not_whole ON part (id) WHERE NOT whole;
+CREATE INDEX part_to_merge ON part (level) WHERE level < 2;
 CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, same TEXT,
   data BLOB, UNIQUE (part, path));
 CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,

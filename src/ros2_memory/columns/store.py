@@ -1,9 +1,9 @@
 """The columns of closed bags in one SQLite file that outlives the process.
 
 Everything here is derived: deleting the file changes no answer, only how long it takes. A bag is
-stored whole or not at all, as parts, one for each topic (`part`), column by column (`part_column`).
-Once the ten minutes that it begins in are over, whole parts take the place of its own: they have
-the rows of all bags of its recording that begin in them. What is known of a column without
+stored whole or not at all, as parts for each topic (`part`), column by column (`part_column`). Once
+the ten minutes that it begins in are over, and then the hour, larger parts take their place: they
+have the rows of all bags of its recording that begin there. What is known of a column without
 unpacking it lies apart from the parts (`zone`), next to that of the same column in the other parts:
 a search reads it at once. A part names the bags that it has rows of: rows of a bag that is not in
 `bag` any more do not count. What follows from whole parts, as the path of the poses in them, is
@@ -29,9 +29,9 @@ from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import Packed
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
-    PART_NS,
-    UNMERGED,
+    BELOW,
     Layouts,
+    Level,
     LongBag,
     PackedPart,
     ReadBag,
@@ -61,8 +61,8 @@ FILE: Final = "columns.sqlite"
 CATALOGUE: Final = "catalogue.sqlite"
 """The file of digests that lay in its place in versions before it."""
 _ALL_TIME: Final = TimeWindow.everything()
-LONG_NS: Final[Ns] = 2 * PART_NS
-"""A bag that lasts longer becomes parts at once."""
+LONG_NS: Final[Ns] = 2 * Level.TEN_MINUTES.length
+"""A bag that lasts longer becomes parts of an hour at once."""
 
 _UNKNOWN: Final = -2
 _FEW: Final = 2048
@@ -146,7 +146,7 @@ class PartHead(NamedTuple):
         bags: the numbers of the bags that its rows are of, ascending.
         messages: how many rows it has.
         dropped: the paths of its columns that were dropped, as the bags' share was used up.
-        is_whole: whether it stays as it is, as its ten minutes are over.
+        is_whole: whether it has all bags of its recording that begin in its slot of the clock.
     """
 
     number: int
@@ -287,10 +287,10 @@ class ColumnStore(Database):
         ids = self._asked(lambda rows: [row for (row,) in rows], none, "SELECT id FROM bag")
         return np.array(ids, np.int64) + self.offset
 
-    def unmerged(self) -> frozenset[int]:
-        """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""
+    def below(self, level: Level) -> frozenset[int]:
+        """Returns the numbers of the bags that have parts below a level."""
         return self._asked(
-            lambda rows: frozenset(self.offset + row for (row,) in rows), frozenset(), UNMERGED
+            lambda rows: frozenset(self.offset + row for (row,) in rows), frozenset(), BELOW, level
         )
 
     def dropped(self) -> dict[str, Ns]:
@@ -354,7 +354,7 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT bags, id, topic, first_ns, last_ns, messages, dropped, whole FROM part"
+                "SELECT bags, id, topic, first_ns, last_ns, messages, dropped, level FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?)"
                 " AND first_ns < ? AND last_ns >= ? AND id > ? ORDER BY first_ns, id",
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
@@ -373,7 +373,7 @@ class ColumnStore(Database):
                     numbers,
                     messages,
                     tuple(json.loads(dropped)) if dropped else (),
-                    bool(whole),
+                    level > Level.BAG,
                 )
                 for numbers, (
                     _,
@@ -383,7 +383,7 @@ class ColumnStore(Database):
                     last,
                     messages,
                     dropped,
-                    whole,
+                    level,
                 ) in zip(bags_of_parts, rows, strict=True)
             ]
 
@@ -523,16 +523,16 @@ class ColumnStore(Database):
             return True
         return self.write(write)
 
-    def put(self, bags: Sequence[ReadBag], tables: Sequence[Table], *, whole: bool) -> Written:
+    def put(self, bags: Sequence[ReadBag], tables: Sequence[Table], level: Level) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.
 
-        One that is in whole parts stays as it is: another program has stored it. One that changed
-        meanwhile is left out.
+        One with parts of this level stays as it is: another program has stored it. One that
+        changed meanwhile is left out.
 
         Args:
             bags: those of the tables, by their numbers there.
             tables: with all of their messages.
-            whole: whether their ten minutes are over, so that their parts stay as they are.
+            level: of the parts.
         """
         written = Written(0, {})
 
@@ -541,8 +541,8 @@ class ColumnStore(Database):
             rows = connection.execute(
                 f"SELECT {_KEY}, hashed FROM bag"
                 " WHERE definitions IN ('', ?) AND path IN (SELECT value FROM json_each(?))"
-                f" AND id NOT IN ({UNMERGED})",
-                (self._definitions, json.dumps([bag.key.path for bag in bags])),
+                f" AND id NOT IN ({BELOW})",
+                (self._definitions, json.dumps([bag.key.path for bag in bags]), level),
             )
             stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
             missing = {
@@ -553,7 +553,7 @@ class ColumnStore(Database):
             new = {number: bag for number, bag in missing.items() if bag.is_current()}
             delete_bags(connection, [bag.key.path for bag in new.values()])
             parts = insert_bags(
-                connection, new, tables, self._definitions, self._layouts, whole=whole
+                connection, new, tables, self._definitions, self._layouts, level=level
             )
             done = len(bags) - len(missing) + len(new)
             written = Written(done, {self.offset + row: part for row, part in parts.items()})
@@ -685,9 +685,9 @@ def _insert_fragment(
 
 def _query_merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
     [bags] = connection.execute(
-        f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({UNMERGED})"
+        f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({BELOW})", (Level.TEN_MINUTES,)
     ).fetchone()
     [columns] = connection.execute(
-        "SELECT total(bytes) FROM part WHERE whole AND dropped = ''"
+        "SELECT total(bytes) FROM part WHERE level > 0 AND dropped = ''"
     ).fetchone()
     return int(bags), int(columns)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import cached_property
 from itertools import chain, repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -32,10 +33,31 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile
     from ros2_memory.storage.base import IntArray, Schema
 
-PART_NS: Final[Ns] = 600 * NS_PER_S
-"""Bags of one recording that begin in the same ten minutes become one part for each topic."""
-UNMERGED: Final = "SELECT value FROM part, json_each(part.bags) WHERE NOT whole"
-"""Selects the bags whose parts are not those of whole ten minutes."""
+PART_NS: Final[Ns] = 3600 * NS_PER_S
+"""Bags of one recording that begin in the same hour become one part for each topic."""
+
+
+class Level(IntEnum):
+    """What the bags of a part have in common, but for their recording.
+
+    A part of a level takes the place of those below it. Few large parts are read and followed from
+    sooner than many small ones; the newest bags are stored at once all the same.
+    """
+
+    BAG = 0
+    TEN_MINUTES = 1
+    HOUR = 2
+
+    @property
+    def length(self) -> Ns:
+        """How long (ns) the slots of the clock are in which the bags begin; 0 of one bag."""
+        return (0, 600 * NS_PER_S, PART_NS)[self]
+
+
+_MOST_ROWS: Final = 16_384
+"""Of a part, about: who asks about one message unpacks columns of all."""
+BELOW: Final = "SELECT value FROM part, json_each(part.bags) WHERE level < ?"
+"""Selects the bags that have parts below a level."""
 _MOST_INTEGER: Final = 2**63 - 1
 _MOST_LAYOUTS: Final = 4_096
 
@@ -154,16 +176,17 @@ class LongBag:
         return True
 
     def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> bool:
-        """Inserts some of its messages, as parts of ten minutes each."""
+        """Inserts some of its messages, as parts of an hour each."""
         if not self._may_go_on(connection):
             return False
         self._lacks_definitions |= any(map(lacks_definitions, tables))
         parts: list[int] = []
         for table in tables:
             topic, layout = topic_of(connection, table, self._layouts)
-            for rows in _in_parts(table) if len(table) else ():
+            pieces = map(_in_parts, _by_hour(table)) if len(table) else ()
+            for rows in chain.from_iterable(pieces):
                 part = pack_rows(layout, rows, np.full(len(rows), self._number, np.int64))
-                parts.append(_insert_part(connection, topic, part, whole=True))
+                parts.append(_insert_part(connection, topic, part, Level.HOUR))
         share = round(self._share * sum(map(len, tables)))
         thin_parts(connection, parts, bytes_of_topics(connection), share)
         return True
@@ -254,11 +277,21 @@ def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> bool
     return True
 
 
-def _in_parts(table: Table) -> Iterator[Table]:
-    """Yields the rows of a table by the ten minutes that they are in."""
-    slots = table.log_times // PART_NS
-    edges = np.flatnonzero(np.diff(slots)) + 1
+def _by_hour(table: Table) -> Iterator[Table]:
+    """Yields the rows of a table by the hour that they are in."""
+    edges = np.flatnonzero(np.diff(table.log_times // PART_NS)) + 1
     for rows in np.split(np.arange(len(table)), edges):
+        yield table.rows(rows)
+
+
+def _in_parts(table: Table) -> Iterator[Table]:
+    """Yields the rows of a table in as many parts as need be; those of one time are in one."""
+    times = table.log_times
+    edges = np.unique(np.searchsorted(times, times[_MOST_ROWS::_MOST_ROWS]))
+    if not edges.any():
+        yield table
+        return
+    for rows in np.split(np.arange(len(table)), edges[edges > 0]):
         yield table.rows(rows)
 
 
@@ -290,9 +323,9 @@ def insert_bags(
     definitions: str,
     layouts: Layouts,
     *,
-    whole: bool,
+    level: Level,
 ) -> dict[int, PackedPart]:
-    """Inserts bags of one recording, in one part for each topic; returns these by their ids.
+    """Inserts bags of one recording, in parts for each topic; returns these by their ids.
 
     Args:
         connection: to the store.
@@ -301,7 +334,7 @@ def insert_bags(
             which are left out.
         definitions: as `ColumnStore` has them.
         layouts: of tables before these.
-        whole: as for `ColumnStore.put`.
+        level: of the parts.
     """
     lacking = {
         number
@@ -317,18 +350,17 @@ def insert_bags(
         if is_stored.any():
             topic, layout = topic_of(connection, table, layouts)
             rows = table if is_stored.all() else table.rows(np.flatnonzero(is_stored))
-            part = pack_rows(layout, rows, ids[rows.bag_numbers])
-            parts[_insert_part(connection, topic, part, whole=whole)] = part
+            for piece in _in_parts(rows):
+                part = pack_rows(layout, piece, ids[piece.bag_numbers])
+                parts[_insert_part(connection, topic, part, level)] = part
     return parts
 
 
-def _insert_part(
-    connection: sqlite3.Connection, topic: int, part: PackedPart, *, whole: bool
-) -> int:
+def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart, level: Level) -> int:
     cursor = connection.execute(
-        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes, whole)"
+        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes, level)"
         " VALUES (?, ?, ?, ?, ?, '', ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags), part.size, whole),
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags), part.size, level),
     )
     number = int(cursor.lastrowid or 0)
     columns: list[tuple[int, str, str | None, bytes | None]] = []

@@ -15,6 +15,7 @@ import pytest
 from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
+from ros2_memory.columns.writing import Level
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
@@ -47,7 +48,7 @@ def storing(memory: Memory, folder: Path, draw: Random, *, part: float = 1.0) ->
     draw.shuffle(bags)
     stop = round(part * len(bags))
     for bag in bags[:stop]:
-        filling.fill(Batch([bag], whole=False), timeline)
+        filling.fill(Batch([bag], Level.BAG), timeline)
     for batch in filling.batches(timeline):
         if not {*batch.bags} & {*bags[stop:]}:
             filling.fill(batch, timeline)

@@ -26,6 +26,7 @@ from ros2_memory.columns import fill
 from ros2_memory.columns.fill import Batch, Filling, Progress, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.columns.writing import Level
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
@@ -94,7 +95,7 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
     tmp_path: Path,
 ) -> None:
     for number in range(6):
-        bag(tmp_path, 60 * number)  # each in ten minutes of its own
+        bag(tmp_path, 1080 * number)  # with three hours between them
     earlier = storing(tmp_path, reading="before")[1]
     fill_store(earlier)
     while earlier.follow():
@@ -170,7 +171,7 @@ async def test_health_tells_how_much_is_stored(tmp_path: Path) -> None:
     for number in range(3):
         bag(tmp_path, number)
     memory, backfill = storing(tmp_path)
-    backfill.store(Batch(backfill.waiting()[:1], whole=False))
+    backfill.store(Batch(backfill.waiting()[:1], Level.BAG))
     reply = await Health(memory, "1.2.3", backfill)()
     assert reply["store"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
     assert backfill.filling is not None
