@@ -46,6 +46,8 @@ log = get_logger(__name__)
 
 BACKLOG: Final = 8
 """A child process stores more bags than these, so that answers stay fast."""
+_MERGED_HERE: Final = 100
+"""And if it is more with those that are stored again with others: an hour of short splits is."""
 _BACKLOG_ALONE: Final = 256
 """Bags of a lake that are stored in a round: no child process knows them."""
 PRUNE_INTERVAL_S: Final = 600.0
@@ -87,18 +89,18 @@ class Backfill:
     async def _fill_round(self) -> None:
         due, in_thread = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S, self._in_thread
         await in_thread(partial(self.look_after, thorough=due))
-        waiting = await in_thread(self.waiting)
+        waiting, batches = await in_thread(self.waiting), await in_thread(self.batches)
         store = None if self.filling is None else self.filling.store
         # A store that is in memory cannot be filled by another process.
         has_file = store is not None and store.path is not None
-        is_helped = self.helper and len(waiting) > BACKLOG and has_file
-        if is_helped and await _run_helper(self.helper):
+        is_much = len(waiting) > BACKLOG or sum(len(batch.bags) for batch in batches) > _MERGED_HERE
+        if self.helper and is_much and has_file and await _run_helper(self.helper):
             # Bags that the helper could not store are tried here, and refused if they fail.
-            waiting = await in_thread(self.waiting)
+            waiting, batches = await in_thread(self.waiting), await in_thread(self.batches)
         if not waiting and store is not None:
             await in_thread(store.write_again)  # whether the disk works again
         done = tried = 0
-        for batch in await in_thread(self.batches):
+        for batch in batches:
             if tried >= (BACKLOG if self.helper else _BACKLOG_ALONE):
                 break
             tried += len(batch.bags)

@@ -7,6 +7,7 @@ import random
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,16 +15,17 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.bootstrap import build_repairer
-from ros2_memory.columns import decode, fill
+from ros2_memory.columns import decode, fill, writing
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.fill import Progress, StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.walk import LevelColumns, walked
-from ros2_memory.columns.writing import ReadBag
+from ros2_memory.columns.writing import Level, ReadBag
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap import bulk
 from tests.support.bags import McapLayout, odom, text, write_db3, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.column_worlds import World, check_all, store_file, times
 
 if TYPE_CHECKING:
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.plan import Plan
     from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import BagReader, Batch, Channel
-
-pytestmark = pytest.mark.usefixtures("short_parts")
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S
@@ -92,6 +92,45 @@ def test_copies_of_a_long_bag_are_recognised_before_it_is_stored_again(tmp_path:
     ]
     write_mcap(tmp_path / "rec_b" / "rec_b_0.mcap", again)
     assert check_all(world) == 300
+
+
+def test_larger_parts_take_the_place_of_smaller_ones_as_time_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "PART_NS", 3600 * S)
+    for number in range(11):
+        write_bag(tmp_path, number)
+    clock = SettableClock(T0 + 660 * S)
+    world = World.of(tmp_path, clock=clock)
+    levels = "SELECT level, count(DISTINCT bags) FROM part GROUP BY level"
+
+    def stored() -> list[tuple[int, int]]:
+        world.fill()
+        check_all(world)
+        with closing(sqlite3.connect(store_file(tmp_path))) as base:
+            return base.execute(levels).fetchall()
+
+    assert stored() == [(Level.BAG, 1), (Level.TEN_MINUTES, 1)]
+    clock.at = T0 + 1200 * S
+    assert stored() == [(Level.TEN_MINUTES, 2)]
+    clock.at = T0 // (3600 * S) * 3600 * S + 3600 * S
+    assert stored() == [(Level.HOUR, 1)]
+    assert world.fill() == 0
+
+
+def test_a_topic_with_many_messages_has_several_parts_and_those_of_one_time_are_in_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "_MOST_ROWS", 10)
+    poses = [odom(T0 + n // 4 * S, n / 7, 0.0) for n in range(50)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    world = World.of(tmp_path)
+    world.fill()
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        parts = base.execute("SELECT messages, first_ns, last_ns FROM part ORDER BY id").fetchall()
+    assert [messages for messages, *_ in parts] == [8, 12, 8, 12, 10]
+    assert all(before[2] < after[1] for before, after in pairwise(parts))
+    assert check_all(world) == 50
 
 
 # Bags that a crash cut short

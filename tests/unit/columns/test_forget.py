@@ -22,8 +22,6 @@ from tests.support.column_worlds import World, check_all, store_file
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.usefixtures("short_parts")
-
 S = NS_PER_S
 T0 = 1_700_000_400 * S
 

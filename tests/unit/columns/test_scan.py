@@ -23,8 +23,6 @@ from tests.support.memories import memory_of
 if TYPE_CHECKING:
     from ros2_memory.columns.zones import PartZones
 
-pytestmark = pytest.mark.usefixtures("short_parts")
-
 S = 10**9
 T0 = 1_700_000_000 * S
 

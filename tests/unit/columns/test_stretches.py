@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
 
-pytestmark = pytest.mark.usefixtures("short_parts")
-
 S = NS_PER_S
 T0 = 1_700_000_400 * S
 LENGTH = 1200 * S
