@@ -117,7 +117,7 @@ def assert_whole(bag_dir: Path) -> None:
         assert base.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         rows = base.execute(
             "SELECT bag.path, bag.messages, bag.size,"
-            " (SELECT count(DISTINCT whole) FROM part, json_each(part.bags) WHERE value = bag.id)"
+            " (SELECT count(DISTINCT level) FROM part, json_each(part.bags) WHERE value = bag.id)"
             " FROM bag"
         ).fetchall()
     for path, _, size, kinds in rows:
