@@ -42,7 +42,7 @@ CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
   bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL, level INTEGER NOT NULL);
 CREATE INDEX part_of_topic ON part (topic, first_ns, last_ns);
-CREATE INDEX part_to_merge ON part (level) WHERE level < 2;
+CREATE INDEX part_of_level ON part (level);
 CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, same TEXT,
   data BLOB, UNIQUE (part, path));
 CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,

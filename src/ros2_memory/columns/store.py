@@ -688,6 +688,6 @@ def _query_merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
         f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({BELOW})", (Level.TEN_MINUTES,)
     ).fetchone()
     [columns] = connection.execute(
-        "SELECT total(bytes) FROM part WHERE level > 0 AND dropped = ''"
+        "SELECT total(bytes) FROM part WHERE +level > 0 AND dropped = ''"
     ).fetchone()
     return int(bags), int(columns)

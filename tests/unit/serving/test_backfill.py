@@ -167,6 +167,24 @@ async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
             tasks.cancel_scope.cancel()
 
 
+async def test_much_that_is_put_together_is_left_to_the_helper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.serving.backfill._MERGED_HERE", 2)
+    for number in range(3):
+        bag(tmp_path, number)
+    _, backfill = storing(tmp_path)
+    for waiting in backfill.waiting():
+        backfill.store(Batch([waiting], Level.BAG))
+    ran = tmp_path / "ran"
+    backfill.helper = [sys.executable, "-c", f"open({str(ran)!r}, 'w')"]
+    await backfill.fill()
+    assert ran.exists()
+    ran.unlink()
+    await backfill.fill()  # what it left is put together here
+    assert not ran.exists()
+
+
 async def test_health_tells_how_much_is_stored(tmp_path: Path) -> None:
     for number in range(3):
         bag(tmp_path, number)
