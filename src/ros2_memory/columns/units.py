@@ -159,6 +159,17 @@ class Rows:
         """The number of the whole part of which all rows count; None where it is not so."""
         return self.unit.part if self.index is None else None
 
+    def part_between(self, start: Ns, stop: Ns) -> int | None:
+        """Returns the number of the whole part of which all rows at these log times count.
+
+        Those from `start` until before `stop`. None where it is not so.
+        """
+        if self.unit.part is None or self.index is None:
+            return self.unit.part
+        begin, end = np.searchsorted(self.unit.times(), (start, stop))
+        first, last = np.searchsorted(self.index, (begin, end))
+        return self.unit.part if last - first == end - begin else None
+
     @property
     def recording(self) -> Path:
         """The recording that the rows are of."""

@@ -226,11 +226,15 @@ class PoseSlice:
         return joined_poses([block.poses.between(start, stop) for block in self.blocks])
 
     def key(self, settings: str) -> FragmentKey | None:
-        """Returns the key of the poses in memory; None where not all are of whole parts."""
-        parts = [block.parts for block in self.blocks if block.parts is not None]
-        if len(parts) < len(self.blocks):
-            return None
-        return FragmentKey(self.start, settings, tuple(chain.from_iterable(parts)))
+        """Returns the key of the poses in memory; None where not all of these parts are here."""
+        span = self.start - self.beside, self.stop + self.beside
+        parts: list[int] = []
+        for block in self.blocks:
+            of_block = block.parts_between(*span)
+            if of_block is None:
+                return None
+            parts += of_block
+        return FragmentKey(self.start, settings, tuple(parts))
 
 
 def pose_slices(newest_first: Iterable[PoseRows], beside: Ns) -> Iterator[PoseSlice]:

@@ -46,13 +46,22 @@ class PoseRows:
         first: a log time (ns) that none of the poses is earlier than.
         last: one that none is later than.
         load: returns the poses.
-        parts: the numbers of the parts of which all rows are here; None if there are others, too.
+        rows: what they are read of; none if not all of them are poses here.
     """
 
     first: Ns
     last: Ns
     load: Callable[[], Poses]
-    parts: tuple[int, ...] | None = None
+    rows: Sequence[Rows] = ()
+
+    def parts_between(self, start: Ns, stop: Ns) -> Sequence[int] | None:
+        """Returns the numbers of the whole parts whose rows at these log times are all poses here.
+
+        None if there may be others, too.
+        """
+        parts = [rows.part_between(start, stop) for rows in self.rows]
+        known = [part for part in parts if part is not None]
+        return known if known and len(known) == len(parts) else None
 
     def slices(self, length: Ns) -> Iterable[int]:
         """Returns which slices of the clock may have poses, counted from the epoch."""
@@ -157,10 +166,9 @@ class PoseReader:
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
         """Returns the poses of rows that overlap in time, in the order of `blocks`."""
-        parts = tuple(some.part for some in rows if some.part is not None)
-        is_whole = len(parts) == len(rows) and not any(map(self._held_by_others, rows))
+        known = () if any(map(self._held_by_others, rows)) else rows
         first, last = min(some.first for some in rows), max(some.last for some in rows)
-        return PoseRows(first, last, partial(self._joined, rows), parts if is_whole else None)
+        return PoseRows(first, last, partial(self._joined, rows), known)
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
         counting = map(self._without_others, rows)
