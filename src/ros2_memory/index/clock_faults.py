@@ -21,6 +21,7 @@ from itertools import takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import set_back_while_written
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.index.segment import in_time
@@ -36,6 +37,9 @@ FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
 """2017-01-01, before the first release of ROS 2. Clocks without a battery start in 1970."""
 FAR_BACK_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """Where a clock is set back by this much, the dates before or after that are wrong."""
+
+_DATED: Final[Key[dict[frozenset[str], Sequence[Segment]]]] = Key()
+"""Of a timeline: the segments without some bags, by their files."""
 
 
 class FaultyClock(StrEnum):
@@ -171,7 +175,7 @@ def check_dates(
     dating = Dating(faults=tuple(faults), note=note)
     if len(dating.misdated) == bags:
         dating = replace(dating, faults=tuple(fault._replace(misleads=False) for fault in faults))
-    dated = dated_segments(segments, dating.faults)
+    dated = dated_segments(timeline, dating.faults)
     return replace(
         dating,
         earliest=dated[0].first[0] if dated else None,
@@ -206,10 +210,20 @@ def _step_faults(
                 yield ClockFault(bag, FaultyClock.STRAY)
 
 
-def dated_segments(segments: Sequence[Segment], faults: Sequence[ClockFault]) -> Sequence[Segment]:
-    """Returns segments without the bags that mislead, in order."""
+def dated_segments(timeline: Timeline, faults: Sequence[ClockFault]) -> Sequence[Segment]:
+    """Returns the recorded segments without the bags that mislead, in order; remembers them."""
     misdated = [fault.bag for fault in faults if fault.misleads]
-    firsts, files = [segment.first for segment in segments], {bag.file for bag in misdated}
+    files = frozenset(bag.file for bag in misdated)
+    known = timeline.memo.of(_DATED, dict)
+    if files not in known:
+        known[files] = _segments_without(timeline.recorded_segments, misdated, files)
+    return known[files]
+
+
+def _segments_without(
+    segments: Sequence[Segment], misdated: Sequence[BagFile], files: Collection[str]
+) -> Sequence[Segment]:
+    firsts = [segment.first for segment in segments]
     # Of the others, what they remember serves the next snapshot.
     touched = {bisect_right(firsts, in_time(bag)) - 1 for bag in misdated}
     dated = (

@@ -116,7 +116,7 @@ class Snapshot:
     @cached_property
     def _dated_segments(self) -> Sequence[Segment]:
         """The bags that a correct clock dated, without that of carried messages, in order."""
-        return dated_segments(self.timeline.recorded_segments, self.dating.faults)
+        return dated_segments(self.timeline, self.dating.faults)
 
     @property
     def whole_segments(self) -> Iterator[Segment]:
