@@ -54,7 +54,7 @@ class Level(IntEnum):
         return (0, 600 * NS_PER_S, PART_NS)[self]
 
 
-_MOST_ROWS: Final = 16_384
+_MOST_ROWS: Final = 24_576
 """Of a part, about: who asks about one message unpacks columns of all."""
 BELOW: Final = "SELECT value FROM part, json_each(part.bags) WHERE level < ?"
 """Selects the bags that have parts below a level."""
