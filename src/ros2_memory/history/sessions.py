@@ -350,7 +350,7 @@ class Sessions:
     ) -> Mapping[Session, Sequence[StampedTransform]]:
         """Returns the static transforms of one more session; for many, of all."""
         view, before = self._view, self._view.notes.added
-        if len(self._static) == _FEW_SESSIONS:
+        if len(self._static) == _FEW_SESSIONS and not view.call.stored:
             # Who has asked for so many asks for more, also where nothing of it is remembered.
             known = {**self._all_static(), **known}
             self._static.update(known)

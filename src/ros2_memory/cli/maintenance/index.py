@@ -41,9 +41,9 @@ NICENESS: Final = 15
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _BATCH: Final = 4096
 """Bags stored before the program looks which others closed meanwhile, among all that wait."""
-_FOLLOWED: Final = 12
-"""Batches stored before what follows from them is made: of two hours most is still in the cache."""
-_CACHE_MB: Final = 16
+_FOLLOWED: Final = 4
+"""Batches stored before what follows from them is made: of four hours it is still in the cache."""
+_CACHE_MB: Final = 32
 _RARELY: Final = (50_000, 20, 100)
 """Thresholds of `gc`: columns make no cycles, and the index of a week has many objects."""
 
