@@ -490,11 +490,12 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in differing:
         return differing[key]
+    if view.sessions.are_joined(*pair):
+        return False
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
     bags = [[span for span in near if span.bag.recording == path] for path in pair]
-    are_two = all(bags) and not view.sessions.are_joined(*pair)
-    differ = are_two and _bags_differ(view, topic, bags, both)
+    differ = all(bags) and _bags_differ(view, topic, bags, both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
         differing[key] = differ
     return differ
