@@ -45,13 +45,13 @@ class CoveredSegment(NamedTuple):
     to_store: Mask
 
     @property
-    def missing(self) -> Mask:
+    def is_missing(self) -> Mask:
         """Which bags are not stored."""
         return self.numbers < 0
 
     def misses_in(self, window: TimeWindow) -> bool:
         """Returns whether a bag that is not stored may begin in a window."""
-        starts = self.segment.bags.starts[self.missing]
+        starts = self.segment.bags.starts[self.is_missing]
         return bool(starts.size) and window.overlaps(int(starts.min()), int(starts.max()))
 
 
@@ -76,7 +76,7 @@ class Coverage:
     @cached_property
     def missing(self) -> Sequence[BagFile]:
         """The bags that are not stored, in order of time."""
-        return [bag for each in self.segments for bag in each.segment.bags.at(each.missing)]
+        return [bag for each in self.segments for bag in each.segment.bags.at(each.is_missing)]
 
     @cached_property
     def to_store(self) -> Sequence[BagFile]:
@@ -92,7 +92,7 @@ class Coverage:
     def missing_extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that are not stored as `Timeline.extents` yields all."""
         for covered in self.segments:
-            bags, is_missing = covered.segment.bags, covered.missing
+            bags, is_missing = covered.segment.bags, covered.is_missing
             is_missing &= (bags.starts < window.stop) & (bags.ends >= window.start)
             if is_missing.any():
                 yield from covered.segment.extents(topic, window, is_missing)
@@ -171,7 +171,7 @@ class Covering:
                     self._by_id = {
                         key: covered
                         for key, covered in self._by_id.items()
-                        if np.isin(covered.numbers[~covered.missing], numbers).all()
+                        if np.isin(covered.numbers[~covered.is_missing], numbers).all()
                     }
             segments = self._covered_segments(timeline, state)
             coverage = Coverage(state, segments)

@@ -158,20 +158,20 @@ class Filling:
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
             return []
-        waiting, batches = self.waiting(timeline), list[Batch]()
-        left = [*waiting, *self._below(Level.HOUR, coverage)]
-        for bags in _by_slot(left, Level.HOUR):
+        waiting = self.waiting(timeline)
+        alone = {*self._below(Level.TEN_MINUTES, coverage)}
+        of_ten_minutes = alone.union(waiting)
+        recent, hours = list[Batch](), list[Batch]()
+        for bags in _by_slot([*waiting, *self._below(Level.HOUR, coverage)], Level.HOUR):
             if self._is_over(bags[0], Level.HOUR, timeline):
-                batches.append(Batch(bags, Level.HOUR))
-        in_hours = {bag.file for batch in batches for bag in batch.bags}
-        alone = self._below(Level.TEN_MINUTES, coverage)
-        left = [bag for bag in (*waiting, *alone) if bag.file not in in_hours]
-        for bags in _by_slot(left, Level.TEN_MINUTES):
-            if self._is_over(bags[0], Level.TEN_MINUTES, timeline):
-                batches.append(Batch(bags, Level.TEN_MINUTES))
-            else:
-                batches += [Batch([bag], Level.BAG) for bag in bags if bag not in alone]
-        return batches
+                hours.append(Batch(bags, Level.HOUR))
+                continue
+            for some in _by_slot(filter(of_ten_minutes.__contains__, bags), Level.TEN_MINUTES):
+                if self._is_over(some[0], Level.TEN_MINUTES, timeline):
+                    recent.append(Batch(some, Level.TEN_MINUTES))
+                else:
+                    recent += [Batch([bag], Level.BAG) for bag in some if bag not in alone]
+        return [*recent, *hours]
 
     def _below(self, level: Level, coverage: Coverage) -> list[BagFile]:
         """Returns the bags that have parts below a level."""

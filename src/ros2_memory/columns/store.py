@@ -687,6 +687,7 @@ def _query_merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
     [bags] = connection.execute(
         f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({BELOW})", (Level.TEN_MINUTES,)
     ).fetchone()
+    # With "+" the index on levels is not used: nearly all parts are of these.
     [columns] = connection.execute(
         "SELECT total(bytes) FROM part WHERE +level > 0 AND dropped = ''"
     ).fetchone()

@@ -109,8 +109,7 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
         near = is_free & (_squared(x - x[cell], y - y[cell]) <= _PEAK_MM**2)
         weights = mass * near
         peak = np.array((weights @ x, weights @ y)) / weights.sum()
-        away_from_peak = _squared(x - peak[0], y - peak[1])
-        is_claimed = is_free & (away_from_peak <= _CLAIM_MM**2)
+        is_claimed = is_free & (_squared(x - peak[0], y - peak[1]) <= _CLAIM_MM**2)
         is_claimed[cell] = True
         weight = float(mass @ is_claimed)
         is_free &= ~is_claimed

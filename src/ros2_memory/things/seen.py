@@ -192,8 +192,7 @@ class Watching:
         if any(segment.recorded is not segment for segment in timeline.segments):
             # Carried messages that nothing is seen by reach over all of the history.
             for row, bag in enumerate(timeline.bags):
-                has_any = not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
-                is_asked[row] = has_any
+                is_asked[row] = not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
         self._bags = np.flatnonzero(is_asked)
         self._folder_of = timeline.folder_numbers[self._bags]
         self._firsts, self._lasts = timeline.starts[self._bags], timeline.ends[self._bags]

@@ -100,15 +100,22 @@ def test_larger_parts_take_the_place_of_smaller_ones_as_time_goes_on(
     monkeypatch.setattr(writing, "PART_NS", 3600 * S)
     for number in range(11):
         write_bag(tmp_path, number)
+    older = write_mcap(tmp_path / "rec" / "older.mcap", [odom(T0 - 7200 * S, 0.0, 0.0)])
+    os.utime(older, ns=(T0, T0))
     clock = SettableClock(T0 + 660 * S)
     world = World.of(tmp_path, clock=clock)
-    levels = "SELECT level, count(DISTINCT bags) FROM part GROUP BY level"
+    batches = world.filling.batches(world.memory.index.snapshot().timeline)
+    levels = [batch.level for batch in batches]
+    assert levels == [Level.BAG, Level.TEN_MINUTES, Level.HOUR]
+    older.unlink()
+    world = World.of(tmp_path, clock=clock)
+    by_level = "SELECT level, count(DISTINCT bags) FROM part GROUP BY level"
 
     def stored() -> list[tuple[int, int]]:
         world.fill()
         check_all(world)
         with closing(sqlite3.connect(store_file(tmp_path))) as base:
-            return base.execute(levels).fetchall()
+            return base.execute(by_level).fetchall()
 
     assert stored() == [(Level.BAG, 1), (Level.TEN_MINUTES, 1)]
     clock.at = T0 + 1200 * S
