@@ -350,7 +350,7 @@ async def test_strangers_do_not_lock_out_whoever_shows_the_token() -> None:
 async def test_peers_that_are_gone_fill_no_log(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection_limits.BoundedConnection, "_refusals", LogThrottle())
+    monkeypatch.setattr(connection_limits.BoundedConnection, "_refusals", LogThrottle(lambda: 0.0))
     garbage = (b"", b"P", HALF, b"\x16\x03\x01", POST, GET + b"\x00" * 99, b"GET / HTTP/9\r\n\r\n")
     chunked = b"POST /early HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\nzz\r\n"
     with capture_logs() as logged:
