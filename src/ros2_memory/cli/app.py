@@ -126,6 +126,10 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "ship the bags of many robots into a lake of Iceberg tables",
         "with --once: some bags are not, or may not be, in the lake (stderr names them)",
     ),
+    "sql": CommandEntry(
+        "sql.sql",
+        "answer a SELECT over the tables of a lake",
+    ),
     "recover": CommandEntry(
         "maintenance.recover.recover",
         "repair unfinished MCAP files",

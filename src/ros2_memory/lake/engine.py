@@ -11,6 +11,7 @@ import threading
 import time
 from collections import defaultdict
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from itertools import chain
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import duckdb
@@ -19,7 +20,7 @@ import pyarrow.dataset as ds
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
 
-from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.lake.warehouse import Partitions
@@ -40,7 +41,7 @@ _SETTINGS: Final = {
 }
 _LOCAL: Final = (
     " UNION ALL BY NAME"
-    " SELECT * FROM read_parquet($local, union_by_name = true, hive_partitioning = false)"
+    " SELECT * FROM read_parquet([{}], union_by_name = true, hive_partitioning = false)"
 )
 _MESSAGE_BYTES: Final = 16 << 20
 _CHANNEL_BYTES: Final = 8 << 20
@@ -123,31 +124,52 @@ class Lake:
         Raises:
             RefusedError: a file cannot be read; the log has why.
         """
+        # A cursor of its own, which alone knows the table.
+        with _reported(), self._database.cursor() as cursor:
+            rows = self._rows_of(name, files, cursor)
+            bound = {**(parameters or {})}
+            return cursor.sql(f"WITH {name} AS ({rows}) {sql}", params=bound).to_arrow_table()
+
+    def query(self, sql: str) -> pa.Table:
+        """Returns the rows of a select over the tables as they are now, each by its name.
+
+        Raises:
+            InvalidArgumentsError: DuckDB refuses it; the sentence has its reason.
+            RefusedError: the lake cannot be read.
+        """
+        self.refresh()
+        with _reported(), self._database.cursor() as cursor:
+            try:
+                for name in TABLES.keys() & cursor.get_table_names(sql):
+                    files = chain.from_iterable(days.values() for days in self.days(name).values())
+                    rows = self._rows_of(name, chain.from_iterable(files), cursor)
+                    cursor.execute(f"CREATE TEMP VIEW {name} AS {rows}")
+                return cursor.sql(sql).to_arrow_table()
+            except (duckdb.ProgrammingError, duckdb.DataError) as error:
+                tables = f"the tables are {', '.join(TABLES)}"
+                raise InvalidArgumentsError(f"{error}; {tables}") from error
+
+    def _rows_of(
+        self, name: str, files: Iterable[LakeFile], cursor: duckdb.DuckDBPyConnection
+    ) -> str:
+        """Returns the select of all rows in some files of a table, for one cursor."""
         with self._looking():
             table = self._loaded_table(name)
         properties = {} if table is None else dict(table.io.properties)
         places = [PyArrowFileIO.parse_location(file.location) for file in files]
         paths = [path for *_, path in places]
         rows: pa.Table | ds.Dataset = TABLES[name].arrow_schema.empty_table()
-        source, bound = "SELECT * FROM in_store", dict[str, object](parameters or {})
-        try:
-            # A cursor of its own, which alone knows the table.
-            with self._database.cursor() as cursor:
-                if not {scheme for scheme, *_ in places} <= {"file"}:
-                    store = PyArrowFileIO(properties).fs_by_scheme(*places[0][:2])
-                    rows = ds.dataset(paths, rows.schema, format="parquet", filesystem=store)
-                elif paths:
-                    # DuckDB reads local files itself, within its limits.
-                    source, bound["local"] = source + _LOCAL, paths
-                cursor.register("in_store", rows)
-                return cursor.sql(f"WITH {name} AS ({source}) {sql}", params=bound).to_arrow_table()
-        except (duckdb.Error, OSError, pa.ArrowException) as error:
-            # Its sentence alone: a traceback with variables would show the keys of a store.
-            kind = type(error).__name__
-            log.warning("lake_engine_failed", reason=f"{kind}: {error}")
-            # The error may name a path or a key: the client does not see it.
-            text = f"the lake cannot be read ({kind}); the server's log has the reason"
-            raise RefusedError(text) from error
+        local = ""
+        if not {scheme for scheme, *_ in places} <= {"file"}:
+            store = PyArrowFileIO(properties).fs_by_scheme(*places[0][:2])
+            rows = ds.dataset(paths, rows.schema, format="parquet", filesystem=store)
+        elif paths:
+            # DuckDB reads local files itself, within its limits.
+            local = _LOCAL.format(
+                ", ".join("'{}'".format(path.replace("'", "''")) for path in paths)
+            )
+        cursor.register(f"{name}_in_store", rows)
+        return f"SELECT * FROM {name}_in_store{local}"  # noqa: S608 - texts of ours
 
     @contextmanager
     def _looking(self) -> Iterator[None]:
@@ -161,3 +183,16 @@ class Lake:
             except NoSuchTableError:
                 return None
         return self._tables[name]
+
+
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Logs why files cannot be read; the error leaves it out, as it may have a path or a key."""
+    try:
+        yield
+    except (duckdb.Error, OSError, pa.ArrowException) as error:
+        # Its sentence alone: a traceback with variables would show the keys of a store.
+        kind = type(error).__name__
+        log.warning("lake_engine_failed", reason=f"{kind}: {error}")
+        text = f"the lake cannot be read ({kind}); the server's log has the reason"
+        raise RefusedError(text) from error

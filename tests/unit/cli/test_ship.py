@@ -199,3 +199,24 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
     assert "hunter2" not in exits(0, "config show", "fleet.robots={r1: /r1}", given).out
     secrets.write_text("[hunter2hunter2]")
     assert "hunter2" not in ship(2, given).err
+
+
+def test_a_select_is_answered_over_the_tables_as_they_are_now(
+    ship: Ship, tmp_path: Path, exits: Program
+) -> None:
+    ship(0)
+    counted, of_lake = (
+        "sql 'SELECT robot, count(*) AS bags, max(day) AS day FROM bags",
+        [f"lake.warehouse={tmp_path}/lake"],
+    )
+    rows = json.loads(exits(0, f"{counted} GROUP BY robot ORDER BY robot' --json", *of_lake).out)
+    assert [row["robot"] for row in rows] == [*ROBOTS]
+    [first, *_] = rows
+    lines = exits(0, f"{counted} GROUP BY robot ORDER BY robot' --csv", *of_lake).out.splitlines()
+    assert lines[:2] == ["robot,bags,day", f"{first['robot']},{first['bags']},{first['day']}"]
+    assert "kitchen" in exits(0, f"{counted} GROUP BY ALL'", *of_lake).out
+    refused = exits(2, "sql 'SELECT * FROM chanels'", *of_lake).err
+    assert "chanels does not exist" in refused
+    assert "the tables are channels, poses" in refused
+    nothing = exits(2, "sql 'SELECT 1'", f"lake.warehouse={tmp_path}/elsewhere").err
+    assert f"{tmp_path}/elsewhere: there is no lake, or no bag in it" in nothing

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import duckdb
 import pytest
 from pyiceberg.expressions import AlwaysTrue
 
@@ -21,7 +20,15 @@ from tests.support.bags import text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
 from tests.support.lake_questions import Question, every_question
-from tests.support.lakes import fleet_of, lake_robots, location, robot_bags, ship, store_columns
+from tests.support.lakes import (
+    fleet_of,
+    lake_in,
+    lake_robots,
+    location,
+    robot_bags,
+    ship,
+    store_columns,
+)
 from tests.support.memories import ROOT, memory_of, with_store
 from tests.support.moving_map import BEGIN, S
 from tests.support.unlike_robots import DAMAGED, LENGTH_S, ROBOTS, SEEN, YEAR_NS
@@ -134,40 +141,28 @@ def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     assert reply(world.both(), "memory_status", {}) == status
 
 
-def run_views(code: str) -> duckdb.DuckDBPyConnection:
-    """Runs the Python of the page, and returns its database."""
-    names: dict[str, Any] = {}
-    exec(code, names)  # noqa: S102
-    database: duckdb.DuckDBPyConnection = names["database"]
-    return database
-
-
-def of_the_page(language: str) -> list[str]:
-    """The blocks of a language on the page about the lake."""
+def answers_of_the_page(folder: Path) -> list[list[tuple[Any, ...]]]:
+    """What the statements of the page about the lake find in the lake of a folder."""
     page = (ROOT / "docs" / "how-to" / "lake.md").read_text(encoding="utf-8")
-    return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
+    lake = Lake(lake_in(folder))
+    found = map(lake.query, re.findall(r"```sql\n(.*?);\n```", page, re.DOTALL))
+    answers = [[tuple(row.values()) for row in rows.to_pylist()] for rows in found]
+    lake.close()
+    return answers
 
 
 def test_statements_of_the_page_find_nothing_in_tables_without_rows(tmp_path: Path) -> None:
     """As without `lake.messages`, and of robots that have neither poses nor detections."""
     write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [text(BEGIN, "here")])
     ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=())])
-    [views] = of_the_page("python")
-    database = run_views(views.replace("LAKE", str(tmp_path / "lake")))
-    found = [database.sql(statement).fetchall() for statement in of_the_page("sql")]
-    assert [len(rows) for rows in found] == [1, 0, 0, 0, 0, 0]
+    assert [*map(len, answers_of_the_page(tmp_path / "lake"))] == [1, 0, 0, 0, 0, 0]
 
 
 def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: World) -> None:
-    [views] = of_the_page("python")
-    statements = of_the_page("sql")
     with location(world.folder).writable() as tables:  # as `ship` puts the files of a day together
         for name in ("bags", "poses", "sightings"):
             tables.replace(name, AlwaysTrue(), tables.rows(name, AlwaysTrue()))
-    database = run_views(views.replace("LAKE", str(world.folder)))
-    metres, minutes, often, charge, last, where = (
-        database.sql(statement).fetchall() for statement in statements
-    )
+    metres, minutes, often, charge, last, where = answers_of_the_page(world.folder)
 
     def answer(tool: str, name: str, **given: Any) -> Any:
         return reply(world.mounted, tool, {"robot": name, **given})

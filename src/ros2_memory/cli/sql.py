@@ -1,0 +1,51 @@
+"""`ros2-memory sql`: a select over the tables of a lake."""
+
+import csv
+import json
+import sys
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from ros2_memory.bootstrap_fleet import open_lake
+from ros2_memory.cli.options import AsJson, Overrides, load_for
+from ros2_memory.cli.output import print_line, print_reply
+from ros2_memory.core.errors import InvalidArgumentsError
+
+if TYPE_CHECKING:
+    from ros2_memory.config import DuckdbNode
+
+
+def sql(
+    select: Annotated[
+        str, typer.Argument(metavar="SELECT", help="'SELECT robot, count(*) FROM bags GROUP BY 1'.")
+    ],
+    overrides: Overrides = None,
+    *,
+    as_csv: Annotated[bool, "--csv", "Print CSV."] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Answer a SELECT over the tables of a lake, as they are now.
+
+    DuckDB answers it in this process, within lake.engine.memory_mb, and reads the files of the
+    tables that it names. docs/reference/lake.md has their columns. Needs lake.warehouse, and
+    ros2-memory[lake].
+    """
+    if as_csv and as_json:
+        raise InvalidArgumentsError("give --csv or --json, not both")
+    settings, _ = load_for(None, ["deployment=query_only", "lake=duckdb", *(overrides or ())])
+    lake = open_lake(settings, cast("DuckdbNode", settings.lake.engine))
+    if not lake.days("bags"):
+        raise InvalidArgumentsError(f"{settings.lake.warehouse}: there is no lake, or no bag in it")
+    rows = lake.query(select)
+    if as_csv:
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(rows.column_names)
+        writer.writerows(zip(*rows.to_pydict().values(), strict=True))
+        return
+    # Dates, times and bytes are texts there.
+    text = json.dumps(rows.to_pylist(), default=str)
+    if as_json:
+        print_line(text)
+    else:
+        print_reply(json.loads(text))
