@@ -3,7 +3,8 @@
 A few drawn robots are shipped. Of their rows those of many robots are made: each lacks a tenth of
 the bags, drawn for it, and its places and metres have noise of its own. The server is started over
 these alone. Once it has stored all columns, it is asked by a real client: each question first and
-again, then by several clients.
+again, then by several clients. At last `ros2-memory sql` answers the statements of
+docs/how-to/lake.md.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import shutil
 import sqlite3
 import statistics
@@ -45,7 +47,9 @@ if TYPE_CHECKING:
 Asks: TypeAlias = "Mapping[str, tuple[str, dict[str, JsonValue]]]"
 Tables: TypeAlias = "dict[str, pa.Table]"
 
-_DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks"
+_ROOT: Final = Path(__file__).resolve().parents[1]
+_DIR: Final = _ROOT / "build" / "benchmarks"
+_PAGE: Final = _ROOT / "docs" / "how-to" / "lake.md"
 _LACKING: Final = 0.1
 _AT_ONCE: Final = 10
 """Robots whose rows are committed together."""
@@ -69,6 +73,10 @@ def main() -> None:
         bags = _make(folder, rows, robots, seed)
         facts = [json.loads((each / "world.json").read_bytes()) for each in folders]
         asyncio.run(_measured(folder, questions(facts), (robots, bags), given))
+        for select in re.findall(r"```sql\n(.*?);\n```", _PAGE.read_text("utf-8"), re.DOTALL):
+            ran = timing.selected(folder, select)
+            table = re.findall(r"FROM (\w+)", select)[-1]
+            print(f"  sql from {table}: {ran.seconds:.2f} s, {ran.peak_mb:.0f} MB")
 
 
 def _shipped(world: Path, bags: int, folder: Path) -> Tables:
