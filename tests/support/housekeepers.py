@@ -37,9 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from ros2_memory.retention.collect import Outliving
     from ros2_memory.storage.base import BagReader, BagWriter
-    from ros2_memory.triggers.screening import Screening
 
 PLENTY = 10**15
 HOUR = 3600 * NS_PER_S
@@ -58,46 +56,37 @@ def keeper_of(
     *,
     max_bytes: int = PLENTY,
     max_age_h: float = 10**6,
+    min_free_bytes: int = 0,
+    keeps_foreign: bool = False,
+    require_shipped: bool = False,
     clock: Clock | None = None,
     reader: BagReader | None = None,
     writer: BagWriter | None = None,
-    grace_s: float = 0.0,
-    moments_bytes: int = PLENTY,
-    monotonic: Callable[[], float] = time.monotonic,
-    measure_free: Callable[[Path], int] = lambda _: PLENTY,
-    is_synchronised: Callable[[], bool] = lambda: True,
-    keeps_foreign: bool = False,
-    require_shipped: bool = False,
-    screening: Screening | None = None,
-    memory: Outliving | None = None,
-    background: Background | None = None,
+    **how: Any,
 ) -> Housekeeping:
     """A housekeeper, mostly of all bags, its own or not (retention.foreign=delete).
 
     Its clock is right, and an hour later unless one is given.
     """
+    limits = RetentionLimits(
+        max_bytes, round(max_age_h * HOUR), min_free_bytes, keeps_foreign, require_shipped
+    )
+    given: dict[str, Any] = {
+        "is_synchronised": lambda: True,
+        "split_duration_s": 10.0,
+        "own": OwnRecordings(bag_dir),
+        "moments_bytes": PLENTY,
+        "static_topics": ("/tf_static",),
+        "measure_free": lambda _: PLENTY,
+        "background": Direct(),
+    }
     return Housekeeping(
         bag_dir,
         BagDirReader(reader or McapReader()),
         writer or McapWriter(),
         clock or later(),
-        RetentionLimits(
-            max_bytes,
-            round(max_age_h * HOUR),
-            keeps_foreign=keeps_foreign,
-            require_shipped=require_shipped,
-        ),
-        is_synchronised=is_synchronised,
-        split_duration_s=10.0,
-        own=OwnRecordings(bag_dir),
-        moments_bytes=moments_bytes,
-        screening=screening,
-        static_topics=("/tf_static",),
-        grace_s=grace_s,
-        monotonic=monotonic,
-        measure_free=measure_free,
-        memory=memory,
-        background=background or Direct(),
+        limits,
+        **given | how,
     )
 
 

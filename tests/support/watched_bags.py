@@ -17,14 +17,12 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord
 from ros2_memory.core.directories import identity_of
 from ros2_memory.recorder.housekeeping import Housekeeping
-from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.rules import Rule, SplitSearch
 from ros2_memory.triggers.watch import Triggers
 from tests.support.bags import Msg, boolean, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import Direct
+from tests.support.housekeepers import keeper_of
 from tests.support.memories import shipped_extractor
 
 if TYPE_CHECKING:
@@ -91,21 +89,11 @@ class WatchedBags:
         """A housekeeper as a recorder that starts anew has one."""
         reader = BagDirReader(McapReader())
         search = SplitSearch(reader, shipped_extractor(), self.rules, monotonic=lambda: self.now_s)
-        limits = RetentionLimits(
-            self.limits.get("max_bytes", PLENTY),
-            round(self.limits.get("max_age_h", 10**4) * 3600 * S),
-        )
-        return Housekeeping(
+        return keeper_of(
             self.bag_dir,
-            reader,
-            McapWriter(),
-            self.clock,
-            limits,
-            is_synchronised=lambda: True,
-            split_duration_s=10.0,
+            clock=self.clock,
+            keeps_foreign=True,
             own=self.own,
-            background=Direct(),
-            moments_bytes=self.limits.get("moments_bytes", PLENTY),
             rule_bytes={each.name: each.max_bytes for each in self.rules},
             watch=lambda moments: Triggers(
                 self.bag_dir,
@@ -117,7 +105,7 @@ class WatchedBags:
                 split_duration_s=10.0,
                 is_recorded=lambda topic: topic not in self.unrecorded,
             ),
-            measure_free=lambda _: PLENTY,
+            **self.limits,
         )
 
     def beat(self, *live: str, state: RecorderState = RecorderState.RECORDING) -> None:

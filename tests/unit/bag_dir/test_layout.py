@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from ros2_memory.bag_dir.layout import (
     has_own_name,
-    node_name,
     recording_name,
 )
 from ros2_memory.core.timebase import NS_PER_S
@@ -26,10 +24,3 @@ def test_a_name_that_is_taken_gets_a_number(tmp_path: Path) -> None:
     for path in tmp_path.iterdir():
         assert has_own_name(path.name)
         assert not has_own_name(f"{path.name}_x")
-
-
-def test_each_recording_has_a_node_of_its_own_with_a_valid_name(tmp_path: Path) -> None:
-    (tmp_path / recording_name(NOW, tmp_path)).mkdir()
-    names = [node_name("rec_20261120T050000Z"), node_name(recording_name(NOW, tmp_path))]
-    assert len(set(names)) == 2
-    assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) for name in names)

@@ -32,15 +32,6 @@ def refusal(bag_dir: Path, patience_s: float = 0.0) -> str:
     return str(caught.value)
 
 
-def test_a_second_recorder_is_refused_at_once_and_told_who_holds_it(tmp_path: Path) -> None:
-    holder = {"pid": os.getppid(), "host": socket.gethostname()}
-    descriptor = held_by(tmp_path, json.dumps(holder))
-    sentence = refusal(tmp_path, patience_s=3600)
-    os.close(descriptor)
-    assert f"process {os.getppid()} on {socket.gethostname()}" in sentence
-    assert str(tmp_path) in sentence
-
-
 def test_a_holder_on_another_machine_counts_as_alive(tmp_path: Path) -> None:
     descriptor = held_by(tmp_path, json.dumps({"pid": 1, "host": "another-robot"}))
     assert "process 1 on another-robot" in refusal(tmp_path, patience_s=3600)

@@ -5,14 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.policies import Backoff, ClockReading, SilenceWatch, set_back
-
-
-class TestBackoff:
-    def test_doubles_up_to_its_cap(self) -> None:
-        backoff = Backoff()
-        waits = [backoff.failed() for _ in range(9)]
-        assert waits == [1, 2, 4, 8, 16, 32, 60, 60, 60]
+from ros2_memory.recorder.policies import ClockReading, SilenceWatch, set_back
 
 
 def silent_at(watch: SilenceWatch, written: dict[float, int], until_s: float) -> float | None:

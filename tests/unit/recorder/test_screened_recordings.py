@@ -6,41 +6,25 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE
 from ros2_memory.bag_dir.state_files import SCREENED, read_withheld
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.background import Background
 from ros2_memory.storage.mcap.writer import McapWriter
-from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.triggers.screening import Screening
 from tests.support.bags import McapLayout
 from tests.support.fakes import failing
 from tests.support.housekeepers import background_keeper_of, keeper_of, recording_now
-from tests.support.memories import shipped_extractor
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, privacy, words
 from tests.support.simulated_recorders import World, assert_each_counts_once
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.triggers.exclusion import ExclusionRule
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
 OPEN = McapLayout(latched=frozenset({"/privacy_mode"}), finish=False, chunk_size=400)
-
-
-def screening_of(bag_dir: Path, rule: ExclusionRule) -> Screening:
-    return Screening(
-        bag_dir,
-        [rule],
-        BagDirReader(McapReader(), bag_dir, every_message=True),
-        shipped_extractor(),
-        McapWriter(),
-        split_duration_s=5.0,
-    )
 
 
 class TestSessions:
@@ -48,9 +32,8 @@ class TestSessions:
     def test_over_rotations_what_is_not_excluded_counts_once(
         self, tmp_path: Path, unknown: bool
     ) -> None:
-        house = keeper_of(
-            tmp_path, screening=screening_of(tmp_path, privacy(excludes_unknown=unknown))
-        )
+        bags = ScreenedBags(tmp_path, privacy(excludes_unknown=unknown))
+        house = keeper_of(tmp_path, screening=bags.screening)
         world = World(tmp_path, housekeeper=house, session_duration_s=20).started()
         for _ in range(12):
             world.run(5)
@@ -73,7 +56,7 @@ class TestSessions:
     def test_a_recording_that_cannot_be_held_back_does_not_begin(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        house = keeper_of(tmp_path, screening=screening_of(tmp_path, privacy()))
+        house = keeper_of(tmp_path, screening=ScreenedBags(tmp_path).screening)
         world = World(tmp_path, housekeeper=house, session_duration_s=20).started(15)
         with monkeypatch.context() as patched:
             patched.setattr(SCREENED, "write", failing())

@@ -8,21 +8,14 @@ import pytest
 
 from ros2_memory.recorder.session import SplitChanges, Splits
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, boolean, write_mcap
+from tests.support.bags import boolean, write_mcap
 
 T0 = 1_795_150_800 * 10**9
-OPEN = McapLayout(chunk_size=None, finish=False)
 
 
 @pytest.fixture
 def splits(tmp_path: Path) -> Splits:
     return Splits(tmp_path / "rec_1", McapReader())
-
-
-def write(splits: Splits, number: int, *topics: str, finish: bool = True) -> None:
-    layout = McapLayout() if finish else OPEN
-    messages = [boolean(T0 + n, True, topic) for n, topic in enumerate(topics)]
-    write_mcap(splits.directory / f"rec_1_{number}.mcap", messages, layout)
 
 
 def test_splits_that_close_at_once_are_reported_in_the_order_of_recording(splits: Splits) -> None:
@@ -34,10 +27,10 @@ def test_splits_that_close_at_once_are_reported_in_the_order_of_recording(splits
 
 
 def test_bytes_written_never_shrink_though_splits_are_deleted(splits: Splits) -> None:
-    write(splits, 0, "/a", "/b")
+    path = write_mcap(splits.directory / "rec_1_0.mcap", [boolean(T0, True)])
     splits.observe(0)
     before = splits.bytes_written
-    (splits.directory / "rec_1_0.mcap").unlink()
+    path.unlink()
     splits.observe(1)
     assert splits.bytes_written == before > 0
     assert splits.names() == {"rec_1_0.mcap"}

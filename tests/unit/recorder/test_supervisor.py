@@ -70,13 +70,6 @@ class TestRotation:
         world.supervisor.tick()
         assert len(world.recorders) == recordings
 
-    def test_no_message_is_lost_or_counts_twice(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20).started(75)
-        world.supervisor.stop()
-        assert (len(world.recorders), world.heartbeat()["restarts"]) == (4, 0)
-        assert sum(world.published(counting=False).values()) > len(world.published(counting=False))
-        assert_each_counts_once(world)
-
     def test_a_topic_that_appears_while_both_record_is_waited_for_again(
         self, tmp_path: Path
     ) -> None:
@@ -157,7 +150,7 @@ class TestStop:
 
     @pytest.mark.parametrize("killed", ["old", "new", "all"])
     @pytest.mark.parametrize("obeys_after", [1, 8])
-    @pytest.mark.parametrize("after_s", [21.25, 22.5, 25.0, 26.25, 27.5])
+    @pytest.mark.parametrize("after_s", [20.5, 21.25, 22.5, 24.0, 25.0, 26.25, 27.5])
     def test_kills_at_any_moment_of_a_handover_lose_and_double_nothing(
         self, tmp_path: Path, after_s: float, obeys_after: int, killed: str
     ) -> None:
@@ -211,14 +204,6 @@ class TestMessagesOfOneRecordingAlone:
         world = World(tmp_path, session_duration_s=20).started(20 - deaf_s)
         world.recorders[0].deaf = True
         world.run(deaf_s + 15)
-        world.supervisor.stop()
-        assert_what_stands_counts_once(world)
-
-    @pytest.mark.parametrize("after_s", [20.5, 21.0, 21.75, 22.0, 24.5, 26.0, 26.5])
-    def test_a_stop_amid_a_rotation_hides_nothing(self, tmp_path: Path, after_s: float) -> None:
-        world = World(tmp_path, session_duration_s=20).started(after_s - 0.5)
-        world.recorders[0].deaf = True
-        world.run(0.5)
         world.supervisor.stop()
         assert_what_stands_counts_once(world)
 

@@ -109,29 +109,6 @@ class TestDeath:
         assert len(world.recorders) == 3
         assert_each_counts_once(world)
 
-    @pytest.mark.parametrize("after_s", [21.25, 21.75, 24.0, 26.0])
-    def test_an_old_one_that_dies_in_a_handover_counts_as_far_as_it_reaches(
-        self, tmp_path: Path, after_s: float
-    ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(after_s)
-        old, new = world.recorders
-        old.die()
-        world.run(12)
-        assert new.status is None
-        assert world.supervisor.is_recording
-        world.supervisor.stop()
-        assert_what_stands_counts_once(world)
-
-    @pytest.mark.parametrize("after_s", [20.5, 21.0, 21.75, 24.0, 26.25, 26.75, 27.0])
-    def test_after_a_crash_of_everything_the_next_start_settles_the_handover(
-        self, tmp_path: Path, after_s: float
-    ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(after_s)
-        for recorder in world.running:
-            recorder.die()
-        World(tmp_path).started(0.25)
-        assert_what_stands_counts_once(world)
-
     def test_where_the_disk_does_not_list_what_is_there_it_is_settled_later(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

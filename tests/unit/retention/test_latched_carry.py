@@ -27,11 +27,10 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import copied, files_in, keeper_of, reader_of_both
+from tests.support.housekeepers import files_in, keeper_of, reader_of_both
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 from tests.support.noting_reader import fail_reading
-from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -230,18 +229,6 @@ class TestTheBagOfCarriedMessages:
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
         assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
 
-    @needs_recorded
-    def test_a_real_recording_looks_its_frames_up_as_before(self, tmp_path: Path) -> None:
-        copied(RECORDED / "session_mcap", tmp_path / "session_mcap")
-        memory = memory_of(tmp_path)
-        latest = memory.index.snapshot().latest
-        assert latest is not None
-        moments = [latest - S, latest - 3 * S]
-        before = [looked_up(memory, moment) for moment in moments]
-        keep_only(tmp_path, "session_mcap/session_mcap_6.mcap")
-        assert [looked_up(memory, moment) for moment in moments] == before
-        assert held(memory, "/tf_static", latest)[0] < latest - 50 * S  # type: ignore[operator]
-
     def test_a_bag_stays_while_the_disk_fails_to_give_its_latched_messages(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -326,10 +313,6 @@ class TestTheBagOfCarriedMessages:
         assert (tmp_path / "rec/rec_1.mcap").exists()
         keep_only(tmp_path, "rec/rec_3.mcap")
         assert [each.log_time for each in records(tmp_path)] == [T0, T0 + 10 * S]
-
-
-def looked_up(memory: Memory, moment: int) -> object:
-    return queries.transform(memory, Call(), "odom", "laser", at(moment)).transform
 
 
 def records(bag_dir: Path) -> list[Record]:

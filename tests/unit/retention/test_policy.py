@@ -103,17 +103,6 @@ class TestAge:
         going = by_hours(plan, held)
         assert plan.newest not in {each.path for each in going}
 
-    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
-        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
-        assert expired(contents(*before, after), LIMITS) == ()
-
-    def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
-        ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
-        boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
-        fresh = bag("fresh", 60 * S, written=NOW - HOUR)
-        deleted = expired(contents(ahead, boot, fresh, *hourly(172)), LIMITS)
-        assert names(deleted) == ["boot", "h171", "ahead", "h170", "h169"]
-
     def test_a_bag_without_messages_does_not_age_others_and_goes_with_its_time(self) -> None:
         old = bag("empty", None, written=NOW - 170 * HOUR + 1)
         deleted = expired(contents(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)
@@ -253,16 +242,6 @@ class TestAlways:
         left = without(held, expired(held, limits)).bags
         assert bool(left) == bool(held.bags)
         assert any(each.has_dates for each in left) == any(each.has_dates for each in held.bags)
-
-    @given(stocks(), all_limits)
-    def test_no_more_is_deleted_than_needed(
-        self, held: DirContents, limits: RetentionLimits
-    ) -> None:
-        aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
-        deleted = [each for each in expired(held, limits) if each not in aged]
-        if deleted:
-            spared = [each for each in deleted if each.files != deleted[-1].files]
-            assert not fits(without(held, [*aged, *spared]), limits)
 
     @given(stocks(), all_limits)
     def test_the_order_of_what_is_known_does_not_matter(

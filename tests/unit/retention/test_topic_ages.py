@@ -15,7 +15,6 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
 from ros2_memory.bag_dir.metadata_yaml import correct
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import (
     SHIPPED,
     Receipt,
@@ -28,7 +27,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention import repair
-from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.retention.topic_ages import PATIENCE_S, TopicAge, TopicCutter
 from ros2_memory.storage.base import BagWriter
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -36,7 +34,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.fakes import failing
-from tests.support.housekeepers import HOUR, Direct, own_all
+from tests.support.housekeepers import HOUR, keeper_of, own_all
 from tests.support.memories import reply_over
 
 S = NS_PER_S
@@ -80,25 +78,9 @@ def cutter_of(
     )
 
 
-def house(
-    bag_dir: Path, cutter: TopicCutter, *, require_shipped: bool = False, synchronised: bool = True
-) -> Housekeeping:
-    limits = RetentionLimits(
-        PLENTY, 168 * HOUR, min_free_bytes=1000, require_shipped=require_shipped
-    )
-    return Housekeeping(
-        bag_dir,
-        BagDirReader(McapReader()),
-        McapWriter(),
-        SettableClock(NOW),
-        limits,
-        is_synchronised=lambda: synchronised,
-        split_duration_s=10.0,
-        own=OwnRecordings(bag_dir),
-        static_topics=("/tf_static",),
-        cutter=cutter,
-        background=Direct(),
-    )
+def house(bag_dir: Path, cutter: TopicCutter, **how: Any) -> Housekeeping:
+    limits: dict[str, Any] = {"max_age_h": 168, "min_free_bytes": 1000, "keeps_foreign": True}
+    return keeper_of(bag_dir, clock=SettableClock(NOW), cutter=cutter, **limits, **how)
 
 
 def counts_of(path: Path) -> dict[str, int]:
@@ -178,10 +160,11 @@ def test_latched_topics_moments_and_foreign_bags_stay(bag_dir: Path, tmp_path: P
     ids=["busy", "the disk is short", "the clock may be wrong", "messages are forgotten"],
 )
 def test_nothing_is_cut_while(bag_dir: Path, why: dict[str, Any]) -> None:
-    synchronised = why.pop("synchronised", True)
+    is_synchronised = why.pop("synchronised", True)
     if why.pop("erasing", False):
         (bag_dir / ERASING_FILE).write_text("{}")
-    house(bag_dir, cutter_of(bag_dir, **why), synchronised=synchronised).apply()
+    cutter = cutter_of(bag_dir, **why)
+    house(bag_dir, cutter, is_synchronised=lambda: is_synchronised).apply()
     assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
     assert not (bag_dir / EXPIRED_FILE).exists()
 

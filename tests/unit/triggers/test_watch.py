@@ -367,25 +367,6 @@ def test_messages_that_cannot_be_decoded_are_named(robot: WatchedBags) -> None:
     assert "/bumper" in (robot.record().problem or "")
 
 
-def test_a_kill_between_moment_and_state_doubles_nothing(
-    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot.begin(T0)
-    robot.split(seconds(0, 30, {6, 9, 20}))
-    robot.clock.at = T0 + 60 * S
-
-    robot.beat(state=RecorderState.STOPPED)
-    with monkeypatch.context() as broken:
-        broken.setattr(TRIGGERS, "write", Mock(side_effect=SystemExit))
-        with pytest.raises(SystemExit):
-            robot.look()
-    assert len(robot.moments()) == 2
-    robot.house = robot.new_house()
-    robot.look()
-    assert robot.spans() == [(1, 12), (15, 23)]
-    assert (robot.record().fired, robot.record().moments) == (3, 2)
-
-
 def test_what_was_published_by_a_clock_that_was_ahead_makes_nothing_a_repeat(
     tmp_path: Path,
 ) -> None:
