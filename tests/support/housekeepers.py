@@ -29,7 +29,6 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
 
@@ -88,16 +87,6 @@ def keeper_of(
         limits,
         **given | how,
     )
-
-
-def background_keeper_of(bag_dir: Path, **limits: Any) -> Housekeeping:
-    """The same housekeeper, whose tasks run in threads."""
-    return keeper_of(bag_dir, background=Background(), **limits)
-
-
-def reader_of_both() -> BagReader:
-    """Reads either plugin's files."""
-    return Rosbag2Reader()
 
 
 def later(seconds: int = 3600) -> SettableClock:
@@ -202,7 +191,6 @@ def embedding(path: Path, *, start: int = 1_790_000_000 * S, size: int = 20) -> 
     return path
 
 
-S = 10**9
 T0 = 1_790_000_000 * S
 NOW = T0 + 4 * 3600 * S
 A, B = "rec_20260921T101320Z", "rec_20260921T102320Z"

@@ -283,6 +283,11 @@ class World:
         return found
 
 
+def rotating(bag_dir: Path, run_s: float = 0.0, **given: Any) -> World:
+    """A world that has run for some time, whose recordings are over after 20 s."""
+    return World(bag_dir, session_duration_s=20, **given).started(run_s)
+
+
 def events(logs: list[MutableMapping[str, Any]], name: str) -> list[MutableMapping[str, Any]]:
     return [each for each in logs if each["event"] == name]
 

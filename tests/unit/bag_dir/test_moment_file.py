@@ -101,18 +101,7 @@ class TestMomentFiles:
             "[" * 100_000,
             '{"format": 2}',
             '{"format": 1}',
-            json.dumps(
-                {
-                    "format": 1,
-                    "request": NUMBER,
-                    "label": "a",
-                    "start_ns": 5,
-                    "end_ns": 4,
-                    "requested_ns": 5,
-                    "pending": False,
-                    "missing": [],
-                }
-            ),
+            json.dumps({**request().to_json(), "end_ns": 4, "pending": False, "missing": []}),
         ],
     )
     def test_what_says_something_else_is_no_moment(self, tmp_path: Path, text: str) -> None:
@@ -188,26 +177,8 @@ def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
         "x" * 5000,
         "{}",
         json.dumps({"format": 1, "request": "../../etc", "label": "x"}),
-        json.dumps(
-            {
-                "format": 1,
-                "request": "f" * 32,  # another's
-                "label": "x",
-                "start_ns": T0,
-                "end_ns": T0,
-                "requested_ns": T0,
-            }
-        ),
-        json.dumps(
-            {
-                "format": 1,
-                "request": NUMBER,
-                "label": "two\nlines",
-                "start_ns": T0,
-                "end_ns": T0,
-                "requested_ns": T0,
-            }
-        ),
+        json.dumps(request(number="f" * 32).to_json()),  # another's
+        json.dumps({**request().to_json(), "label": "two\nlines"}),
     ],
 )
 def test_what_is_no_request_is_told_and_dropped(tmp_path: Path, text: str) -> None:

@@ -27,10 +27,9 @@ from tests.support.examples import examples
 from tests.support.fakes import failing
 from tests.support.housekeepers import embedding, lines, made_moment, own_all
 from tests.support.log_lines import with_checks
-from tests.support.simulated_recorders import World
+from tests.support.simulated_recorders import World, events, rotating
 
 if TYPE_CHECKING:
-    from collections.abc import MutableMapping
     from pathlib import Path
 
 A, B, C = "rec_20260921T101320Z", "rec_20260921T102320Z", "rec_20260921T103320Z"
@@ -66,12 +65,6 @@ def restored(folder: Path) -> None:
     shutil.rmtree(aside)
 
 
-def events_named(
-    logs: list[MutableMapping[str, Any]], event: str
-) -> list[MutableMapping[str, Any]]:
-    return [each for each in logs if each["event"] == event]
-
-
 def test_a_disk_that_only_root_may_open_a_part_of_is_looked_through(tmp_path: Path) -> None:
     for folder in ("rec", "lost+found", ".hidden"):
         (tmp_path / folder).mkdir()
@@ -103,7 +96,7 @@ class TestWhatARecorderLists:
     def test_a_list_that_is_deleted_while_recording_is_written_again_whole(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(5)
+        world = rotating(tmp_path, 5)
         shutil.rmtree(tmp_path / ".episodic")
         world.run(40)
         world.supervisor.stop()
@@ -167,7 +160,7 @@ class TestWhatAKillLeaves:
         named_in_heartbeat(tmp_path)
         with structlog.testing.capture_logs() as logs:
             assert not claimed(tmp_path).owns(tmp_path / A)
-        [event] = events_named(logs, "recording_not_claimed")
+        [event] = events(logs, "recording_not_claimed")
         assert event["recording"] == A
         assert "ros2-memory adopt" in event["reason"]
 
@@ -218,7 +211,7 @@ class TestWhatAKillLeaves:
             stream.write(with_checks(json.dumps(line)))
         with structlog.testing.capture_logs() as logs:
             assert not OwnRecordings(tmp_path).names()
-        assert events_named(logs, "recordings_list_damaged")
+        assert events(logs, "recordings_list_damaged")
 
     def test_a_list_that_cannot_be_written_is_known_all_the_same(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -229,7 +222,7 @@ class TestWhatAKillLeaves:
         with monkeypatch.context() as patch, structlog.testing.capture_logs() as logs:
             patch.setattr(own_recordings, "write_durably", failing())
             own.claim()
-            assert events_named(logs, "recordings_not_listed")
+            assert events(logs, "recordings_not_listed")
             assert own.owns(tmp_path / A)
             patch.setattr(own_recordings, "append_lines", failing())
             with pytest.raises(RecorderError, match="No space left"):
@@ -291,7 +284,7 @@ class TestWithoutAList:
         with structlog.testing.capture_logs() as logs:
             own = claimed(tmp_path)
         assert not own.names()
-        [event] = events_named(logs, "recordings_not_adopted")
+        [event] = events(logs, "recordings_not_adopted")
         assert (event["log_level"], event["recordings"], event["names"]) == ("warning", 2, [A, B])
         assert "ros2-memory adopt" in event["advice"]
 

@@ -163,6 +163,21 @@ def messages_in(path: Path) -> list[Record]:
     return list(reader.records(path, topics, TimeWindow.everything()))
 
 
+def record(bag_dir: Path, messages: Iterable[Msg]) -> Path:
+    """A split with these messages, in order of time."""
+    ordered = sorted(messages, key=lambda each: each.log_time)
+    return write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", ordered)
+
+
+def of_topic(bag_dir: Path, topic: str) -> list[Record]:
+    """What the day has of a topic."""
+    return [one for one in messages_in(bag_dir / DAY_FILE) if one.channel.topic == topic]
+
+
+def bags_left(bag_dir: Path, name: str = "rec_A") -> int:
+    return len([*bag_dir.glob(f"{name}/*.mcap")])
+
+
 def topics_in(bag_dir: Path) -> Counter[str]:
     return Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
 
@@ -228,7 +243,7 @@ def test_people_are_looked_for_in_frames_topics_and_numbers(bag_dir: Path) -> No
         tf(T0, transform(T0, "map", "child", (0.1, 0, 0.3)), topic="/tf_static"),
         *(boolean(each, each % 2 == 0, topic="/face/is_seen") for each in at),
     ]
-    write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", sorted(messages, key=lambda one: one.log_time))
+    record(bag_dir, messages)
     keep_all(bag_dir)
     reader = McapReader()
     stays = [(one.channel.topic, reader.decode(one)) for one in messages_in(bag_dir / DAY_FILE)]
@@ -254,17 +269,13 @@ def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> No
         for n in range(30)
     ]
     states = [goals(begin + n * S // 2, {1: 2 if n < 21 else 4}) for n in range(60)]
-    both = sorted([*spectrum, *states], key=lambda one: one.log_time)
-    write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", both)
+    record(bag_dir, [*spectrum, *states])
     keep_all(bag_dir)
-    found = {
-        (one.log_time - begin) / S
-        for one in messages_in(bag_dir / DAY_FILE)
-        if one.channel.topic == "/drive/_action/status"
-    }
+    status = "/drive/_action/status"
+    found = {(one.log_time - begin) / S for one in of_topic(bag_dir, status)}
     assert found >= {10.0, 10.5}
     assert len(found) < 20
-    assert {*topics_in(bag_dir)} == {"/drive/_action/status"}
+    assert {*topics_in(bag_dir)} == {status}
 
 
 def test_days_that_nobody_wants_go_after_a_day_of_running_and_not_before(bag_dir: Path) -> None:
@@ -498,7 +509,7 @@ def test_a_kill_at_any_step_counts_no_message_twice_and_loses_none(
     assert poses_in(bag_dir) == undisturbed.thinned
     for name in ("memory/20260921.thinned.mcap", "memory/20260922.thinned.mcap"):
         assert messages_in(bag_dir / name) == messages_in(undisturbed.after / name)
-    assert not [*bag_dir.glob("rec_A/*.mcap")]
+    assert not bags_left(bag_dir)
 
 
 @pytest.mark.parametrize("after", [0, 50])
@@ -580,11 +591,10 @@ def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
     assert path.stat().st_ino == thinned
     split(bag_dir, 60, name="rec_B")
     keep_all(bag_dir, "rec_B")
-    before = [one.log_time for one in messages_in(path) if one.channel.topic == "/battery_state"]
+    before = topics_in(bag_dir)["/battery_state"]
     days_of(bag_dir).limit(now)
-    after = [one.log_time for one in messages_in(path) if one.channel.topic == "/battery_state"]
-    assert len(after) < len(before)
-    assert len({*after}) == len(after)
+    after = [one.log_time for one in of_topic(bag_dir, "/battery_state")]
+    assert len({*after}) == len(after) < before
 
 
 def test_a_damaged_day_is_not_thinned_so_that_it_still_says_so(bag_dir: Path) -> None:
@@ -649,10 +659,10 @@ def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_di
         monotonic=lambda: monotonic.now() / S,
     )
     keeper.apply()
-    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 8
+    assert bags_left(bag_dir) == 8
     monotonic.at = 90_000 * S
     keeper.apply()
-    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 4
+    assert bags_left(bag_dir) == 4
 
 
 def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_dir: Path) -> None:
@@ -663,7 +673,7 @@ def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_di
     memory = days_of(bag_dir, writer=Failing(0))
     max_bytes = sum(sizes) - min(sizes) // 2
     house(bag_dir, T0 + 7300 * S, max_bytes=max_bytes, memory=memory).apply()
-    assert len([*bag_dir.glob("rec_*/*.mcap")]) == 10
+    assert bags_left(bag_dir, "rec_*") == 10
 
 
 def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
@@ -671,7 +681,7 @@ def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
 ) -> None:
     class FullAtFirst(McapWriter):
         def write(self, path: Path, records, **how) -> None:  # type: ignore[no-untyped-def]
-            if len([*bag_dir.glob("rec_*/*.mcap")]) == 11:
+            if bags_left(bag_dir, "rec_*") == 11:
                 raise OSError(errno.ENOSPC, "No space left on device")
             super().write(path, records, **how)
 
@@ -682,7 +692,7 @@ def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
     with structlog.testing.capture_logs() as logs:
         house(bag_dir, T0 + 7300 * S, max_bytes=1, memory=memory).apply()
     assert [log["lost"] for log in logs if log["event"] == "memory_not_kept"] == [2]
-    assert len([*bag_dir.glob("rec_*/*.mcap")]) == 1
+    assert bags_left(bag_dir, "rec_*") == 1
     assert {int(one.log_time - T0) // (60 * S) for one in messages_in(bag_dir / DAY_FILE)} == {
         *range(2, 10)
     }
@@ -702,11 +712,11 @@ def test_age_waits_while_the_disk_fails_and_then_all_of_it_stays(bag_dir: Path, 
     with pytest.MonkeyPatch.context() as patched:
         fail_reading(patched, way, unreachable)
         keeper.apply()
-    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 1
-    assert not [*bag_dir.glob("memory/*.mcap")]
+    assert bags_left(bag_dir) == 1
+    assert not days_in(bag_dir)
     keeper.apply()
-    assert not [*bag_dir.glob("rec_A/*.mcap")]
-    assert len([*bag_dir.glob("memory/*.mcap")]) == 1
+    assert not bags_left(bag_dir)
+    assert len(days_in(bag_dir)) == 1
 
 
 @pytest.mark.parametrize("way", ["records", "batches"])
@@ -726,11 +736,11 @@ def test_what_the_disk_never_gives_holds_others_for_two_days_at_most(
     memory = days_of(bag_dir, monotonic=monotonic)
     keeper = house(bag_dir, T0 + 72_700 * S, max_age_h=12, memory=memory, monotonic=monotonic)
     keeper.apply()
-    assert not [*bag_dir.glob("memory/*.mcap")]
+    assert not days_in(bag_dir)
     # A day for its latched messages, then one for what stays of it.
     for clock.at in range(0, 172_802 * S, 3600 * S):
         keeper.apply()
-    assert not [*bag_dir.glob("rec_[AC]/*.mcap")]
+    assert not bags_left(bag_dir, "rec_[AC]")
     [day] = bag_dir.glob("memory/*.mcap")
     assert McapReader().summarize(day).start >= T0 + 600 * S
 
@@ -772,7 +782,7 @@ def delete_all(bag_dir: Path) -> None:
     """As retention does it, by age."""
     for _ in range(3):
         house(bag_dir, T0 + (29 * 3600 + 60) * S, max_age_h=24, memory=days_of(bag_dir)).apply()
-    assert not [*bag_dir.glob("rec_A/*.mcap")]
+    assert not bags_left(bag_dir)
 
 
 def test_a_silence_is_forgotten_with_its_topic(
@@ -873,10 +883,9 @@ def test_without_hidden_joints_others_keep_their_own_values(
     none = np.zeros(0)
     body = make(kind, header=header(T0, "1"), name=names, position=at, velocity=none, effort=none)
     seen = [detections(T0 + nth * S, ("0", "mug")) for nth in range(3)]
-    messages = [Msg("/joint_states", kind, T0, body), *seen]
-    write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", messages)
+    record(bag_dir, [Msg("/joint_states", kind, T0, body), *seen])
     keep_all(bag_dir)
-    [found] = [one for one in messages_in(bag_dir / DAY_FILE) if one.channel.type == kind]
+    [found] = of_topic(bag_dir, "/joint_states")
     message: Any = McapReader().decode(found)
     assert message.name == kept
     left = [each for each, name in zip(at, names, strict=True) if name in kept]
@@ -889,10 +898,9 @@ def test_of_a_latched_message_only_the_hidden_frame_goes(bag_dir: Path) -> None:
     at = [T0 + n * S for n in range(10)]
     frames = ("base_link", "person_1", "2")
     exact = tf(T0, *(transform(T0, "map", each, (0.123456789, 0, 0)) for each in frames))
-    messages = [replace(exact, topic="/tf_static"), *(odom(each, 1.0, 2.0) for each in at)]
-    write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", messages)
+    record(bag_dir, [replace(exact, topic="/tf_static"), *(odom(each, 1.0, 2.0) for each in at)])
     keep_all(bag_dir)
-    [kept] = [one for one in messages_in(bag_dir / DAY_FILE) if one.channel.topic == "/tf_static"]
+    [kept] = of_topic(bag_dir, "/tf_static")
     message: Any = McapReader().decode(kept)
     assert [each.child_frame_id for each in message.transforms] == ["base_link", "2"]
     assert {each.transform.translation.x for each in message.transforms} == {0.123456789}

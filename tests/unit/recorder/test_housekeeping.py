@@ -18,19 +18,19 @@ from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.delete import remove_bag
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.fakes import failing
 from tests.support.housekeepers import (
     PLENTY,
-    background_keeper_of,
     files_in,
     keeper_of,
     later,
-    reader_of_both,
     recording_now,
     size_of,
 )
@@ -185,7 +185,7 @@ class TestRetention:
         first, *_ = recording(tmp_path, "a", 0)
         packed = zstandard.compress(first.read_bytes())
         first.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
-        keeper_of(tmp_path, max_bytes=30_000, reader=reader_of_both()).apply()
+        keeper_of(tmp_path, max_bytes=30_000, reader=Rosbag2Reader()).apply()
         assert not first.exists()
         assert not first.with_name("a_0.mcap.zstd").exists()
 
@@ -195,7 +195,7 @@ class TestRetention:
         first.with_name("a_0.db3-shm").write_bytes(b"")
         first.with_name("a_1.db3-shm").write_bytes(b"")
         bag(tmp_path / "b/b_0.mcap", 100)
-        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply()
+        keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
         assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
 
 
@@ -335,21 +335,6 @@ class TestMakingRoom:
         assert 0 < told["most_free_bytes"] < told["free_bytes_wanted"] == PLENTY
         assert not events(logs, "budget_not_held")
 
-    def test_what_another_pass_finds_meanwhile_is_not_taken_for_its_own(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        recording(tmp_path, "a", 0)
-        keeper = keeper_of(tmp_path, measure_free=lambda _: 0)
-
-        def meanwhile(*_: object) -> None:
-            monkeypatch.undo()
-            keeper.apply()
-
-        monkeypatch.setattr(Housekeeping, "_report", meanwhile)
-        with structlog.testing.capture_logs() as logs:
-            keeper.make_room(PLENTY)
-        assert len(events(logs, "room_out_of_reach")) == 1
-
 
 class TestInTheBackground:
     def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
@@ -360,7 +345,7 @@ class TestInTheBackground:
             asked.append(held.wait(30))
             return 0
 
-        keeper = background_keeper_of(tmp_path, measure_free=measured)
+        keeper = keeper_of(tmp_path, background=Background(), measure_free=measured)
         keeper.make_room(1)
         keeper.make_room(1)
         assert keeper.is_making_room()

@@ -25,6 +25,7 @@ from ros2_memory.recorder.reception import (
     ASKED_FOR,
     DEEPEN_EVERY_S,
     Reception,
+    Rotation,
     newest_splits,
     plan_queues,
 )
@@ -57,16 +58,21 @@ def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
     return found
 
 
+def rotated(of: Reception, recording: str, now_s: float) -> Rotation:
+    """The reason for which a recording is rotated then."""
+    due = of.rotation_due(recording, now_s)
+    assert due is not None
+    of.rotation_begun(due, now_s)
+    return due
+
+
 def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: Path) -> None:
     made = reception(tmp_path)
     assert profiles(made, "a").keys() == {"/tf_static"}
     assert made.rotation_due("a", 0.0) is None
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
-    rotation = made.rotation_due("a", 10.0)
-    assert rotation is not None
-    assert rotation.event == "queues_deepened"
-    assert rotation.topics == {"/odom"}
-    made.rotation_begun(rotation, 10.0)
+    rotation = rotated(made, "a", 10.0)
+    assert (rotation.event, rotation.topics) == ("queues_deepened", {"/odom"})
     assert profiles(made, "b")["/odom"]["depth"] == 200
     made.learn("b", split(tmp_path / "b_0.mcap", 50, 4))
     assert made.rotation_due("b", 1000.0) is None
@@ -76,15 +82,11 @@ def test_topics_that_come_one_by_one_do_not_rotate_one_by_one(tmp_path: Path) ->
     made = reception(tmp_path)
     made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
-    rotation = made.rotation_due("a", 10.0)
-    assert rotation is not None
-    made.rotation_begun(rotation, 10.0)
+    rotated(made, "a", 10.0)
     made.overrides("b")
     made.learn("b", split(tmp_path / "b_0.mcap", 50, 4, topic="/late"))
     assert made.rotation_due("b", 10.0 + DEEPEN_EVERY_S - 1) is None
-    later = made.rotation_due("b", 10.0 + DEEPEN_EVERY_S)
-    assert later is not None
-    assert later.topics == {"/late"}
+    assert rotated(made, "b", 10.0 + DEEPEN_EVERY_S).topics == {"/late"}
 
 
 def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_path: Path) -> None:
@@ -94,11 +96,8 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     made.refused("a", "/odom")
     # The recording that refused it still states what the other publishers offered.
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
-    rotation = made.rotation_due("a", 50.0)
-    assert rotation is not None
-    assert rotation.event == "asking_again"
-    assert rotation.topics == {"/odom"}
-    made.rotation_begun(rotation, 50.0)
+    rotation = rotated(made, "a", 50.0)
+    assert (rotation.event, rotation.topics) == ("asking_again", {"/odom"})
     asked = profiles(made, "b")["/odom"]
     assert (asked["reliability"], asked["durability"]) == ("best_effort", "volatile")
     made.refused("b", "/odom")
@@ -124,9 +123,7 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
     for topic in topics:
         made.refused("a", topic)
         made.refused("a", topic, best_effort=False)  # the other policy of the same publisher
-    rotation = made.rotation_due("a", 50.0)
-    assert rotation is not None
-    made.rotation_begun(rotation, 50.0)
+    rotated(made, "a", 50.0)
     for name in ("b", "c"):
         asked = profiles(made, name)
         assert {(each["reliability"], each["durability"]) for each in asked.values()} == {

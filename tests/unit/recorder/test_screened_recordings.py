@@ -14,9 +14,9 @@ from ros2_memory.recorder.background import Background
 from ros2_memory.storage.mcap.writer import McapWriter
 from tests.support.bags import McapLayout
 from tests.support.fakes import failing
-from tests.support.housekeepers import background_keeper_of, keeper_of, recording_now
+from tests.support.housekeepers import keeper_of, recording_now
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, privacy, words
-from tests.support.simulated_recorders import World, assert_each_counts_once
+from tests.support.simulated_recorders import assert_each_counts_once, rotating
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +34,7 @@ class TestSessions:
     ) -> None:
         bags = ScreenedBags(tmp_path, privacy(excludes_unknown=unknown))
         house = keeper_of(tmp_path, screening=bags.screening)
-        world = World(tmp_path, housekeeper=house, session_duration_s=20).started()
+        world = rotating(tmp_path, housekeeper=house)
         for _ in range(12):
             world.run(5)
             withheld = read_withheld(tmp_path)
@@ -57,7 +57,7 @@ class TestSessions:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         house = keeper_of(tmp_path, screening=ScreenedBags(tmp_path).screening)
-        world = World(tmp_path, housekeeper=house, session_duration_s=20).started(15)
+        world = rotating(tmp_path, 15, housekeeper=house)
         with monkeypatch.context() as patched:
             patched.setattr(SCREENED, "write", failing())
             world.run(15)
@@ -115,7 +115,7 @@ class TestTheHouse:
 
     def test_a_step_runs_in_the_background_and_its_fault_is_reported(self, tmp_path: Path) -> None:
         bags = ScreenedBags(tmp_path / "bags")
-        house = background_keeper_of(bags.bag_dir, screening=bags.screening)
+        house = keeper_of(bags.bag_dir, background=Background(), screening=bags.screening)
         name = bags.begin(0)
         bags.split(name, [mode(-2, value=False), *words(0, 10)])
         house.screen(())

@@ -19,6 +19,7 @@ from tests.support.simulated_recorders import (
     assert_each_counts_once,
     assert_what_stands_counts_once,
     events,
+    rotating,
 )
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
@@ -73,7 +74,7 @@ class TestRotation:
     def test_a_topic_that_appears_while_both_record_is_waited_for_again(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(24)
+        world = rotating(tmp_path, 24)
         old, new = world.recorders
         for recorder in (old, new):
             recorder.lines.append("[INFO] [1.0] [rosbag2_recorder]: Subscribed to topic '/late'")
@@ -87,7 +88,7 @@ class TestRotation:
         self, tmp_path: Path
     ) -> None:
         """Publishers on a busy machine discover who has subscribed seconds later."""
-        world = World(tmp_path, session_duration_s=20).started(20.5)
+        world = rotating(tmp_path, 20.5)
         _, new = world.recorders
         new.deaf = True
         world.run(4)
@@ -100,7 +101,7 @@ class TestRotation:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
-        world = World(tmp_path, session_duration_s=20).started(19)
+        world = rotating(tmp_path, 19)
         world.defaults = {"topics": ("/bumper",)}
         [said] = world.logged(12.25, "rotated_without")
         assert world.recorders[0].status == 0
@@ -112,7 +113,7 @@ class TestRotation:
     def test_a_split_that_the_old_one_opens_while_it_ends_is_in_its_sidecar(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started()
+        world = rotating(tmp_path)
         world.recorders[0].obeys_after = 40
         world.run(40)
         old = read_handover(world.recorders[0].directory).handover
@@ -123,7 +124,7 @@ class TestRotation:
         assert_each_counts_once(world)
 
     def test_a_rotation_that_cannot_begin_is_tried_again(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20).started(19)
+        world = rotating(tmp_path, 19)
         world.refuse = "no more processes"
         world.run(4)
         assert read_handover(world.recorders[0].directory).handover.next is None
@@ -141,7 +142,7 @@ class TestStop:
         self, tmp_path: Path, after_s: float, is_deaf: bool
     ) -> None:
         """Nor is anything hidden that the new one alone has."""
-        world = World(tmp_path, session_duration_s=20).started(after_s - 0.5)
+        world = rotating(tmp_path, after_s - 0.5)
         world.recorders[0].deaf = is_deaf
         world.run(0.5)
         world.supervisor.stop()
@@ -155,7 +156,7 @@ class TestStop:
         self, tmp_path: Path, after_s: float, obeys_after: int, killed: str
     ) -> None:
         """`all`: the daemon, too; what it left is settled by the next one."""
-        world = World(tmp_path, session_duration_s=20).started()
+        world = rotating(tmp_path)
         world.recorders[0].obeys_after = obeys_after
         world.run(after_s)
         doomed = world.recorders[:1] if killed == "old" else world.recorders[1:]
@@ -183,7 +184,7 @@ class TestMessagesOfOneRecordingAlone:
     def test_what_one_missed_in_a_rotation_counts_in_the_other(
         self, tmp_path: Path, which: int
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(21.75)
+        world = rotating(tmp_path, 21.75)
         world.recorders[which].deaf = True
         world.run(0.75)
         world.recorders[which].deaf = False
@@ -201,7 +202,7 @@ class TestMessagesOfOneRecordingAlone:
         self, tmp_path: Path, deaf_s: float
     ) -> None:
         """Some recorders live and write nothing, which is why they are rotated."""
-        world = World(tmp_path, session_duration_s=20).started(20 - deaf_s)
+        world = rotating(tmp_path, 20 - deaf_s)
         world.recorders[0].deaf = True
         world.run(deaf_s + 15)
         world.supervisor.stop()
@@ -210,7 +211,7 @@ class TestMessagesOfOneRecordingAlone:
 
 class TestClock:
     def test_set_back_in_a_handover_the_handover_is_tried_again(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20).started(22)
+        world = rotating(tmp_path, 22)
         world.set_clock(-5)
         world.run(15)
         world.supervisor.stop()
@@ -278,7 +279,7 @@ class TestWatch:
     def test_a_directory_that_vanished_in_a_handover_leaves_the_other(
         self, tmp_path: Path, loser: str
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(22)
+        world = rotating(tmp_path, 22)
         old, new = world.recorders
         shutil.rmtree((old if loser == "old" else new).directory)
         world.run(2)
@@ -342,7 +343,7 @@ class TestHeartbeat:
         assert world.supervisor.is_recording
 
     def test_bytes_count_recordings_that_ended_too(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20).started()
+        world = rotating(tmp_path)
         sizes = []
         for _ in range(12):
             world.run(5)

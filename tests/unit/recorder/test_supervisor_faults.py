@@ -32,6 +32,7 @@ from tests.support.simulated_recorders import (
     assert_each_counts_once,
     assert_what_stands_counts_once,
     events,
+    rotating,
 )
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
@@ -94,7 +95,7 @@ class TestDeath:
         assert not world.recorders[0].directory.exists()
 
     def test_a_new_one_that_dies_in_a_handover_counts_for_nothing(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20).started(22.5)
+        world = rotating(tmp_path, 22.5)
         old, new = world.recorders
         new.die()
         with capture_logs() as logs:
@@ -112,7 +113,7 @@ class TestDeath:
     def test_where_the_disk_does_not_list_what_is_there_it_is_settled_later(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(24)
+        world = rotating(tmp_path, 24)
         for recorder in world.running:
             recorder.die()
         again = World(tmp_path)
@@ -162,7 +163,7 @@ class TestFailingDisk:
     def test_a_handover_is_given_up_where_the_new_directory_cannot_be_found_out(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(20.75)
+        world = rotating(tmp_path, 20.75)
         old, new = world.recorders
         new.die()
         FailingDisk(monkeypatch, lambda path: path == new.directory)
@@ -174,7 +175,7 @@ class TestFailingDisk:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused_s: float
     ) -> None:
         """It takes its time to end, and records meanwhile."""
-        world = World(tmp_path, session_duration_s=20, defaults={"obeys_after": 20}).started(20)
+        world = rotating(tmp_path, 20, defaults={"obeys_after": 20})
         with monkeypatch.context() as full:
             full.setattr(handover_file, "write_all_durably", failing(errno.ENOSPC))
             [reported, *_] = world.logged(refused_s, "rotation_failed")
@@ -187,7 +188,7 @@ class TestFailingDisk:
     def test_a_rotation_that_was_noted_and_not_flushed_is_tried_again(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path, session_duration_s=20).started(19)
+        world = rotating(tmp_path, 19)
         with monkeypatch.context() as failing_disk:
             failing_disk.setattr(durable_write, "flush", failing(errno.EIO))
             assert world.logged(3, "rotation_failed")
@@ -314,7 +315,7 @@ class TestSpace:
 
     def test_pausing_in_a_handover_loses_and_doubles_nothing(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping, session_duration_s=20).started(22.25)
+        world = rotating(tmp_path, 22.25, housekeeper=housekeeping)
         world.free = 900
         world.run(3)
         assert world.running == []

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import anyio
 import pytest
@@ -43,6 +43,7 @@ from tests.support.housekeepers import (
     size_of,
 )
 from tests.support.memories import memory_of
+from tests.support.simulated_recorders import events
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,8 +68,11 @@ def foreign(bag_dir: Path, *names: str, start: int = -86_400) -> list[Path]:
     ]
 
 
+Mixed: TypeAlias = "tuple[Path, list[Path], list[Path]]"
+
+
 @pytest.fixture
-def mixed(tmp_path: Path) -> tuple[Path, list[Path], list[Path]]:
+def mixed(tmp_path: Path) -> Mixed:
     """The bag directory, the recorder's bags, and those of others wherever they may lie."""
     mine = [*recording(tmp_path, A, 0), *recording(tmp_path, B, 3 * 3600)]
     own_all(tmp_path)
@@ -88,7 +92,7 @@ def mixed(tmp_path: Path) -> tuple[Path, list[Path], list[Path]]:
 
 
 class TestRetention:
-    def test_no_limit_takes_a_foreign_bag(self, mixed: tuple[Path, list[Path], list[Path]]) -> None:
+    def test_no_limit_takes_a_foreign_bag(self, mixed: Mixed) -> None:
         bag_dir, mine, others = mixed
         for limits in ({"max_bytes": LITTLE}, {"max_age_h": 0.01}):
             for _ in range(3):
@@ -96,9 +100,7 @@ class TestRetention:
         assert all(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
 
-    def test_the_budget_counts_the_recorders_own_and_moments_alone(
-        self, mixed: tuple[Path, list[Path], list[Path]]
-    ) -> None:
+    def test_the_budget_counts_the_recorders_own_and_moments_alone(self, mixed: Mixed) -> None:
         bag_dir, mine, others = mixed
         (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
         kept(house_of(bag_dir, keeps_foreign=True), bag_dir, 0, 15)
@@ -108,19 +110,17 @@ class TestRetention:
         counted -= (bag_dir / "session_mcap" / "metadata.yaml").stat().st_size
         with structlog.testing.capture_logs() as logs:
             house_of(bag_dir, keeps_foreign=True, max_bytes=counted).apply()
-        [reported] = [each for each in logs if each["event"] == "retention_applied"]
+        [reported] = events(logs, "retention_applied")
         assert (reported["bags"], reported["total_bytes"]) == (0, counted)
         assert reported["foreign_bytes"] == besides + len(b"no bag")
         assert list_bytes
-        [warned] = [each for each in logs if each["event"] == "foreign_bags_kept"]
+        [warned] = events(logs, "foreign_bags_kept")
         assert "adopt" in warned["reason"]
         house_of(bag_dir, keeps_foreign=True, max_bytes=counted - 1).apply()
         # The first two are kept in a moment, and would free nothing.
         assert [path.exists() for path in mine[:4]] == [True, True, False, True]
 
-    def test_with_delete_all_bags_are_weighed(
-        self, mixed: tuple[Path, list[Path], list[Path]]
-    ) -> None:
+    def test_with_delete_all_bags_are_weighed(self, mixed: Mixed) -> None:
         bag_dir, mine, others = mixed
         house_of(bag_dir, keeps_foreign=False, max_bytes=LITTLE).apply()
         assert not any(path.exists() for path in others)
@@ -157,7 +157,7 @@ class TestRetention:
             house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE).apply()
         assert [path.exists() for path in mine] == [False] * 5 + [True]
         assert all(path.exists() for path in (*others, *newest))
-        [reported] = [each for each in logs if each["event"] == "retention_applied"]
+        [reported] = events(logs, "retention_applied")
         assert reported["foreign_bytes"] == sum(path.stat().st_size for path in (*others, *newest))
         assert (tmp_path / A / "handover.json").exists()
 
@@ -252,9 +252,7 @@ class TestRepair:
 
 
 class TestClearing:
-    def test_a_start_that_clears_leaves_foreign_bags(
-        self, mixed: tuple[Path, list[Path], list[Path]]
-    ) -> None:
+    def test_a_start_that_clears_leaves_foreign_bags(self, mixed: Mixed) -> None:
         bag_dir, mine, others = mixed
         kept(house_of(bag_dir, keeps_foreign=True), bag_dir, 0, 15)
         assert in_moments(bag_dir)
@@ -312,9 +310,7 @@ class TestReports:
         limits = RetentionLimits(PLENTY, 10**6 * 3600 * S, keeps_foreign=keeps_foreign)
         return replace(memory, limits=replace(memory.limits, kept=limits))
 
-    def test_status_and_health_say_how_much_foreign_bags_take(
-        self, mixed: tuple[Path, list[Path], list[Path]]
-    ) -> None:
+    def test_status_and_health_say_how_much_foreign_bags_take(self, mixed: Mixed) -> None:
         bag_dir, mine, others = mixed
         (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
         memory = self.memory(bag_dir)
@@ -324,9 +320,7 @@ class TestReports:
         health = anyio.run(Health(memory, "1"))
         assert health["foreign_bytes"] == budget.foreign
 
-    def test_they_follow_the_list_and_the_bags(
-        self, mixed: tuple[Path, list[Path], list[Path]]
-    ) -> None:
+    def test_they_follow_the_list_and_the_bags(self, mixed: Mixed) -> None:
         bag_dir, _, others = mixed
         memory = self.memory(bag_dir)
         before = memory_status(memory, Call()).budget.foreign

@@ -25,9 +25,10 @@ from ros2_memory.retention.latched_carry import (
 from ros2_memory.storage.base import REPEATED_NS
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import files_in, keeper_of, reader_of_both
+from tests.support.housekeepers import files_in, keeper_of
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 from tests.support.noting_reader import fail_reading
@@ -62,6 +63,11 @@ def drive(start: int, stop: int) -> list[Msg]:
     return [odom(at, (at - T0) / S, 0.0) for at in range(start, stop, S)]
 
 
+def drive_in(split: int) -> list[Msg]:
+    """Ten seconds of driving."""
+    return drive(T0 + split * 10 * S, T0 + (split + 1) * 10 * S)
+
+
 def recording(bag_dir: Path, name: str, *splits: Iterable[Msg]) -> None:
     for number, messages in enumerate(splits):
         write_mcap(bag_dir / name / f"{name}_{number}.mcap", messages, LAYOUT)
@@ -69,7 +75,7 @@ def recording(bag_dir: Path, name: str, *splits: Iterable[Msg]) -> None:
 
 def at_home(bag_dir: Path, splits: int = 2) -> None:
     """A recording whose first split has a latched message."""
-    odometry = [drive(T0 + n * 10 * S, T0 + (n + 1) * 10 * S) for n in range(splits)]
+    odometry = [drive_in(n) for n in range(splits)]
     recording(bag_dir, "rec", [docked(T0, "home"), *odometry[0][:-1]], *odometry[1:])
 
 
@@ -114,8 +120,8 @@ class TestTheBagOfCarriedMessages:
         recording(
             tmp_path,
             "rec",
-            [frame(T0, "laser", 0.1), *drive(T0, T0 + 10 * S)],
-            drive(T0 + 10 * S, T0 + 20 * S),
+            [frame(T0, "laser", 0.1), *drive_in(0)],
+            drive_in(1),
         )
         keep_only(tmp_path, "rec/rec_1.mcap")
         memory = memory_of(tmp_path)
@@ -127,12 +133,9 @@ class TestTheBagOfCarriedMessages:
         self, tmp_path: Path
     ) -> None:
         first = [frame(T0, "laser", 0.1), frame(T0 + 1, "camera", 0.2), frame(T0 + 2, "laser", 0.3)]
-        recording(
-            tmp_path, "rec", [*first, *drive(T0, T0 + 10 * S)], drive(T0 + 10 * S, T0 + 20 * S)
-        )
+        recording(tmp_path, "rec", [*first, *drive_in(0)], drive_in(1))
         keep_only(tmp_path, "rec/rec_1.mcap")
-        carried = records(tmp_path)
-        assert [each.log_time for each in carried] == [T0 + 1, T0 + 2]
+        assert carried_at(tmp_path) == [T0 + 1, T0 + 2]
         assert places(memory_of(tmp_path), T0 + 15 * S, ["laser", "camera"]) == [
             (0.3, 0.0, 0.0),
             (0.2, 0.0, 0.0),
@@ -142,9 +145,7 @@ class TestTheBagOfCarriedMessages:
         self, tmp_path: Path
     ) -> None:
         message = docked(T0, "home", received=T0 + 77)
-        recording(
-            tmp_path, "rec", [message, *drive(T0, T0 + 5 * S)], drive(T0 + 10 * S, T0 + 20 * S)
-        )
+        recording(tmp_path, "rec", [message, *drive(T0, T0 + 5 * S)], drive_in(1))
         (before,) = McapReader().records(
             tmp_path / "rec/rec_0.mcap", [DOCK], TimeWindow.everything()
         )
@@ -158,8 +159,8 @@ class TestTheBagOfCarriedMessages:
     def test_it_is_not_written_again_where_nothing_changes(self, tmp_path: Path) -> None:
         again = docked(T0, "home", received=T0 + 10 * S)
         recording(tmp_path, "rec", [docked(T0, "home"), *drive(T0, T0 + 9 * S)])
-        recording(tmp_path, "sec", [again, *drive(T0 + 10 * S, T0 + 20 * S)])
-        recording(tmp_path, "thi", drive(T0 + 20 * S, T0 + 30 * S))
+        recording(tmp_path, "sec", [again, *drive_in(1)])
+        recording(tmp_path, "thi", drive_in(2))
         keep_only(tmp_path, "sec/sec_0.mcap", "thi/thi_0.mcap")
         before = (tmp_path / "latched/carried.mcap").stat()
         keep_only(tmp_path, "thi/thi_0.mcap")
@@ -168,8 +169,8 @@ class TestTheBagOfCarriedMessages:
 
     def test_messages_of_a_sqlite_bag_are_carried(self, tmp_path: Path) -> None:
         write_db3(tmp_path / "rec/old_0.db3", [frame(T0, "laser", 0.1), *drive(T0, T0 + 9 * S)])
-        recording(tmp_path, "rec", drive(T0 + 10 * S, T0 + 20 * S))
-        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply()
+        recording(tmp_path, "rec", drive_in(1))
+        keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
         memory = memory_of(tmp_path, storage="rosbag2")
         assert places(memory, T0 + 15 * S, ["laser"]) == [(0.1, 0.0, 0.0)]
 
@@ -247,40 +248,8 @@ class TestTheBagOfCarriedMessages:
         keeper.apply()
         assert not (tmp_path / "rec" / "rec_0.mcap").exists()
 
-    def test_a_bag_that_failed_for_a_moment_days_ago_is_not_given_up_at_once(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        failing = set[str]()
-        too_many = BagUnreachableError("b_0.mcap", "it cannot be opened: Too many open files")
-        fail_reading(
-            monkeypatch, "records", lambda path: too_many if path.name in failing else None
-        )
-        now = SettableClock(0)
-        for nth, name in enumerate("abcd"):
-            start = T0 + nth * 10 * S
-            latched = [frame(start, name, 0.1)] if name in "ab" else []
-            recording(tmp_path, name, [*latched, *drive(start + S, start + 10 * S)])
-        size = (tmp_path / "a" / "a_0.mcap").stat().st_size
-        keeper = keeper_of(tmp_path, max_bytes=3 * size + 1000, monotonic=lambda: now.now() / S)
-
-        def passed(*, fails: bool) -> list[str]:
-            failing.update(["b_0.mcap"] if fails else ())
-            keeper.apply()
-            failing.clear()
-            return sorted(path.parent.name for path in tmp_path.rglob("*_0.mcap"))
-
-        assert passed(fails=True) == ["a", "b", "d"]
-        recording(tmp_path, "e", drive(T0 + 40 * S, T0 + 50 * S))
-        assert passed(fails=False) == ["b", "d", "e"]
-        now.at = 2 * 86_400 * S
-        recording(tmp_path, "f", drive(T0 + 50 * S, T0 + 60 * S))
-        assert "b" in passed(fails=True)
-        recording(tmp_path, "g", drive(T0 + 60 * S, T0 + 70 * S))
-        assert "b" not in passed(fails=False)
-        assert [each.log_time for each in records(tmp_path)] == [T0, T0 + 10 * S]
-
     def test_what_lies_behind_a_damaged_part_of_a_bag_is_carried(self, tmp_path: Path) -> None:
-        recording(tmp_path, "rec", (), drive(T0 + 10 * S, T0 + 20 * S))
+        recording(tmp_path, "rec", (), drive_in(1))
         lost, left = frame(T0, "laser", 0.1), frame(T0 + 8 * S, "camera", 0.2)
         damaged = write_mcap(
             tmp_path / "rec" / "rec_0.mcap",
@@ -289,7 +258,7 @@ class TestTheBagOfCarriedMessages:
         )
         spoil_chunk(damaged, 0)
         keep_only(tmp_path, "rec/rec_1.mcap")
-        assert [each.log_time for each in records(tmp_path)] == [T0 + 8 * S]
+        assert carried_at(tmp_path) == [T0 + 8 * S]
 
     @pytest.mark.parametrize("kind", [BagError, BagUnreachableError])
     def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(
@@ -298,27 +267,31 @@ class TestTheBagOfCarriedMessages:
         recording(
             tmp_path,
             "rec",
-            [frame(T0, "laser", 0.1), *drive(T0, T0 + 10 * S)],
-            [frame(T0 + 10 * S, "camera", 0.2), *drive(T0 + 10 * S, T0 + 20 * S)],
-            drive(T0 + 20 * S, T0 + 30 * S),
-            drive(T0 + 30 * S, T0 + 40 * S),
+            [frame(T0, "laser", 0.1), *drive_in(0)],
+            [frame(T0 + 10 * S, "camera", 0.2), *drive_in(1)],
+            drive_in(2),
+            drive_in(3),
         )
         keep_only(tmp_path, *(f"rec/rec_{number}.mcap" for number in (1, 2, 3)))
         with pytest.MonkeyPatch.context() as patched:
             fault = kind("carried.mcap", "it cannot be opened: Input/output error")
             fail_reading(patched, "records", lambda path: fault if is_carried(path) else None)
             keeper_of(tmp_path, max_bytes=1).apply()
-        assert [each.log_time for each in records(tmp_path)] == [T0]
+        assert carried_at(tmp_path) == [T0]
         assert not (tmp_path / "rec/rec_2.mcap").exists()
         assert (tmp_path / "rec/rec_1.mcap").exists()
         keep_only(tmp_path, "rec/rec_3.mcap")
-        assert [each.log_time for each in records(tmp_path)] == [T0, T0 + 10 * S]
+        assert carried_at(tmp_path) == [T0, T0 + 10 * S]
 
 
 def records(bag_dir: Path) -> list[Record]:
     """What is carried."""
     path = bag_dir / "latched/carried.mcap"
     return list(McapReader().records(path, ["/tf_static", DOCK], TimeWindow.everything()))
+
+
+def carried_at(bag_dir: Path) -> list[int]:
+    return [each.log_time for each in records(bag_dir)]
 
 
 class TestAnswers:

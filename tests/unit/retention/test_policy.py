@@ -12,7 +12,6 @@ from ros2_memory.retention.policy import (
     DirContents,
     RetentionLimits,
     StoredBag,
-    StoredFile,
     by_hours,
     plan_deletions,
 )
@@ -43,12 +42,6 @@ def bag(
     at = written if written is not None else end or NOW
     number = zlib.crc32(name.encode()) if inode is None else inode
     return StoredBag(f"{recording}/{name}", recording, *span, at, 1, number, size)
-
-
-def another_name(of: StoredBag, file: StoredFile) -> StoredBag:
-    """The bag, if its name led to another file."""
-    device, inode = file.inode
-    return of._replace(device=device, inode=inode, size=file.size)
 
 
 def contents(
@@ -194,18 +187,11 @@ all_limits = st.builds(
 
 def without(held: DirContents, deleted: Iterable[StoredBag]) -> DirContents:
     """What lies there after these bags are deleted."""
-    gone = {each.path for each in deleted}
-    bags = [each for each in held.bags if each.path not in gone]
-    inodes = {file.inode for each in bags for file in each.files}
-    freed = {
-        file.inode: file.size
-        for each in held.bags
-        for file in each.files
-        if file.inode not in inodes
-    }
+    gone = set(deleted)
+    bags = [each for each in held.bags if each not in gone]
     free = held.free_bytes
     if free is not None:
-        free += sum(freed.values())
+        free += sum(each.size for each in gone)
     return replace(held, bags=bags, free_bytes=free)
 
 
@@ -295,51 +281,10 @@ class TestAlways:
             assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
 
 
-def sizes(files: Iterable[StoredFile]) -> dict[tuple[int, int], int]:
-    return {file.inode: file.size for file in files}
-
-
 class TestMoments:
-    """`kept` are files of moments, which other names of may be deleted."""
-
     def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
         bags = hourly(3)
         limits = replace(LIMITS, min_free_bytes=10)
-        found = plan_deletions(
-            replace(contents(*bags, free_bytes=0), saved=sizes(bags[-1].files)), limits
-        )
+        saved = {file.inode: file.size for file in bags[-1].files}
+        found = plan_deletions(replace(contents(*bags, free_bytes=0), saved=saved), limits)
         assert (names(found.to_delete), found.fits) == (["h1"], True)
-
-    @given(
-        st.lists(
-            st.tuples(st.integers(0, 200), st.integers(0, 6)),
-            min_size=1,
-            unique_by=lambda drawn: drawn[1],
-        ),
-        st.sets(st.integers(0, 8)),
-        st.integers(0, 120),
-    )
-    def test_what_is_said_of_the_budget_is_what_the_disk_would_show(
-        self, drawn: list[tuple[int, int]], kept: set[int], most: int
-    ) -> None:
-        def file(inode: int) -> StoredFile:
-            return StoredFile((1, inode), 10 + inode)
-
-        bags = [
-            another_name(bag(f"b{n}", NOW - hours * HOUR), file(inode))
-            for n, (hours, inode) in enumerate(drawn)
-        ]
-        limits = replace(LIMITS, max_total_bytes=most)
-        files = tuple(file(inode) for inode in kept)
-        found = plan_deletions(replace(contents(*bags), saved=sizes(files)), limits)
-
-        def shown(left: list[StoredBag]) -> int:
-            return sum({each.inode: each.size for each in (*files, *_files(left))}.values())
-
-        left = [each for each in bags if each not in found.to_delete]
-        assert found.total_bytes == shown(bags)
-        assert found.fits == (shown(left) <= most)
-
-
-def _files(bags: list[StoredBag]) -> list[StoredFile]:
-    return [each for bag in bags for each in bag.files]

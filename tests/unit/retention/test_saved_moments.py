@@ -39,9 +39,12 @@ from tests.support.housekeepers import (
     recording_now,
     told_of,
 )
+from tests.support.simulated_recorders import events
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from ros2_memory.recorder.housekeeping import Housekeeping
 
 
 # A file has one size.
@@ -99,7 +102,7 @@ class TestKeeping:
         monkeypatch.setattr(type(sidecar), "samefile", gone)
         with structlog.testing.capture_logs() as logs:
             house._moments.relink_sidecars()
-        assert [each for each in logs if each["event"] == "moment_not_followed"] == []
+        assert not events(logs, "moment_not_followed")
 
     def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
@@ -165,6 +168,16 @@ class TestKeeping:
         assert files_in(tmp_path / "else") == []
 
 
+def waiting(bag_dir: Path, **limits: Any) -> tuple[Housekeeping, SettableClock]:
+    """Two splits, and a moment that goes on for 6 s longer."""
+    recording(bag_dir, A, 0, splits=2)
+    clock = SettableClock(T0 + 19 * S)
+    house = house_of(bag_dir, clock=clock, **limits)
+    outcome = kept(house, bag_dir, 0, 25, at=clock.at)
+    assert (outcome.bags, outcome.pending) == (2, True)
+    return house, clock
+
+
 class TestOpenBags:
     def test_a_moment_waits_for_the_split_that_is_being_written(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0, splits=2)
@@ -186,11 +199,7 @@ class TestOpenBags:
         ]
 
     def test_a_moment_ends_when_nothing_of_it_is_open_any_more(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0, splits=2)
-        clock = SettableClock(T0 + 19 * S)
-        house = house_of(tmp_path, clock=clock)
-        outcome = kept(house, tmp_path, 0, 25, at=clock.at)
-        assert (outcome.bags, outcome.pending) == (2, True)
+        house, clock = waiting(tmp_path)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
         clock.at = T0 + 26 * S
         house.keep_moments()
@@ -200,11 +209,8 @@ class TestOpenBags:
     def test_what_passes_the_share_when_it_closes_is_reported_and_not_kept(
         self, tmp_path: Path
     ) -> None:
-        made = recording(tmp_path, A, 0, splits=2)
-        clock = SettableClock(T0 + 19 * S)
-        share = sum(path.stat().st_size for path in made)
-        house = house_of(tmp_path, clock=clock, moments_bytes=share)
-        kept(house, tmp_path, 0, 25, at=clock.at)
+        size = bag(tmp_path / A / f"{A}_0.mcap", 0).stat().st_size
+        house, clock = waiting(tmp_path, moments_bytes=5 * size // 2)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
         clock.at = T0 + 26 * S
         house.keep_moments()
@@ -217,10 +223,7 @@ class TestOpenBags:
     def test_a_disk_that_is_full_when_a_split_closes_costs_nothing_unless_it_stays_so(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, stays_full: bool
     ) -> None:
-        recording(tmp_path, A, 0, splits=2)
-        clock = SettableClock(T0 + 19 * S)
-        house = house_of(tmp_path, clock=clock)
-        kept(house, tmp_path, 0, 25, at=clock.at)
+        house, clock = waiting(tmp_path)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
 
         with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
@@ -232,7 +235,7 @@ class TestOpenBags:
             if stays_full:
                 clock.at += LONGEST_WAIT_NS
                 house.keep_moments()
-        told = [each for each in captured if each["event"] == "moment_not_followed"]
+        told = events(captured, "moment_not_followed")
         assert [each["reason"] for each in told] == ["No space left on device"]
         house.keep_moments()
         missing = ["not all can be saved: No space left on device"]
@@ -251,9 +254,7 @@ class TestOpenBags:
 
     def test_before_anything_is_deleted_a_pending_moment_goes_on(self, tmp_path: Path) -> None:
         """As after a night: the recorder that begins anew deletes before it records."""
-        recording(tmp_path, A, 0, splits=2)
-        clock = SettableClock(T0 + 19 * S)
-        kept(house_of(tmp_path, clock=clock), tmp_path, 0, 25, at=clock.at)
+        _, clock = waiting(tmp_path)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
         recording(tmp_path, B, 100, splits=2)
         clock.at = NOW
@@ -303,7 +304,7 @@ class TestCrashes:
         (folder / f".{MOMENT_FILE}.tmp").mkdir()
         with structlog.testing.capture_logs() as captured:
             assert kept(house, tmp_path, 30, 35).bags == 1
-        assert "moment_not_written" in {event["event"] for event in captured}
+        assert events(captured, "moment_not_written")
 
 
 class TestOthers:

@@ -36,6 +36,7 @@ from tests.support.clocks import SettableClock
 from tests.support.fakes import failing
 from tests.support.housekeepers import HOUR, keeper_of, own_all
 from tests.support.memories import reply_over
+from tests.support.simulated_recorders import events
 
 S = NS_PER_S
 T0 = 1_790_000_400 * S
@@ -112,7 +113,7 @@ def test_only_what_is_too_old_goes_and_all_else_stays(bag_dir: Path) -> None:
     assert contents_of(old, *others) == before
     assert before
     assert young.read_bytes() == untouched
-    [told] = [log for log in logs if log["event"] == "topics_cut"]
+    [told] = events(logs, "topics_cut")
     assert (told["bags"], told["messages"]) == (2, {"/speech": 20})
 
 
@@ -177,7 +178,7 @@ def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> N
         for now_s[0] in (0.0, PATIENCE_S - 1):
             keeper.apply()
             assert counts_of(bag)["/speech"] == 10
-    assert [log["event"] for log in logs].count("topics_wait") == 1
+    assert len(events(logs, "topics_wait")) == 1
     now_s[0] = PATIENCE_S
     keeper.apply()
     assert "/speech" not in counts_of(bag)
@@ -222,7 +223,7 @@ def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(bag_dir: Path)
     with capture_logs() as logs:
         keeper.apply()
         keeper.apply()
-    failed = [log["path"] for log in logs if log["event"] == "topics_not_cut"]
+    failed = [log["path"] for log in events(logs, "topics_not_cut")]
     assert failed == [str(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
     assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
 
@@ -241,7 +242,7 @@ def test_a_bag_that_another_program_rewrites_is_left_to_it(bag_dir: Path) -> Non
     with bag.open("rb") as held, capture_logs() as logs:
         fcntl.flock(held, fcntl.LOCK_EX)
         house(bag_dir, cutter_of(bag_dir)).apply()
-    [told] = [log for log in logs if log["event"] == "topics_not_cut"]
+    [told] = events(logs, "topics_not_cut")
     assert "another program rewrites it" in told["reason"]
     assert counts_of(bag)["/speech"] == 10
 

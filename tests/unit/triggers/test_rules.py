@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import accumulate
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given, settings
@@ -37,7 +37,13 @@ HOLDS = st.sampled_from([0, S, 5 * S, 20 * S])
 
 
 def fired(
-    stream: Stream, hold: int, cuts: Sequence[int] = (), *, latched: bool = False, end: int = 0
+    stream: Stream,
+    hold: int,
+    cuts: Sequence[int] = (),
+    *,
+    latched: bool = False,
+    end: int = 0,
+    **kind: Any,
 ) -> list[int]:
     """When the rule fires, if the stream is looked at in pieces that end at these times."""
     times: list[int] = []
@@ -45,7 +51,7 @@ def fired(
     for until in (*sorted(cuts), max(end, stream[-1][0] + 1 if stream else 0)):
         piece = [each for each in stream if each[0] < until]
         stream = stream[len(piece) :]
-        watched = rule(hold=hold)
+        watched = rule(hold=hold, **kind)
         for time, matches in piece:
             found = watched.take(runs, "/bumper", time, matches=matches, latched=latched)
             times += [] if found is None else [found.at]
@@ -100,16 +106,8 @@ def test_a_silence_fires_once_and_again_after_the_topic_spoke(
 ) -> None:
     hold, end = 9 * S, 1000 * S
     times = [sum(pauses[: n + 1]) * S for n in range(len(pauses))]
-    found: list[int] = []
-    runs: dict[str, RunRecord] = {}
-    left = times
-    for until in (*sorted(cut * S for cut in cuts), end):
-        watched = rule(hold=hold, **SILENT)
-        for time in [each for each in left if each < until]:
-            fire = watched.take(runs, "/bumper", time, matches=False)
-            found += [] if fire is None else [fire.at]
-        left = [each for each in left if each >= until]
-        found += [each.at for each in watched.reach(runs, until)]
+    stream: Stream = [(time, False) for time in times]
+    found = fired(stream, hold, [cut * S for cut in cuts], end=end, **SILENT)
     gaps = zip(times, [*times[1:], end], strict=True) if times else ()
     assert found == [last + hold for last, after in gaps if after - last >= hold]
 
