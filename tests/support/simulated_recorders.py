@@ -153,7 +153,7 @@ class WorldClock(Clock):
 
 
 class World:
-    """Time, a bag directory, and the recorders that were started in it."""
+    """Time, a bag directory, its house unless another is given, and the recorders started there."""
 
     def __init__(
         self,
@@ -180,7 +180,7 @@ class World:
         self.refuse = ""
         self.before_start: Callable[[Path], object] = bool
         self.recorders: list[PlayedRecorder] = []
-        self.named_at_start: list[list[str]] = []
+        self.house = PlayedHousekeeper(self)
         self.defaults = defaults or {}
         plan: dict[str, object] = {
             "bag_dir": bag_dir,
@@ -207,7 +207,7 @@ class World:
         )
         self.supervisor = Supervisor(
             self.orders,
-            housekeeper or PlayedHousekeeper(),
+            housekeeper or self.house,
             monotonic=lambda: self.mono,
             free_bytes_of=self._free_bytes,
             device=lambda _directory: self.device,
@@ -225,7 +225,6 @@ class World:
         self.topics_path.write_text(yaml.safe_dump({"topics": [*names, *ANY_TOPIC]}))
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:
-        self.named_at_start.append(self.heartbeat()["recordings"])
         self.before_start(directory)
         if self.refuse:
             raise RecorderError(self.refuse)
@@ -308,12 +307,11 @@ def assert_each_counts_once(world: World) -> None:
 class PlayedHousekeeper(Housekeeping):
     """Records what it is asked for, and frees what the test sets."""
 
-    def __init__(self) -> None:
+    def __init__(self, world: World | None = None) -> None:
         self.asked: list[str] = []
-        self.world: World | None = None
+        self.world = world
         self.frees_to = 0
         self.making = False
-        self.moments_kept = 0
         self.recorded: list[tuple[tuple[str, ...], int, float]] = []
         self.held: str | None = None
         self.restarts: list[tuple[int, str]] = []
@@ -330,7 +328,7 @@ class PlayedHousekeeper(Housekeeping):
         self.asked.append("apply")
 
     def keep_moments(self) -> None:
-        self.moments_kept += 1
+        """None are asked for."""
 
     def note_restart(self, first: int, how: str) -> None:
         self.restarts.append((first, how))

@@ -21,6 +21,8 @@ from tests.unit.index.test_unchanged_bags import Start
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.history.context import SnapshotSource
+
 S = 10**9
 
 
@@ -30,6 +32,10 @@ def keep(start: Start, moment: str, *splits: int) -> None:
     folder.mkdir(parents=True)
     for split in splits:
         os.link(start.bag_dir / "rec" / f"rec_{split}.mcap", folder / f"rec_{split}.mcap")
+
+
+def found(index: SnapshotSource) -> list[str]:
+    return [bag.file for bag in index.refresh().bags]
 
 
 @pytest.fixture
@@ -78,11 +84,11 @@ class TestTheIndex:
     """Bags that the catalogue knows are taken over unread; what is kept is weighed beside them."""
 
     def test_a_kept_bag_that_is_known_by_its_own_name_is_no_second_one(self, start: Start) -> None:
-        before = [bag.file for bag in start.index()[0].refresh().bags]
+        before = found(start.index()[0])
         keep(start, "one", 1, 2)
         keep(start, "two", 2, 3)
         start.age()
-        assert [bag.file for bag in start.index()[0].refresh().bags] == before
+        assert found(start.index()[0]) == before
         assert start.index()[0].refresh() == start.read()
 
     def test_it_answers_when_the_other_has_gone_under_a_running_index(self, start: Start) -> None:
@@ -99,9 +105,7 @@ class TestTheIndex:
             f"{start.bag_dir}/moments/one/rec/rec_{split}.mcap" for split in (1, 2)
         ]
         start.remember()
-        assert [bag.file for bag in start.index()[0].refresh().bags] == [
-            bag.file for bag in after.bags
-        ]
+        assert found(start.index()[0]) == [bag.file for bag in after.bags]
         shutil.rmtree(start.bag_dir / "moments/one")
         assert len(index.refresh().bags) == 5
         assert [*index.refresh().bags] == [*start.read().bags]
@@ -111,17 +115,17 @@ class TestOtherNames:
     def test_a_hard_link_beside_its_original_is_no_second_bag(self, tmp_path: Path) -> None:
         recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
         memory = memory_of(tmp_path)
-        assert [bag.file for bag in memory.index.refresh().bags] == [str(recorded)]
+        assert found(memory.index) == [str(recorded)]
         linked = tmp_path / "rec/rec_0_link.mcap"
         os.link(recorded, linked)
         (tmp_path / "z/backup").mkdir(parents=True)
         os.link(recorded, tmp_path / "z/backup/rec_0.mcap")
         for index in (memory.index, memory_of(tmp_path).index):
-            assert [bag.file for bag in index.refresh().bags] == [str(recorded)]
+            assert found(index) == [str(recorded)]
         [row] = list_recorded_topics(memory, Call())
         assert row.count == 1
         recorded.unlink()
-        assert [bag.file for bag in memory.index.refresh().bags] == [str(linked)]
+        assert found(memory.index) == [str(linked)]
         linked.unlink()
         assert len(memory.index.refresh().bags) == 1
 
@@ -131,4 +135,4 @@ class TestOtherNames:
         memory.index.refresh()
         outer = tmp_path / "a.mcap"
         os.link(recorded, outer)
-        assert [bag.file for bag in memory.index.refresh().bags] == [str(outer)]
+        assert found(memory.index) == [str(outer)]

@@ -8,7 +8,6 @@ import os
 import re
 import stat
 from typing import TYPE_CHECKING
-from unittest.mock import Mock
 
 import pytest
 import structlog
@@ -32,6 +31,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
+from tests.support.fakes import failing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -117,6 +117,14 @@ def asked(bag_dir: Path, label: str = "here", at: int = T0) -> PendingRequest:
     return posted
 
 
+def refuse_all(queue: RequestQueue, now: int = T0) -> int:
+    """Answers what is asked for then; returns how much that is."""
+    requests = [*queue.take(now)]
+    for request in requests:
+        queue.answer(request.number, Outcome(refused="no"))
+    return len(requests)
+
+
 def names(bag_dir: Path) -> list[str]:
     return sorted(path.name for path in (bag_dir / REQUESTS_FOLDER).iterdir())
 
@@ -162,11 +170,7 @@ def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
     for _ in range(MAX_AT_ONCE + 2):
         asked(tmp_path)
     queue = RequestQueue(tmp_path)
-    first = list(queue.take(T0))
-    assert len(first) == MAX_AT_ONCE
-    for request in first:
-        queue.answer(request.number, Outcome(refused="no"))
-    assert len(list(queue.take(T0))) == 2
+    assert [refuse_all(queue), refuse_all(queue)] == [MAX_AT_ONCE, 2]
 
 
 @pytest.mark.parametrize(
@@ -195,9 +199,8 @@ def test_who_asked_is_told_that_the_disk_did_not_give_the_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     posted, queue = asked(tmp_path), RequestQueue(tmp_path)
-    unreadable = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
     with monkeypatch.context() as patch:
-        patch.setattr(moment_file, "_read_request", unreadable)
+        patch.setattr(moment_file, "_read_request", failing(errno.EIO))
         assert list(queue.take(T0)) == []
     outcome = posted.outcome()
     assert outcome is not None
@@ -213,8 +216,7 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
     os.mkfifo(folder / f"{'b' * 32}.json")
     posted, queue = asked(tmp_path), RequestQueue(tmp_path)
     with structlog.testing.capture_logs() as captured:
-        [request] = queue.take(T0)
-        queue.answer(request.number, Outcome(refused="no"))
+        assert refuse_all(queue) == 1
     assert [event["event"] for event in captured] == ["request_ignored"] * 3
     assert posted.outcome() is not None
     assert not queue.has_requests()
@@ -224,19 +226,15 @@ def test_other_files_are_left_alone(tmp_path: Path) -> None:
     posted = asked(tmp_path)
     (tmp_path / REQUESTS_FOLDER / "notes.txt").write_text("mine")
     queue = RequestQueue(tmp_path)
-    for request in queue.take(T0):
-        queue.answer(request.number, Outcome(refused="no"))
-    assert list(queue.take(T0)) == []
+    assert [refuse_all(queue), refuse_all(queue)] == [1, 0]
     posted.close()
     assert names(tmp_path) == ["notes.txt"]
 
 
 def test_answers_that_nobody_fetched_are_swept_away(tmp_path: Path) -> None:
-    asked(tmp_path)
-    queue = RequestQueue(tmp_path)
-    [request] = queue.take(T0)
-    queue.answer(request.number, Outcome(refused="no"))
-    path = tmp_path / REQUESTS_FOLDER / f"{request.number}.answer"
+    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
+    assert refuse_all(queue) == 1
+    path = tmp_path / REQUESTS_FOLDER / f"{posted.request.number}.answer"
     os.utime(path, ns=(T0, T0))
     assert list(queue.take(T0 + 500 * S)) == []
     assert path.exists()

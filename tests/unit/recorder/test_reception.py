@@ -58,6 +58,12 @@ def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
     return found
 
 
+def qos(of: Reception, recording: str) -> dict[str, tuple[object, object]]:
+    """Reliability and durability of each topic."""
+    asked = profiles(of, recording).items()
+    return {topic: (each["reliability"], each["durability"]) for topic, each in asked}
+
+
 def rotated(of: Reception, recording: str, now_s: float) -> Rotation:
     """The reason for which a recording is rotated then."""
     due = of.rotation_due(recording, now_s)
@@ -72,7 +78,8 @@ def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: 
     assert made.rotation_due("a", 0.0) is None
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = rotated(made, "a", 10.0)
-    assert (rotation.event, rotation.topics) == ("queues_deepened", {"/odom"})
+    assert rotation.event == "queues_deepened"
+    assert rotation.topics == {"/odom"}
     assert profiles(made, "b")["/odom"]["depth"] == 200
     made.learn("b", split(tmp_path / "b_0.mcap", 50, 4))
     assert made.rotation_due("b", 1000.0) is None
@@ -97,9 +104,9 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     # The recording that refused it still states what the other publishers offered.
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = rotated(made, "a", 50.0)
-    assert (rotation.event, rotation.topics) == ("asking_again", {"/odom"})
-    asked = profiles(made, "b")["/odom"]
-    assert (asked["reliability"], asked["durability"]) == ("best_effort", "volatile")
+    assert rotation.event == "asking_again"
+    assert rotation.topics == {"/odom"}
+    assert qos(made, "b")["/odom"] == ("best_effort", "volatile")
     made.refused("b", "/odom")
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S - 1) is None
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
@@ -125,16 +132,11 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
         made.refused("a", topic, best_effort=False)  # the other policy of the same publisher
     rotated(made, "a", 50.0)
     for name in ("b", "c"):
-        asked = profiles(made, name)
-        assert {(each["reliability"], each["durability"]) for each in asked.values()} == {
-            ("best_effort", "volatile")
-        }
+        assert {*qos(made, name).values()} == {("best_effort", "volatile")}
         made.learn(name, latched)
     for nth in range(ASKED_FOR - 2):
         profiles(made, f"later_{nth}")
-    asked = profiles(made, "d")
-    assert {each["reliability"] for each in asked.values()} == {"reliable"}
-    assert {each["durability"] for each in asked.values()} == {"transient_local"}
+    assert {*qos(made, "d").values()} == {("reliable", "transient_local")}
     # This one had not asked for the weakest: it need not wait.
     made.refused("d", "/map")
     assert made.rotation_due("d", 51.0) is not None
@@ -161,8 +163,7 @@ def test_what_a_volatile_publisher_needs_is_asked_for_reliably(tmp_path: Path) -
     made.overrides("a")
     made.learn("a", latched_split(tmp_path / "a.mcap", "/map"))
     made.refused("a", "/map", best_effort=False)
-    asked = profiles(made, "b")["/map"]
-    assert (asked["reliability"], asked["durability"]) == ("reliable", "volatile")
+    assert qos(made, "b")["/map"] == ("reliable", "volatile")
 
 
 def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_path: Path) -> None:
@@ -221,8 +222,8 @@ def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended
 def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) -> None:
     made = reception(tmp_path, latched=(), volatile=["/rosout"])
     made.learn("a", latched_split(tmp_path / "a_0.mcap", "/rosout", "/map"))
-    asked = {topic: each["durability"] for topic, each in profiles(made, "b").items()}
-    assert asked == {"/rosout": "volatile", "/map": "transient_local"}
+    latched, volatile = ("reliable", "transient_local"), ("reliable", "volatile")
+    assert qos(made, "b") == {"/rosout": volatile, "/map": latched}
 
 
 def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> None:
@@ -234,15 +235,15 @@ def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> 
         offered=OfferedQos(reliable=True, latched=True, publishers=2)
     )
     made.skip_latched(["/map", "/tf_static", "/shared", "/unknown"])
-    asked = {topic: each["durability"] for topic, each in profiles(made, "b").items()}
-    assert asked == {
-        "/map": "volatile",
-        "/tf_static": "volatile",
-        "/shared": "transient_local",
-        "/plan": "transient_local",
+    latched, volatile = ("reliable", "transient_local"), ("reliable", "volatile")
+    assert qos(made, "b") == {
+        "/map": volatile,
+        "/tf_static": volatile,
+        "/shared": latched,
+        "/plan": latched,
     }
     made.skip_latched([])
-    assert {each["durability"] for each in profiles(made, "c").values()} == {"transient_local"}
+    assert {*qos(made, "c").values()} == {latched}
 
 
 MIB = 2**20

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 from structlog.testing import capture_logs
@@ -27,7 +26,6 @@ from ros2_memory.recorder.supervisor import make_bag_dir
 from tests.support.fakes import failing
 from tests.support.housekeepers import keeper_of
 from tests.support.simulated_recorders import (
-    PlayedHousekeeper,
     World,
     assert_each_counts_once,
     assert_what_stands_counts_once,
@@ -63,14 +61,13 @@ class TestDeath:
         assert world.heartbeat()["last_error"] == died["reason"]
 
     def test_one_that_hangs_and_must_be_killed_counts_as_a_restart(self, tmp_path: Path) -> None:
-        house = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=house).started(12)
+        world = World(tmp_path).started(12)
         hung = world.recorders[0]
         hung.deaf, hung.ends_with = True, -9
         stopped = world.wall
         assert len(world.logged(40, "recorder_hung")) == 1
         assert world.heartbeat()["restarts"] == 1
-        [(first, how)] = house.restarts
+        [(first, how)] = world.house.restarts
         assert how == "hung"
         assert stopped - 6 * NS_PER_S < first <= stopped + NS_PER_S
 
@@ -119,8 +116,7 @@ class TestDeath:
         again = World(tmp_path)
         again.wall = world.wall + NS_PER_S
         with monkeypatch.context() as patch, capture_logs() as logs:
-            failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
-            patch.setattr(sessions, "unsettled_handovers", failing)
+            patch.setattr(sessions, "unsettled_handovers", failing(errno.EIO))
             again.started(3)
         assert again.supervisor.is_recording
         assert [each["task"] for each in events(logs, "supervision_failed")] == ["settle"]
@@ -213,76 +209,67 @@ class TestFailingDisk:
     def test_one_task_that_fails_keeps_no_other_from_being_done(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        keeper = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=keeper).started(3)
-
+        world = World(tmp_path).started(3)
         monkeypatch.setattr(world.recorders[0], "take_lines", failing(errno.EIO))
         [reported] = world.logged(30, "supervision_failed")
         assert (reported["task"], reported["reason"]) == ("look", "[Errno 5] Input/output error")
         world.run(40)
-        assert "apply" in keeper.asked
+        assert "apply" in world.house.asked
 
 
 class TestRecordedTime:
     def test_the_house_is_reported_what_is_recorded_and_what_it_holds_is_in_the_heartbeat(
         self, tmp_path: Path
     ) -> None:
-        housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping).started(20)
-        names, written, at_s = housekeeping.recorded[-1]
+        world = World(tmp_path).started(20)
+        names, written, at_s = world.house.recorded[-1]
         assert [*names] == world.heartbeat()["recordings"]
-        assert (written > 0, at_s) == (True, max(each[2] for each in housekeeping.recorded))
+        assert (written > 0, at_s) == (True, max(each[2] for each in world.house.recorded))
         assert world.heartbeat()["age_held"] is None
-        housekeeping.held = "2 bags stay"
+        world.house.held = "2 bags stay"
         world.run(1)
         assert world.heartbeat()["age_held"] == "2 bags stay"
         world.free = 900
         world.run(3)
-        assert housekeeping.recorded[-1][0] == ()
+        assert world.house.recorded[-1][0] == ()
 
 
 class TestSpace:
-    def world(self, tmp_path: Path) -> tuple[World, PlayedHousekeeper]:
-        housekeeping = PlayedHousekeeper()
-        housekeeping.world = World(tmp_path, housekeeper=housekeeping).started(3)
-        return housekeeping.world, housekeeping
-
     def test_a_disk_that_fills_is_first_made_room_on(self, tmp_path: Path) -> None:
-        world, housekeeping = self.world(tmp_path)
-        housekeeping.frees_to = 5000
+        world = World(tmp_path).started(3)
+        world.house.frees_to = 5000
         world.free = 900
         world.run(3)
-        assert "room 1200" in housekeeping.asked
+        assert "room 1200" in world.house.asked
         assert world.supervisor.is_recording
         assert world.heartbeat()["state"] == "recording"
 
     def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
         self, tmp_path: Path
     ) -> None:
-        housekeeping = PlayedHousekeeper()
-        housekeeping.making = True
-        world = World(tmp_path, housekeeper=housekeeping).started(3)
+        world = World(tmp_path).started(3)
+        world.house.making = True
         world.free = 600
         world.run(200)
-        assert housekeeping.asked.count("room 1200") == 1
+        assert world.house.asked.count("room 1200") == 1
         assert world.supervisor.is_recording
         world.free = 400
         world.run(2)
         assert world.heartbeat()["state"] == "paused"
 
     def test_a_pause_that_a_stop_ends_is_noted(self, tmp_path: Path) -> None:
-        world, housekeeping = self.world(tmp_path)
+        world = World(tmp_path).started(3)
         world.free = 900
         paused = world.wall
         world.run(30)
-        assert housekeeping.restarts == []
+        assert world.house.restarts == []
         world.supervisor.stop()
-        [(since, how)] = housekeeping.restarts
+        [(since, how)] = world.house.restarts
         assert how == "paused"
         assert 0 <= since - paused <= NS_PER_S
 
     def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
-        world, housekeeping = self.world(tmp_path)
+        world = World(tmp_path).started(3)
         world.free = 900
         paused = world.wall
         world.run(3)
@@ -293,7 +280,7 @@ class TestSpace:
         world.run(3)
         assert len(world.running) == 1
         assert world.heartbeat()["state"] == "recording"
-        [(since, how)] = housekeeping.restarts
+        [(since, how)] = world.house.restarts
         assert how == "paused"
         assert 0 <= since - paused <= 2 * NS_PER_S
 
@@ -308,14 +295,13 @@ class TestSpace:
         assert events(logs, "recording_paused") == []
 
     def test_while_it_pauses_room_is_asked_for_again_now_and_then(self, tmp_path: Path) -> None:
-        world, housekeeping = self.world(tmp_path)
+        world = World(tmp_path).started(3)
         world.free = 900
         world.run(200)
-        assert 3 <= housekeeping.asked.count("room 1200") <= 5
+        assert 3 <= world.house.asked.count("room 1200") <= 5
 
     def test_pausing_in_a_handover_loses_and_doubles_nothing(self, tmp_path: Path) -> None:
-        housekeeping = PlayedHousekeeper()
-        world = rotating(tmp_path, 22.25, housekeeper=housekeeping)
+        world = rotating(tmp_path, 22.25)
         world.free = 900
         world.run(3)
         assert world.running == []
@@ -351,19 +337,17 @@ class TestUnmounted:
     def test_nothing_is_recorded_onto_another_disk_and_that_is_reported(
         self, tmp_path: Path
     ) -> None:
-        housekeeping = PlayedHousekeeper()
-        world = World(tmp_path / "bags", housekeeper=housekeeping).started(3)
+        world = World(tmp_path / "bags").started(3)
         self.unmounted(world)
         assert len(world.logged(200, "disk_gone")) == 1
         assert world.running == []
         assert len(world.recorders) == 1
-        assert housekeeping.asked == ["apply"]
+        assert world.house.asked == ["apply"]
         world.supervisor.stop()
         assert list(world.bag_dir.iterdir()) == []
 
     def test_it_goes_on_by_itself_when_the_disk_is_back(self, tmp_path: Path) -> None:
-        housekeeping = PlayedHousekeeper()
-        world = World(tmp_path / "bags", housekeeper=housekeeping).started(3)
+        world = World(tmp_path / "bags").started(3)
         aside = self.unmounted(world)
         world.run(20)
         self.mounted(world, aside)
@@ -376,7 +360,7 @@ class TestUnmounted:
         beat = world.heartbeat()
         assert beat["state"] == "recording"
         assert "has been unmounted" in beat["last_error"]
-        assert [how for _, how in housekeeping.restarts] == ["paused"]
+        assert [how for _, how in world.house.restarts] == ["paused"]
 
     def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(
         self, tmp_path: Path
@@ -422,9 +406,8 @@ class TestHouse:
     def test_it_is_kept_at_the_start_and_now_and_then_when_nothing_comes(
         self, tmp_path: Path
     ) -> None:
-        housekeeping = PlayedHousekeeper()
-        World(tmp_path, housekeeper=housekeeping, silent=True).started(130)
-        assert housekeeping.asked.count("apply") == 3
+        world = World(tmp_path, silent=True).started(130)
+        assert world.house.asked.count("apply") == 3
 
 
 class TestSlowDisk:

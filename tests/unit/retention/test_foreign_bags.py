@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import anyio
 import pytest
@@ -48,6 +48,8 @@ from tests.support.simulated_recorders import events
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.recorder.housekeeping import Housekeeping
+
 
 Capture = pytest.CaptureFixture[str]
 S = 10**9
@@ -58,6 +60,11 @@ LITTLE = 1
 def late() -> SettableClock:
     """A clock an hour after the bags here."""
     return SettableClock(T0 + 3600 * S)
+
+
+def careful(bag_dir: Path, **limits: Any) -> Housekeeping:
+    """A house that leaves foreign bags alone."""
+    return house_of(bag_dir, keeps_foreign=True, **limits)
 
 
 def foreign(bag_dir: Path, *names: str, start: int = -86_400) -> list[Path]:
@@ -96,27 +103,27 @@ class TestRetention:
         bag_dir, mine, others = mixed
         for limits in ({"max_bytes": LITTLE}, {"max_age_h": 0.01}):
             for _ in range(3):
-                house_of(bag_dir, keeps_foreign=True, **limits).apply()
+                careful(bag_dir, **limits).apply()
         assert all(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
 
     def test_the_budget_counts_the_recorders_own_and_moments_alone(self, mixed: Mixed) -> None:
         bag_dir, mine, others = mixed
         (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
-        kept(house_of(bag_dir, keeps_foreign=True), bag_dir, 0, 15)
+        kept(careful(bag_dir), bag_dir, 0, 15)
         besides = sum(path.stat().st_size for path in others)
         list_bytes = (bag_dir / ".episodic" / "recordings.jsonl").stat().st_size
         counted = size_of(bag_dir) - besides - len(b"no bag")
         counted -= (bag_dir / "session_mcap" / "metadata.yaml").stat().st_size
         with structlog.testing.capture_logs() as logs:
-            house_of(bag_dir, keeps_foreign=True, max_bytes=counted).apply()
+            careful(bag_dir, max_bytes=counted).apply()
         [reported] = events(logs, "retention_applied")
         assert (reported["bags"], reported["total_bytes"]) == (0, counted)
         assert reported["foreign_bytes"] == besides + len(b"no bag")
         assert list_bytes
         [warned] = events(logs, "foreign_bags_kept")
         assert "adopt" in warned["reason"]
-        house_of(bag_dir, keeps_foreign=True, max_bytes=counted - 1).apply()
+        careful(bag_dir, max_bytes=counted - 1).apply()
         # The first two are kept in a moment, and would free nothing.
         assert [path.exists() for path in mine[:4]] == [True, True, False, True]
 
@@ -135,7 +142,7 @@ class TestRetention:
         # The directory that stays holds its number for good, whatever the file system.
         (bags / A).rename(tmp_path / "moved")
         shutil.copytree(tmp_path / "backup", bags / A)
-        house = house_of(bags, keeps_foreign=True, max_bytes=LITTLE)
+        house = careful(bags, max_bytes=LITTLE)
         house.apply()
         assert len([*(bags / A).glob("*.mcap")]) == 6
         assert [path.exists() for path in newest] == [False] * 5 + [True]
@@ -154,7 +161,7 @@ class TestRetention:
         others = foreign(tmp_path, f"{A}/{A}_77.mcap", f"{A}/theirs_0.mcap")
         newest = recording(tmp_path, B, 3 * 3600)
         with structlog.testing.capture_logs() as logs:
-            house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE).apply()
+            careful(tmp_path, max_bytes=LITTLE).apply()
         assert [path.exists() for path in mine] == [False] * 5 + [True]
         assert all(path.exists() for path in (*others, *newest))
         [reported] = events(logs, "retention_applied")
@@ -183,9 +190,7 @@ class TestRetention:
             if not own:
                 recording(bag_dir, f"rec_20260921T10{number:02}00Z", number * 600, splits=2)
         before = files_in(bag_dir)
-        house = house_of(
-            bag_dir, keeps_foreign=True, max_bytes=budget, measure_free=lambda _: PLENTY * free
-        )
+        house = careful(bag_dir, max_bytes=budget, measure_free=lambda _: PLENTY * free)
         house.apply()
         house.make_room(PLENTY)
         lost = {path.split("/")[0] for path in {*before} - {*files_in(bag_dir)}}
@@ -254,7 +259,7 @@ class TestRepair:
 class TestClearing:
     def test_a_start_that_clears_leaves_foreign_bags(self, mixed: Mixed) -> None:
         bag_dir, mine, others = mixed
-        kept(house_of(bag_dir, keeps_foreign=True), bag_dir, 0, 15)
+        kept(careful(bag_dir), bag_dir, 0, 15)
         assert in_moments(bag_dir)
         wiped = clear_bags(bag_dir, OwnRecordings(bag_dir))
         assert wiped.faults == []
@@ -269,7 +274,7 @@ class TestClearing:
     def test_of_moments_those_bags_go_that_were_saved(self, tmp_path: Path) -> None:
         own_all(tmp_path)
         recording(tmp_path, A, 0)
-        house = house_of(tmp_path, keeps_foreign=True)
+        house = careful(tmp_path)
         moments = [
             tmp_path / "moments" / str(kept(house, tmp_path, 5, 25, label).moment)
             for label in ("ours", "mixed")

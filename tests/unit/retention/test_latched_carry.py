@@ -28,6 +28,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.fakes import failing
 from tests.support.housekeepers import files_in, keeper_of
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
@@ -184,20 +185,12 @@ class TestTheBagOfCarriedMessages:
         assert "rec/rec_0.mcap" in files_in(bags)
 
     def test_where_it_cannot_be_written_bags_without_latched_messages_go_instead(
-        self, tmp_path: Path
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        class FullDisk(McapWriter):
-            def write(
-                self,
-                path: Path,
-                records: Iterable[Record],
-                *,
-                dense: bool = False,
-            ) -> None:
-                raise BagError(str(path), "it cannot be written: No space left on device")
-
         at_home(tmp_path, splits=3)
-        keeper_of(tmp_path, max_bytes=1, writer=FullDisk()).apply()
+        with monkeypatch.context() as full:
+            full.setattr(McapWriter, "write", failing())
+            keeper_of(tmp_path, max_bytes=1).apply()
         assert files_in(tmp_path) == ["rec", "rec/rec_0.mcap", "rec/rec_2.mcap"]
         keeper_of(tmp_path, max_bytes=1).apply()
         assert held(memory_of(tmp_path), DOCK, T0 + 25 * S) == (T0, {"value": "home"})

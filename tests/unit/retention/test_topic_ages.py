@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import fcntl
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from structlog.testing import capture_logs
@@ -22,13 +22,11 @@ from ros2_memory.bag_dir.state_files import (
     read_losses,
     unshipped,
 )
-from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention import repair
 from ros2_memory.retention.topic_ages import PATIENCE_S, TopicAge, TopicCutter
-from ros2_memory.storage.base import BagWriter
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
@@ -62,7 +60,6 @@ def cutter_of(
     bag_dir: Path,
     *,
     topic_ages: tuple[TopicAge, ...] = SPEECH,
-    writer: BagWriter | None = None,
     is_quiet: bool = True,
     free: int = PLENTY,
     monotonic: Callable[[], float] = lambda: 0.0,
@@ -71,7 +68,7 @@ def cutter_of(
         bag_dir,
         topic_ages,
         McapReader(),
-        writer or McapWriter(),
+        McapWriter(),
         static_topics=("/tf_static",),
         is_quiet=lambda: is_quiet,
         measure_free=lambda _: free,
@@ -200,26 +197,11 @@ def test_metadata_counts_what_is_left(bag_dir: Path) -> None:
     assert not correct(recording, McapReader()), (recording / "metadata.yaml").read_text()
 
 
-class FailingWriter(McapWriter):
-    """Cannot cut."""
-
-    def cut(self, source: Path, *_: Any) -> Counter[str]:
-        raise BagError(str(source), "no space left on device")
-
-
-class KilledError(BaseException):
-    """Ends the program."""
-
-
-class KilledWriter(McapWriter):
-    """Is killed while it cuts."""
-
-    def cut(self, *_: Any) -> Counter[str]:
-        raise KilledError
-
-
-def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(bag_dir: Path) -> None:
-    keeper = house(bag_dir, cutter_of(bag_dir, writer=FailingWriter()))
+def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(McapWriter, "cut", failing())
+    keeper = house(bag_dir, cutter_of(bag_dir))
     with capture_logs() as logs:
         keeper.apply()
         keeper.apply()
@@ -228,9 +210,13 @@ def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(bag_dir: Path)
     assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
 
 
-def test_what_a_kill_interrupted_is_counted_once(bag_dir: Path) -> None:
-    with pytest.raises(KilledError):
-        house(bag_dir, cutter_of(bag_dir, writer=KilledWriter())).apply()
+def test_what_a_kill_interrupted_is_counted_once(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(McapWriter, "cut", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            house(bag_dir, cutter_of(bag_dir)).apply()
     assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
     house(bag_dir, cutter_of(bag_dir)).apply()
     assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10, 10]

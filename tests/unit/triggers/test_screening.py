@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING
-from unittest.mock import Mock
 
 import pytest
 import structlog
@@ -21,6 +19,7 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
+from tests.support.fakes import failing
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.noting_reader import fail_reading
 from tests.support.screened_bags import (
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     from ros2_memory.triggers.exclusion import ExclusionRule
 
 VOLATILE = McapLayout(latched=frozenset())
-FULL = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 
 @pytest.fixture
@@ -237,7 +235,7 @@ def test_a_full_disk_holds_splits_back(bags: ScreenedBags, monkeypatch: pytest.M
     split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
 
     with monkeypatch.context() as patched:
-        patched.setattr(McapWriter, "cut", FULL)
+        patched.setattr(McapWriter, "cut", failing())
         bags.end()
         assert bags.served() == []
         problem = bags.screening.problem() or ""
@@ -299,7 +297,7 @@ def test_a_state_that_cannot_be_written_changes_nothing(
     before = split.read_bytes()
 
     with monkeypatch.context() as patched:
-        patched.setattr(SCREENED, "write", FULL)
+        patched.setattr(SCREENED, "write", failing())
         with pytest.raises(OSError, match="No space"):
             bags.end()
         with pytest.raises(RecorderError, match=r"screened\.json: No space"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 from dataclasses import replace
 from typing import TYPE_CHECKING
-from unittest.mock import Mock
 
 import pytest
 
@@ -16,6 +15,7 @@ from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.retention import saved_moments
 from tests.support.bags import McapLayout, Msg, boolean, text
+from tests.support.fakes import failing
 from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
 
@@ -288,11 +288,9 @@ def test_a_full_disk_keeps_the_firing_until_there_is_room(
     robot.begin(T0)
     robot.split(seconds(0, 10, {6}))
     robot.clock.at = T0 + 30 * S
-
-    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as broken:
-        broken.setattr(saved_moments, "make_moment_folder", full)
-        broken.setattr(json_files, "write_durably", full)
+        broken.setattr(saved_moments, "make_moment_folder", failing())
+        broken.setattr(json_files, "write_durably", failing())
         robot.close_all()
         robot.look()
     assert not robot.moments()
@@ -325,9 +323,7 @@ def test_where_its_state_cannot_be_read_the_budget_deletes_and_age_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = watched(tmp_path, max_bytes=10_000, max_age_h=0.02)
-
-    failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
-    monkeypatch.setattr(TRIGGERS, "read", failing)
+    monkeypatch.setattr(TRIGGERS, "read", failing(errno.EIO))
     robot.house = robot.new_house()
     name = robot.begin(T0)
     for begin in range(0, 50, 10):

@@ -33,15 +33,11 @@ def test_the_newest_distribution_is_taken_and_ros_1_never(tmp_path: Path) -> Non
     assert setup_files_here((), NOTHING, tmp_path) == (jazzy,)
 
 
-def test_an_environment_that_is_sourced_wins(tmp_path: Path) -> None:
-    jazzy = distribution(tmp_path, "jazzy")
-    assert setup_files_here((), {"PATH": str(jazzy.parent / "bin")}, tmp_path) == ()
-
-
-def test_the_setting_wins_over_both(tmp_path: Path) -> None:
-    jazzy = distribution(tmp_path, "jazzy")
+def test_an_environment_that_is_sourced_wins_and_the_setting_over_it(tmp_path: Path) -> None:
+    sourced = {"PATH": str(distribution(tmp_path, "jazzy").parent / "bin")}
     mine = Path("/home/me/ws/install/setup.bash")
-    assert setup_files_here((mine,), {"PATH": str(jazzy.parent / "bin")}, tmp_path) == (mine,)
+    assert setup_files_here((), sourced, tmp_path) == ()
+    assert setup_files_here((mine,), sourced, tmp_path) == (mine,)
 
 
 def test_without_ros_2_it_is_said_where_it_was_looked_for_and_what_to_do(tmp_path: Path) -> None:
