@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import cache, lru_cache
@@ -208,19 +209,15 @@ def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
 
 def _overwrite_in_place(target: Path, data: bytes) -> None:
     """Overwrites a file where its blocks have room for the data; else leaves it as it is."""
-    try:
+    with suppress(OSError):
         descriptor = os.open(target, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:
-        return
-    try:
-        status = os.fstat(descriptor)
-        if len(data) <= status.st_blocks * _BLOCK_BYTES:
-            # Padded with blanks, so that one write covers whatever was there before.
-            os.pwrite(descriptor, data.ljust(status.st_size), 0)
-    except OSError:
-        return
-    finally:
-        os.close(descriptor)
+        try:
+            status = os.fstat(descriptor)
+            if len(data) <= status.st_blocks * _BLOCK_BYTES:
+                # Padded with blanks, so that one write covers whatever was there before.
+                os.pwrite(descriptor, data.ljust(status.st_size), 0)
+        finally:
+            os.close(descriptor)
 
 
 _HEARTBEAT: Final = TypeAdapter(Heartbeat)

@@ -78,6 +78,10 @@ class JsonLog(Generic[_T]):
     Args:
         most_bytes: of a longer file only the end is read.
         is_brief: whether fields that have their default are not written.
+
+    Attributes:
+        current: returns the same as `rows`, which it calls only once the file has changed; None
+            where that fails.
     """
 
     def __init__(
@@ -87,6 +91,7 @@ class JsonLog(Generic[_T]):
         self._row = row
         self._most_bytes = most_bytes
         self._is_brief = is_brief
+        self.current = until_changed(name)(self.rows)
 
     @cached_property
     def _adapter(self) -> TypeAdapter[_T]:  # takes some ms to make, and most files are never there

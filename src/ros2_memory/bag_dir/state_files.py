@@ -136,15 +136,10 @@ def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
             LOST.replace(bag_dir, rows[len(rows) // 2 :])
 
 
-@until_changed(LOST_FILE)
-def _lost_rows(bag_dir: Path) -> Sequence[Loss]:
-    return LOST.rows(bag_dir)
-
-
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
     """Returns the losses that fall between two log times; none where a file cannot be read."""
     expired = EXPIRED.current(bag_dir) or Expired()
-    losses = (*(_lost_rows(bag_dir) or ()), *expired.gone, *expired.going)
+    losses = (*(LOST.current(bag_dir) or ()), *expired.gone, *expired.going)
     return [loss for loss in losses if loss.start < stop and start < loss.stop]
 
 

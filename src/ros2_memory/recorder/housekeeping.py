@@ -127,7 +127,6 @@ class Housekeeping:
             is_synchronised=is_synchronised,
             static_topics=static_topics,
             grace_s=grace_s,
-            needed=self._needed_by_rules,
             measure_free=measure_free,
             monotonic=monotonic,
             memory=memory if memory is not None and memory.keeps else None,
@@ -376,7 +375,8 @@ class Housekeeping:
             heartbeat = self._index.heartbeat()
             begun = heartbeat.recordings if heartbeat else self._own.in_order()[-_WRITTEN_AT_ONCE:]
             known = self._index.known_bags(begun, snapshot)
-            collected = self._collector.apply(known, snapshot, free_bytes_wanted)
+            needed = self._needed_by_rules(snapshot)
+            collected = self._collector.apply(known, snapshot, needed, free_bytes_wanted)
         if collected.bags or collected.cut:
             self._index.refresh()
         return collected

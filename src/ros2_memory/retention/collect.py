@@ -144,7 +144,6 @@ class GarbageCollector:
     Args:
         recorded: how long was recorded after each recording.
         grace_s: how long latched messages are carried before their bag is deleted.
-        needed: gives the bags that rules may still need, which no age deletes.
         memory: what stays of deleted bags; None where nothing does.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
     """
@@ -160,7 +159,6 @@ class GarbageCollector:
         is_synchronised: Callable[[], bool],
         static_topics: Collection[str],
         grace_s: float,
-        needed: Callable[[Snapshot], frozenset[str]],
         measure_free: Callable[[Path], int],
         monotonic: Callable[[], float],
         memory: Outliving | None,
@@ -177,7 +175,6 @@ class GarbageCollector:
         self._is_synchronised = is_synchronised
         self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
         self._grace_s = grace_s
-        self._needed = needed
         self._measure_free = measure_free
         self._monotonic = monotonic
         self._carried_since: dict[str, float] = {}
@@ -186,11 +183,19 @@ class GarbageCollector:
         self._unwritten: list[Deleted] = []
 
     def apply(
-        self, known: KnownBags, snapshot: Snapshot, free_bytes_wanted: int | None = None
+        self,
+        known: KnownBags,
+        snapshot: Snapshot,
+        needed: frozenset[str],
+        free_bytes_wanted: int | None,
     ) -> Collected:
         """Deletes what is too old, then what exceeds the budget. Reports what cannot be deleted.
 
-        `free_bytes_wanted`: how much of the disk must be free; None if that does not count.
+        Args:
+            known: the bags that the index knows.
+            snapshot: those of them that answer.
+            needed: the bags that rules may still need, which no age deletes.
+            free_bytes_wanted: how much of the disk must be free; None if that does not count.
 
         Raises:
             OSError: the free space cannot be measured, or the list of the recorder's own recordings
@@ -200,7 +205,7 @@ class GarbageCollector:
         if free_bytes_wanted is not None:
             limits = replace(limits, min_free_bytes=free_bytes_wanted)
         run = _Pass(urgent=free_bytes_wanted is not None)
-        result, needed = run.result, self._needed(snapshot)
+        result = run.result
         while True:
             contents = replace(self._contents(known, limits, run), needed=needed)
             if free_bytes_wanted is not None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
-from ros2_memory.core.spans import Spans, lies_inside, united, without
+from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:
@@ -237,7 +237,7 @@ class Cut:
         """Returns whether messages of a topic between two log times may be deleted."""
         if topic in self._latched:
             return bool(self._known)
-        return any(start <= last and first < stop for start, stop in self._all)
+        return overlaps_any(self._all, first, last)
 
 
 def add_excluded(

@@ -9,6 +9,7 @@ import errno
 import os
 import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir import state_files
-from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog
+from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog, Line
 from ros2_memory.bag_dir.own_recordings import LIST
 from ros2_memory.bag_dir.state_files import (
     DELETED,
@@ -312,13 +313,13 @@ def test_a_file_is_read_again_once_it_has_changed_and_not_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reads: list[Path] = []
-    rows = LOST.rows
+    lines = LOST.lines
 
-    def counting(bag_dir: Path) -> list[Loss]:
+    def counting(bag_dir: Path) -> Iterator[Line[Loss]]:
         reads.append(bag_dir)
-        return rows(bag_dir)
+        return lines(bag_dir)
 
-    monkeypatch.setattr(LOST, "rows", counting)
+    monkeypatch.setattr(LOST, "lines", counting)
     loss = Loss("/odom", 1, 5, 2, "stamps")
     assert read_losses(tmp_path, 0, 9) == []
     for number in (1, 2):

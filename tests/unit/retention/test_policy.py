@@ -264,22 +264,6 @@ class TestAlways:
         larger = replace(limits, max_total_bytes=limits.max_total_bytes + more)
         assert set(expired(held, larger)) <= set(expired(held, limits))
 
-    @given(stocks(), st.lists(moments, min_size=1, max_size=5))
-    def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
-        self, held: DirContents, ends: list[int]
-    ) -> None:
-        odd = [
-            bag(f"odd{number}", end, written=end, recording="ODD")
-            for number, end in enumerate(ends)
-            if end < 400 * HOUR + 1 or end > NOW
-        ]
-        held = replace(held, now=NOW)
-        more = replace(held, bags=(*held.bags, *odd))
-        # One that is longer than any recording counts as undated, too.
-        dated = (each for each in held.bags if each.end - each.start <= LIMITS.max_age_ns)
-        if any(NOW - 400 * HOUR <= each.end <= NOW for each in dated):
-            assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
-
 
 class TestMoments:
     def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
