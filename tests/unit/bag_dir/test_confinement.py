@@ -385,8 +385,9 @@ class TestWhatTheRecorderKeepsBesideBags:
         (bags / "recorder.lock").symlink_to(outside / "lock")
         with pytest.raises(RecorderError, match="cannot be opened"):
             BagDirLock.acquire(bags)
+        (bags / "x.mcap").symlink_to(kept)
         with pytest.raises(BagError, match="File exists"):
-            _write_through(bags / "x.mcap", kept)
+            McapWriter().write(bags / "x.mcap", [])
         assert contents(outside) == before
 
     def test_no_handover_is_settled_behind_a_link(self, bags: Path, outside: Path) -> None:
@@ -403,11 +404,6 @@ class TestWhatTheRecorderKeepsBesideBags:
         (bags / "rec").symlink_to(outside)
         recover_handovers(bags, McapReader())
         assert contents(outside) == before
-
-
-def _write_through(link: Path, target: Path) -> None:
-    link.symlink_to(target)
-    McapWriter().write(link, [])
 
 
 class TestArguments:

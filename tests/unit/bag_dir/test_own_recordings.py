@@ -269,10 +269,6 @@ class TestCopies:
 class TestWithoutAList:
     """Whether bags are from before the list, restored or copied: nothing shows it."""
 
-    def hand_over(self, bag_dir: Path, name: str, following: str) -> None:
-        write_handover(bag_dir / name, Handover(next=following, counts_until=1))
-        write_handover(bag_dir / following, Handover(previous=name, counts_from=1))
-
     # Adopted at the start until 0.1: a folder that was restored without its list holds the same
     # handover.json, recorder.json and custom data, and the budget deleted all of it.
     def test_recordings_are_foreign_and_the_start_says_so(self, tmp_path: Path) -> None:
@@ -280,7 +276,8 @@ class TestWithoutAList:
             embedding(tmp_path / name / f"{name}_0.mcap")
         embedding(tmp_path / "session_mcap" / "s_0.mcap")
         named_in_heartbeat(tmp_path, A)
-        self.hand_over(tmp_path, A, B)
+        write_handover(tmp_path / A, Handover(next=B, counts_until=1))
+        write_handover(tmp_path / B, Handover(previous=A, counts_from=1))
         with structlog.testing.capture_logs() as logs:
             own = claimed(tmp_path)
         assert not own.names()

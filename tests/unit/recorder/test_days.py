@@ -61,6 +61,7 @@ from tests.support.program import Program, exits
 
 S = NS_PER_S
 T0 = 1_790_000_400 * S  # 13:20 on 21 September 2026
+T0_S = T0 / S
 __all__ = ["exits"]
 DAY_FILE = "memory/20260921.thinned.mcap"
 
@@ -403,22 +404,22 @@ def test_what_was_not_recorded_is_not_answered_from_memory(bag_dir: Path, pause:
     drive_and_stand(bag_dir, "rec_C", 4000)
     own_all(bag_dir)
     whole: dict[str, dict[str, Any]] = {
-        "recap": {"start": T0 / S, "end": T0 / S + 119.9},
+        "recap": {"start": T0_S, "end": T0_S + 119.9},
         "get_topic_in_range": {
             "topic": "/bumper",
             "by": "value",
-            "start": T0 / S,
-            "end": T0 / S + 119.9,
+            "start": T0_S,
+            "end": T0_S + 119.9,
         },
     }
     recap, values = (reply_over(bag_dir, tool, **given) for tool, given in whole.items())
     for name in ("rec_A", "rec_B"):
         keep_all(bag_dir, name)
         shutil.rmtree(bag_dir / name)
-    middle = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 120 + pause / 2)
+    middle = reply_over(bag_dir, "get_position_at", timestamp=T0_S + 120 + pause / 2)
     assert middle["error"] == "no_data", middle
     assert middle["reason"] == ("gap" if pause > 20 else "deleted")
-    standing = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 60)
+    standing = reply_over(bag_dir, "get_position_at", timestamp=T0_S + 60)
     assert standing["x"] == 7.5
     thinned, states = (reply_over(bag_dir, tool, **given) for tool, given in whole.items())
     assert thinned["stood_s"] == pytest.approx(recap["stood_s"], abs=3.0)
@@ -427,7 +428,7 @@ def test_what_was_not_recorded_is_not_answered_from_memory(bag_dir: Path, pause:
     # The last message of a state may be up to 7 s before the end.
     assert times[1] == pytest.approx(times[0], abs=7.5), (values, states)
     text_then = reply_over(
-        bag_dir, "get_topic_in_range", topic="/chatter", start=T0 / S, end=T0 / S + 10
+        bag_dir, "get_topic_in_range", topic="/chatter", start=T0_S, end=T0_S + 10
     )
     assert text_then["error"] == "no_data"
 
@@ -459,7 +460,7 @@ STARTS = (0, 60, 10 * 3600 + 2370, 12 * 3600)
 
 def poses_in(folder: Path) -> list[int]:
     """How many poses there are of each of these splits."""
-    windows = ({"start": T0 / S + at, "end": T0 / S + at + 59.9} for at in STARTS)
+    windows = ({"start": T0_S + at, "end": T0_S + at + 59.9} for at in STARTS)
     replies = (reply_over(folder, "get_topic_in_range", topic="/odom", **each) for each in windows)
     return [reply["total"] for reply in replies]
 
@@ -611,7 +612,7 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     """Splits of 13:20 to 14:40; at 14:10 plus a day the hour from 13:00 is too old."""
     splits(bag_dir, range(0, 80, 10))
     own_all(bag_dir)
-    asked = {"timestamp": (T0 + 600 * S) / S}
+    asked = {"timestamp": T0_S + 600}
     exact = reply_over(bag_dir, "get_position_at", **asked)
     newest = split(bag_dir, 86_400 + 3000, name="rec_B")
     own_all(bag_dir)
@@ -627,10 +628,8 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     assert [
         note for note in reply["notes"] if "it was within x 150.00 to 150.25 and y 1.00" in note
     ]
-    assert "from" not in reply_over(bag_dir, "get_position_at", timestamp=(T0 + 3000 * S) / S)
-    whole = reply_over(
-        bag_dir, "get_topic_at_time", topic="/battery_state", timestamp=(T0 + 604.5 * S) / S
-    )
+    assert "from" not in reply_over(bag_dir, "get_position_at", timestamp=T0_S + 3000)
+    whole = reply_over(bag_dir, "get_topic_at_time", topic="/battery_state", timestamp=T0_S + 604.5)
     assert (whole["error"], whole["reason"]) == ("no_data", "deleted")
 
 
@@ -754,7 +753,7 @@ def test_forgetting_takes_it_out_of_days_to_the_byte(
     shutil.rmtree(bag_dir / "rec_A")
     assert b"vodka" in content_of(bag_dir / DAY_FILE)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
-    window = ("--start", T0 / S, "--end", T0 / S + 3600)
+    window = ("--start", T0_S, "--end", T0_S + 3600)
     exits(0, "forget", "--topic", "/vision/*", *window, "--yes")
     assert b"vodka" not in content_of(bag_dir / DAY_FILE)
     topics = {*topics_in(bag_dir)}
@@ -791,7 +790,7 @@ def test_a_silence_is_forgotten_with_its_topic(
     blind_for_three_minutes(bag_dir)
     delete_all(bag_dir)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
-    window = ("--start", T0 / S, "--end", T0 / S + 300)
+    window = ("--start", T0_S, "--end", T0_S + 300)
     exits(0, "forget", "--topic", "/odom", *window, "--yes")
     assert read_thinned(bag_dir).silences
     exits(0, "forget", "--topic", "/vision/*", *window, "--yes")
@@ -835,7 +834,7 @@ GOLDEN = Path(__file__).resolve().parents[2] / "data" / "memory_day_1.mcap"
 def test_days_of_earlier_versions_are_read(bag_dir: Path) -> None:
     (bag_dir / "memory").mkdir()
     shutil.copy(GOLDEN, bag_dir / DAY_FILE)
-    reply = reply_over(bag_dir, "get_position_at", timestamp=(T0 + 30 * S) / S)
+    reply = reply_over(bag_dir, "get_position_at", timestamp=T0_S + 30)
     assert (round(reply["x"], 1), reply["from"]) == (7.5, "memory")
     seen = {"topic": "/vision/scene/scene_objects", "condition_type": "contains"}
     found = reply_over(bag_dir, "find_last_match", **seen, value="mug")

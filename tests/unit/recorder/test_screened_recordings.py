@@ -108,9 +108,9 @@ class TestTheHouse:
         recording_now(bags.bag_dir, name)
         keeper.apply()
         snapshot = keeper._index.snapshot()
-        assert [each.path.name for each in snapshot.timeline.overlapping(window())] == [
-            f"{name}_0.mcap"
-        ]
+        window = TimeWindow(T0 - 10 * S, T0 + 60 * S)
+        [served] = snapshot.timeline.overlapping(window)
+        assert served.path.name == f"{name}_0.mcap"
         assert [each.path for each in snapshot.active] == [held]
 
     def test_a_step_runs_in_the_background_and_its_fault_is_reported(self, tmp_path: Path) -> None:
@@ -128,7 +128,3 @@ class TestTheHouse:
         assert "screened.json" in background.faults()["screen"]
         house.finish()
         assert "screened.json" in background.faults()["screen"]
-
-
-def window() -> TimeWindow:
-    return TimeWindow(T0 - 10 * S, T0 + 60 * S)

@@ -18,6 +18,7 @@ from tests.support.program import exits
 from tests.unit.recorder.test_days import (
     DAY_FILE,
     T0,
+    T0_S,
     days_of,
     house,
     messages_in,
@@ -31,7 +32,7 @@ NEWEST = T0 + 20 * 3600 * S
 
 
 def window(first: int, stop: int) -> dict[str, float]:
-    return {"start": T0 / S + 60 * first, "end": T0 / S + 60 * stop - 0.1}
+    return {"start": T0_S + 60 * first, "end": T0_S + 60 * stop - 0.1}
 
 
 def saved(keeper: Housekeeping, bag_dir: Path, start: int, end: int, now: int) -> Outcome:
@@ -81,9 +82,9 @@ def test_a_moment_answers_its_time_and_the_day_what_is_around_it(
 
     before, after = both("get_topic_in_range", topic="/odom", **window(20, 22))
     assert after == before
-    before, after = both("get_position_at", timestamp=T0 / S + 1250)
+    before, after = both("get_position_at", timestamp=T0_S + 1250)
     assert after == before
-    before, after = both("get_topic_at_time", topic="/chatter", timestamp=T0 / S + 1208)
+    before, after = both("get_topic_at_time", topic="/chatter", timestamp=T0_S + 1208)
     assert after == before
     # Across its edges nothing is counted twice, and nothing is missing.
     before, after = both("recap", **window(17, 26))
@@ -113,9 +114,9 @@ def test_several_moments_of_a_recording_and_the_day_around_them_are_of_one_robot
 def test_a_moment_that_was_deleted_by_hand_leaves_no_memory_of_its_time(bag_dir: Path) -> None:
     house(bag_dir, NEWEST, max_age_h=12, memory=days_of(bag_dir)).apply()
     shutil.rmtree(bag_dir / "moments")
-    gone = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 1250)
+    gone = reply_over(bag_dir, "get_position_at", timestamp=T0_S + 1250)
     assert gone["error"] == "no_data", gone
-    around = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 1150)
+    around = reply_over(bag_dir, "get_position_at", timestamp=T0_S + 1150)
     assert around["from"] == "memory"
 
 

@@ -46,6 +46,7 @@ from tests.support.memories import memory_of
 from tests.support.simulated_recorders import events
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from ros2_memory.recorder.housekeeping import Housekeeping
@@ -57,9 +58,8 @@ T0 = 1_790_000_000 * S
 LITTLE = 1
 
 
-def late() -> SettableClock:
-    """A clock an hour after the bags here."""
-    return SettableClock(T0 + 3600 * S)
+def bytes_of(paths: Iterable[Path]) -> int:
+    return sum(path.stat().st_size for path in paths)
 
 
 def careful(bag_dir: Path, **limits: Any) -> Housekeeping:
@@ -111,7 +111,7 @@ class TestRetention:
         bag_dir, mine, others = mixed
         (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
         kept(careful(bag_dir), bag_dir, 0, 15)
-        besides = sum(path.stat().st_size for path in others)
+        besides = bytes_of(others)
         list_bytes = (bag_dir / ".episodic" / "recordings.jsonl").stat().st_size
         counted = size_of(bag_dir) - besides - len(b"no bag")
         counted -= (bag_dir / "session_mcap" / "metadata.yaml").stat().st_size
@@ -165,7 +165,7 @@ class TestRetention:
         assert [path.exists() for path in mine] == [False] * 5 + [True]
         assert all(path.exists() for path in (*others, *newest))
         [reported] = events(logs, "retention_applied")
-        assert reported["foreign_bytes"] == sum(path.stat().st_size for path in (*others, *newest))
+        assert reported["foreign_bytes"] == bytes_of([*others, *newest])
         assert (tmp_path / A / "handover.json").exists()
 
     @settings(max_examples=examples(25), deadline=None)
@@ -217,7 +217,9 @@ class TestUpgrade:
             os.utime(path, (1, 1))
         OwnRecordings(tmp_path).claim()
         before = files_in(tmp_path)
-        keeper_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE, clock=late()).apply()
+        keeper_of(
+            tmp_path, keeps_foreign=True, max_bytes=LITTLE, clock=SettableClock(T0 + 3600 * S)
+        ).apply()
         assert files_in(tmp_path) == before
 
 
@@ -320,8 +322,8 @@ class TestReports:
         (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
         memory = self.memory(bag_dir)
         budget = memory_status(memory, Call()).budget
-        assert budget.used - budget.state == sum(path.stat().st_size for path in mine)
-        assert budget.foreign == sum(path.stat().st_size for path in others) + len(b"no bag")
+        assert budget.used - budget.state == bytes_of(mine)
+        assert budget.foreign == bytes_of(others) + len(b"no bag")
         health = anyio.run(Health(memory, "1"))
         assert health["foreign_bytes"] == budget.foreign
 
@@ -332,8 +334,8 @@ class TestReports:
         own_all(bag_dir)
         after = memory_status(memory, Call()).budget.foreign
         never = [bag_dir / "loose.mcap"]
-        left = sum(path.stat().st_size for path in never)
-        assert (before, after) == (sum(path.stat().st_size for path in others), left)
+        left = bytes_of(never)
+        assert (before, after) == (bytes_of(others), left)
         for path in never:
             path.unlink()
         memory.index.refresh()
