@@ -96,6 +96,10 @@ class TestAge:
         going = by_hours(plan, held)
         assert plan.newest not in {each.path for each in going}
 
+    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
+        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
+        assert expired(contents(*before, after), LIMITS) == ()
+
     def test_a_bag_without_messages_does_not_age_others_and_goes_with_its_time(self) -> None:
         old = bag("empty", None, written=NOW - 170 * HOUR + 1)
         deleted = expired(contents(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)

@@ -141,6 +141,23 @@ def test_what_is_gone_is_left_out_and_the_total_stays(tmp_path: Path) -> None:
     assert RecordedTime(tmp_path).since(["b"])["b"] >= 100 * S
 
 
+def test_a_link_in_place_of_its_folder_or_file_is_not_followed(tmp_path: Path) -> None:
+    elsewhere, bag_dir = tmp_path / "elsewhere", tmp_path / "bags"
+    folders(tmp_path, "elsewhere", "bags")
+    (elsewhere / "recorded.jsonl").write_text('{"recording": "a", "recorded_s": 100}\n')
+    (bag_dir / ".episodic").symlink_to(elsewhere)
+    with structlog.testing.capture_logs() as captured:
+        recorded(RecordedTime(bag_dir), "a", 200)
+    told = [each["event"] for each in captured]
+    assert told == ["recorded_time_not_read", "recorded_time_not_kept"]
+    (bag_dir / ".episodic").unlink()
+    (bag_dir / ".episodic").mkdir()
+    (bag_dir / FILE).symlink_to(elsewhere / "recorded.jsonl")
+    recorded(RecordedTime(bag_dir), "b", 200)
+    assert [path.name for path in elsewhere.iterdir()] == ["recorded.jsonl"]
+    assert (elsewhere / "recorded.jsonl").read_text().count("\n") == 1
+
+
 def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
