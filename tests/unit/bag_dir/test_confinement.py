@@ -132,6 +132,14 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
+@contextmanager
+def untouched(folder: Path) -> Iterator[None]:
+    """Nothing below the folder changes in the block."""
+    before = contents(folder)
+    yield
+    assert contents(folder) == before
+
+
 LINKS: dict[str, Any] = {
     "a file": lambda bags, rec: (bags / "run/x.mcap").symlink_to(rec / "rec_0.mcap"),
     "a db3 file": lambda bags, rec: (bags / "x.db3").symlink_to(rec / "rec_1.db3"),
@@ -162,18 +170,17 @@ def linked(request: pytest.FixtureRequest, bags: Path, outside: Path) -> None:
 
 @pytest.mark.usefixtures("linked")
 async def test_no_tool_reads_what_a_link_leads_to(bags: Path, outside: Path) -> None:
-    before = contents(outside)
-    with hearing() as heard, asking(bags) as server:
-        for name, given, _ in ANSWERED:
-            assert SECRET not in await told(server, name, given)
-        for name in ("get_topic_in_range", "get_topic_at_time"):
-            given = {"topic": SECRET, "start": T0_S, "end": T0_S + 9}
-            if name == "get_topic_at_time":
-                given = {"topic": SECRET, "timestamp": T0_S + 3}
-            assert "secret 1" not in await told(server, name, given)
-        assert "topic_not_recorded" in await told(server, name, given)
-    assert [each for each in heard if "outside" in each or "/rec_" in each] == []
-    assert contents(outside) == before
+    with untouched(outside):
+        with hearing() as heard, asking(bags) as server:
+            for name, given, _ in ANSWERED:
+                assert SECRET not in await told(server, name, given)
+            for name in ("get_topic_in_range", "get_topic_at_time"):
+                given = {"topic": SECRET, "start": T0_S, "end": T0_S + 9}
+                if name == "get_topic_at_time":
+                    given = {"topic": SECRET, "timestamp": T0_S + 3}
+                assert "secret 1" not in await told(server, name, given)
+            assert "topic_not_recorded" in await told(server, name, given)
+        assert [each for each in heard if "outside" in each or "/rec_" in each] == []
 
 
 async def test_a_directory_that_a_link_replaced_since_it_was_listed_is_not_read(
@@ -249,9 +256,8 @@ class TestDeletions:
 
     @pytest.mark.usefixtures("linked")
     def test_a_wipe_leaves_what_a_link_leads_to(self, bags: Path, outside: Path) -> None:
-        before = contents(outside)
-        clear_bags(bags)
-        assert contents(outside) == before
+        with untouched(outside):
+            clear_bags(bags)
 
     def test_a_wipe_leaves_what_takes_a_directory_s_place_meanwhile(
         self, bags: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
@@ -278,9 +284,8 @@ class TestDeletions:
         cut = outside / "rec_0.mcap"
         cut.write_bytes(cut.read_bytes()[:-100])
         (outside / "rec_9.mcap").touch()
-        before = contents(outside)
-        recover_files(bags, force=True)
-        assert contents(outside) == before
+        with untouched(outside):
+            recover_files(bags, force=True)
 
     def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
         self, bags: Path, outside: Path
@@ -289,78 +294,72 @@ class TestDeletions:
         cut.write_bytes(cut.read_bytes()[:-100])
         (outside / "rec_9.mcap").touch()
         (bags / "linked").symlink_to(outside)
-        before = contents(outside)
-        for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
-            with pytest.raises(RecorderError, match="symbolic link") as refused:
-                recover_files(path, force=True)
-            assert str(path.resolve()) in str(refused.value)
-            if path.suffix:
-                with pytest.raises(BagError, match="behind a symbolic link"):
-                    build_repairer().repair(path)
-        assert contents(outside) == before
+        with untouched(outside):
+            for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
+                with pytest.raises(RecorderError, match="symbolic link") as refused:
+                    recover_files(path, force=True)
+                assert str(path.resolve()) in str(refused.value)
+                if path.suffix:
+                    with pytest.raises(BagError, match="behind a symbolic link"):
+                        build_repairer().repair(path)
 
     def test_a_repair_leaves_a_directory_that_a_link_replaced_since(
         self, bags: Path, outside: Path
     ) -> None:
         (outside / "run_0.mcap").write_bytes(b"")
         (outside / ".run_0.mcap.repair").write_bytes(b"kept")
-        before = contents(outside)
-        house = keeper_of(bags)
-        shutil.rmtree(bags / "run")
-        (bags / "run").symlink_to(outside)
-        assert not house._repair_file(bags / "run/run_0.mcap")
-        assert not remove_if_empty(bags / "run")
-        assert contents(outside) == before
+        with untouched(outside):
+            house = keeper_of(bags)
+            shutil.rmtree(bags / "run")
+            (bags / "run").symlink_to(outside)
+            assert not house._repair_file(bags / "run/run_0.mcap")
+            assert not remove_if_empty(bags / "run")
 
     def test_nothing_is_asked_for_or_answered_behind_a_link(
         self, bags: Path, outside: Path
     ) -> None:
         (outside / "requests").mkdir()
         (outside / "requests" / f"{'0' * 32}.json").write_text("{}")
-        before = contents(outside)
-        (bags / ".episodic").symlink_to(outside)
-        with pytest.raises(OSError, match="symbolic link"):
-            PendingRequest(bags, "label", 0, 1, 2).post()
-        queue = RequestQueue(bags)
-        queue.open()
-        assert not queue.has_requests()
-        assert contents(outside) == before
+        with untouched(outside):
+            (bags / ".episodic").symlink_to(outside)
+            with pytest.raises(OSError, match="symbolic link"):
+                PendingRequest(bags, "label", 0, 1, 2).post()
+            queue = RequestQueue(bags)
+            queue.open()
+            assert not queue.has_requests()
 
     def test_no_bag_of_a_moment_is_linked_behind_a_link(self, bags: Path, outside: Path) -> None:
-        before = contents(outside)
-        (bags / "moments").mkdir()
-        (bags / "moments/a").symlink_to(outside)
-        with pytest.raises(OSError, match="symbolic link"):
-            directories.make(bags, bags / "moments/a/rec_0")
-        assert contents(outside) == before
+        with untouched(outside):
+            (bags / "moments").mkdir()
+            (bags / "moments/a").symlink_to(outside)
+            with pytest.raises(OSError, match="symbolic link"):
+                directories.make(bags, bags / "moments/a/rec_0")
 
     def test_a_store_behind_a_link_is_neither_written_nor_set_aside(
         self, bags: Path, outside: Path
     ) -> None:
         (outside / "columns.sqlite").write_text("somebody's own")
-        before = contents(outside)
-        (bags / ".episodic").symlink_to(outside)
-        (bags / "own").mkdir()
-        for name in ("columns.sqlite", "columns.sqlite-wal", "columns.sqlite-shm"):
-            link = bags / "own" / name
-            link.symlink_to(outside / "columns.sqlite")
-            refused = open_file([bags / "own" / "columns.sqlite"])
-            assert "symbolic link" in str(refused)
-            link.unlink()
-        assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
-        assert contents(outside) == before
+        with untouched(outside):
+            (bags / ".episodic").symlink_to(outside)
+            (bags / "own").mkdir()
+            for name in ("columns.sqlite", "columns.sqlite-wal", "columns.sqlite-shm"):
+                link = bags / "own" / name
+                link.symlink_to(outside / "columns.sqlite")
+                refused = open_file([bags / "own" / "columns.sqlite"])
+                assert "symbolic link" in str(refused)
+                link.unlink()
+            assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
 
     def test_a_catalogue_behind_a_link_is_not_deleted(self, bags: Path, outside: Path) -> None:
         with closing(sqlite3.connect(outside / "catalogue.sqlite")) as base:
             for name in ("bags", "configs", "held", "shapes"):
                 base.execute(f"CREATE TABLE {name} (content TEXT)")
-        before = contents(outside)
-        (bags / ".episodic").symlink_to(outside)
-        delete_catalogue(bags / ".episodic" / "catalogue.sqlite")
-        (bags / "own").mkdir()
-        (bags / "own" / "catalogue.sqlite").symlink_to(outside / "catalogue.sqlite")
-        delete_catalogue(bags / "own" / "catalogue.sqlite")
-        assert contents(outside) == before
+        with untouched(outside):
+            (bags / ".episodic").symlink_to(outside)
+            delete_catalogue(bags / ".episodic" / "catalogue.sqlite")
+            (bags / "own").mkdir()
+            (bags / "own" / "catalogue.sqlite").symlink_to(outside / "catalogue.sqlite")
+            delete_catalogue(bags / "own" / "catalogue.sqlite")
 
 
 class TestWhatTheRecorderKeepsBesideBags:
@@ -376,19 +375,18 @@ class TestWhatTheRecorderKeepsBesideBags:
 
     def test_nothing_is_written_through_a_link(self, bags: Path, outside: Path) -> None:
         kept = outside / "metadata.yaml"
-        before = contents(outside)
-        (bags / ".recorder.json.tmp").symlink_to(kept)
-        with pytest.raises(OSError, match="symbolic links"):
+        with untouched(outside):
+            (bags / ".recorder.json.tmp").symlink_to(kept)
+            with pytest.raises(OSError, match="symbolic links"):
+                write_durably(bags / "recorder.json", "{}")
+            (bags / "recorder.json").symlink_to(kept)
             write_durably(bags / "recorder.json", "{}")
-        (bags / "recorder.json").symlink_to(kept)
-        write_durably(bags / "recorder.json", "{}")
-        (bags / "recorder.lock").symlink_to(outside / "lock")
-        with pytest.raises(RecorderError, match="cannot be opened"):
-            BagDirLock.acquire(bags)
-        (bags / "x.mcap").symlink_to(kept)
-        with pytest.raises(BagError, match="File exists"):
-            McapWriter().write(bags / "x.mcap", [])
-        assert contents(outside) == before
+            (bags / "recorder.lock").symlink_to(outside / "lock")
+            with pytest.raises(RecorderError, match="cannot be opened"):
+                BagDirLock.acquire(bags)
+            (bags / "x.mcap").symlink_to(kept)
+            with pytest.raises(BagError, match="File exists"):
+                McapWriter().write(bags / "x.mcap", [])
 
     def test_no_handover_is_settled_behind_a_link(self, bags: Path, outside: Path) -> None:
         sidecar = {
@@ -400,10 +398,9 @@ class TestWhatTheRecorderKeepsBesideBags:
         }
         (outside / "handover.json").write_text(json.dumps(sidecar))
         assert read_handover(outside).problem is None
-        before = contents(outside)
-        (bags / "rec").symlink_to(outside)
-        recover_handovers(bags, McapReader())
-        assert contents(outside) == before
+        with untouched(outside):
+            (bags / "rec").symlink_to(outside)
+            recover_handovers(bags, McapReader())
 
 
 class TestArguments:
