@@ -9,13 +9,14 @@ import anyio
 import pytest
 import yaml
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.retention.policy import RetentionLimits
 from tests.support.bags import text, write_mcap
+from tests.support.heartbeats import beat
 from tests.support.memories import ROOT, memory_of
 
 if TYPE_CHECKING:
@@ -36,19 +37,6 @@ QUERIES = [
     *re.findall(r"^\| [^|]+ \| `(.*?)` \|$", PAGE, re.MULTILINE),
     *re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL),
 ]
-HEARTBEAT = Heartbeat(
-    pid=1,
-    updated=0,
-    state=RecorderState.RECORDING,
-    recordings=(),
-    since=0,
-    bytes_written=700,
-    subscribed=("/a",),
-    silent=(),
-    last_error=None,
-    interval_s=2.0,
-    lost={"/odom": 3},
-)
 CALL = Answered("ask", "no_data: gap", 0.03, 12, "abc", {"read": 2.0})
 
 
@@ -59,7 +47,7 @@ def codes(cls: type[EpisodicError] = EpisodicError) -> set[str]:
 def shown(bag_dir: Path) -> dict[str, dict[str, set[str]]]:
     """Every series of a memory that has a recorder, with its labels and their values."""
     write_mcap(bag_dir / "a" / "a_0.mcap", [text(1_700_000_000 * NS_PER_S, "x")])
-    write_heartbeat(bag_dir, HEARTBEAT)
+    beat(bag_dir, 0, RecorderState.RECORDING, lost={"/odom": 3})
     kept = RetentionLimits(max_total_bytes=5000, max_age_ns=NS_PER_S, min_free_bytes=0)
     memory = memory_of(bag_dir, limits=QuerySettings(kept=kept))
     memory.index.refresh()

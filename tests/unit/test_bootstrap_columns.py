@@ -28,12 +28,9 @@ def test_a_memory_stores_columns_unless_it_is_told_not_to(
     given = {"MEMORY_BAG_DIR": str(bag_dir), "MEMORY_DEPLOYMENT": "query_only"}
     without = load_settings(["store.enabled=false"], given)
     memory = build_memory(without)
-    assert memory.scanner is not None
     assert memory.scanner.store is None
     assert build_backfill(without, memory).filling is None
-    settings = load_settings([], given)
-    memory = build_memory(settings)
-    assert memory.scanner is not None
-    assert memory.scanner.store is not None
-    assert memory.scanner.store.path is not None
-    assert memory.scanner.store.path.is_relative_to(tmp_path / "cache")
+    store = build_memory(load_settings([], given)).scanner.store
+    assert store is not None
+    assert store.path is not None
+    assert store.path.is_relative_to(tmp_path / "cache")

@@ -18,7 +18,7 @@ from ros2_memory.core.errors import ConfigError
 from tests.support.config_folders import ROOT, copied, edit
 
 if TYPE_CHECKING:
-    pass
+    from collections.abc import Callable
 
 
 class TestConfigFolder:
@@ -32,13 +32,27 @@ class TestConfigFolder:
         assert "is not used" in (unused_config() or "")
 
 
-class TestMessageSchemas:
-    @staticmethod
-    def load(text: str, tmp_path: Path) -> object:
-        path = tmp_path / "schemas.yaml"
-        path.write_text(text)
-        return load_message_schemas(load_settings([f"reader.schemas_file='{path}'"], {}))
+def labels(text: str, tmp_path: Path) -> object:
+    path = tmp_path / "labels.yaml"
+    path.write_text(text)
+    return load_labels(load_settings([f"data.labels_file='{path}'"], {}))
 
+
+def schemas(text: str, tmp_path: Path) -> object:
+    path = tmp_path / "schemas.yaml"
+    path.write_text(text)
+    return load_message_schemas(load_settings([f"reader.schemas_file='{path}'"], {}))
+
+
+def require_refused(
+    load: Callable[[str, Path], object], tmp_path: Path, text: str, *fragments: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(text, tmp_path)
+    assert [each for each in fragments if each not in str(caught.value)] == []
+
+
+class TestMessageSchemas:
     @pytest.mark.parametrize(
         ("text", "fragment"),
         [
@@ -58,23 +72,14 @@ class TestMessageSchemas:
     def test_a_wrong_file_is_refused_by_file_and_key(
         self, text: str, fragment: str, tmp_path: Path
     ) -> None:
-        with pytest.raises(ConfigError) as caught:
-            self.load(text, tmp_path)
-        assert fragment in str(caught.value)
-        assert str(tmp_path / "schemas.yaml") in str(caught.value)
-        assert "reader.schemas_file" in str(caught.value)
+        named = str(tmp_path / "schemas.yaml"), "reader.schemas_file"
+        require_refused(schemas, tmp_path, text, fragment, *named)
 
 
 class TestLabels:
-    @staticmethod
-    def load(text: str, tmp_path: Path) -> object:
-        path = tmp_path / "labels.yaml"
-        path.write_text(text)
-        return load_labels(load_settings([f"data.labels_file='{path}'"], {}))
-
     def test_are_spellings_by_the_name_that_is_shown(self, tmp_path: Path) -> None:
         text = "labels: {mug: [coffee mug, Mug], remote control: [tv-remote]}\n"
-        assert self.load(text, tmp_path) == {
+        assert labels(text, tmp_path) == {
             "mug": ("coffee mug", "Mug"),
             "remote control": ("tv-remote",),
         }
@@ -109,17 +114,14 @@ class TestLabels:
     def test_a_wrong_file_is_refused_by_file_and_key(
         self, text: str, fragment: str, tmp_path: Path
     ) -> None:
-        with pytest.raises(ConfigError) as caught:
-            self.load(text, tmp_path)
-        assert fragment in str(caught.value)
-        assert str(tmp_path / "labels.yaml") in str(caught.value)
-        assert "data.labels_file" in str(caught.value)
+        named = str(tmp_path / "labels.yaml"), "data.labels_file"
+        require_refused(labels, tmp_path, text, fragment, *named)
 
     def test_the_shipped_examples_are_valid(self, tmp_path: Path) -> None:
         shipped = (ROOT / "config/labels.yaml").read_text()
         _, commented = shipped.split("labels: {}\n\n")
         uncommented = "".join(line.removeprefix("# ") for line in commented.splitlines(True))
-        assert self.load(uncommented, tmp_path) == {
+        assert labels(uncommented, tmp_path) == {
             "mug": ("coffee mug", "tea cup"),
             "sofa": ("couch", "settee"),
             "remote control": ("remote", "tv controller"),

@@ -185,7 +185,9 @@ def parse_arguments(given: Sequence[str], schemas: Mapping[str, JsonObject]) -> 
                 "key=value, such as seconds_ago=10, or one JSON object, or name a bag or a folder "
                 "of bags"
             )
-        arguments[key] = text if _takes_text(schemas.get(key, {})) else _from_json(text, text)
+        # A list in place of one text is read from its JSON by the argument itself.
+        is_text = schemas.get(key, {}).get("type") == "string"
+        arguments[key] = text if is_text else _from_json(text, text)
     return arguments
 
 
@@ -229,14 +231,6 @@ def _from_json(text: str, otherwise: str | None) -> JsonValue:
     except (ValueError, RecursionError):
         return otherwise
     return value
-
-
-def _takes_text(schema: JsonObject) -> bool:
-    several = schema.get("anyOf")
-    forms = several if isinstance(several, list) else []
-    kinds = [form.get("type") for form in forms if isinstance(form, dict)]
-    # A list in place of one text is read from its JSON by the argument itself.
-    return schema.get("type") == "string" or kinds == ["string", "array"]
 
 
 def _arguments(tool: Tool) -> Iterator[tuple[str, JsonObject]]:

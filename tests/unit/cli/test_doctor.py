@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 from mcap.writer import Writer
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts
 from ros2_memory.cli import doctor
 from ros2_memory.core.timebase import NS_PER_S, iso_local
-from tests.support import stub_ros2
+from tests.support import heartbeats, stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.unit.cli.conftest import left
 
@@ -79,19 +79,9 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> Path:
 
 
 def beat(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, **more: Any) -> None:
-    now = time.time_ns()
-    fields: dict[str, Any] = {
-        "pid": os.getpid(),
-        "updated": now,
-        "recordings": ("rec",),
-        "since": now,
-        "bytes_written": 0,
-        "subscribed": ("/odom",),
-        "silent": (),
-        "last_error": None,
-        "interval_s": 2.0,
-    }
-    write_heartbeat(bag_dir, Heartbeat(state=state, **(fields | more)))
+    now = more.pop("at", time.time_ns())
+    given: dict[str, Any] = {"recordings": ("rec",), "subscribed": ("/odom",)}
+    heartbeats.beat(bag_dir, now, state, **(given | more))
 
 
 @pytest.fixture
@@ -164,7 +154,7 @@ class Fault(NamedTuple):
         Fault(
             2,
             ["recorder: its last heartbeat was"],
-            {"updated": time.time_ns() - 3600 * NS_PER_S},
+            {"at": time.time_ns() - 3600 * NS_PER_S},
         ),
         Fault(1, ["recorder: .*no messages from: /scan"], {"silent": ("/scan",)}),
         Fault(1, ["recorder: its last error: it died"], {"last_error": "it died"}),

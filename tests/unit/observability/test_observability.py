@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from mcp import Client, MCPError
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.core.timebase import NS_PER_S
@@ -23,6 +22,7 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.support.bags import text, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 from tests.support.memories import memory_of
 from tests.unit.serving.test_dispatch import served, tool, value
 
@@ -114,21 +114,6 @@ class TestMetrics:
             metrics.stop()
 
 
-def heartbeat(pid: int, updated: int) -> Heartbeat:
-    return Heartbeat(
-        pid=pid,
-        updated=updated,
-        state=RecorderState.PAUSED,
-        recordings=(),
-        since=T0,
-        bytes_written=700,
-        subscribed=("/a", "/b"),
-        silent=("/b",),
-        last_error=None,
-        interval_s=2.0,
-    )
-
-
 def measured(gauges: MemoryGauges) -> dict[str, float]:
     """The values of this moment, by name and label."""
     return {
@@ -175,7 +160,8 @@ def test_they_show_how_much_is_kept_and_how_old_the_newest_is(tmp_path: Path) ->
 def test_they_show_what_the_recorder_reports_and_whether_it_is_another_one(tmp_path: Path) -> None:
     clock = SettableClock(T0 + 9 * NS_PER_S)
     gauges = MemoryGauges(memory_of(tmp_path, clock=clock))
-    write_heartbeat(tmp_path, heartbeat(7, T0 + 5 * NS_PER_S))
+    told = {"pid": 7, "since": T0, "bytes_written": 700, "silent": ("/b",), "lost": {"/odom": 3}}
+    beat(tmp_path, T0 + 5 * NS_PER_S, RecorderState.PAUSED, **told)
     found = measured(gauges)
     states = {each: found[f"recorder_state {each}"] for each in RecorderState}
     assert [each for each, is_it in states.items() if is_it] == [RecorderState.PAUSED]
@@ -184,10 +170,9 @@ def test_they_show_what_the_recorder_reports_and_whether_it_is_another_one(tmp_p
     assert found["recorder_silent_topics"] == 1
     assert found["recorder_restarts_total"] == 0
     assert found["recorder_state_since_timestamp_seconds"] == T0 / NS_PER_S
-    write_heartbeat(tmp_path, replace(heartbeat(7, T0 + 5 * NS_PER_S), lost={"/odom": 3}))
-    assert measured(gauges)["recorder_lost_messages /odom"] == 3
+    assert found["recorder_lost_messages /odom"] == 3
     for pid, restarts in ((7, 0), (8, 1), (8, 1), (9, 2)):
-        write_heartbeat(tmp_path, replace(heartbeat(pid, T0), interval_s=2.0))
+        beat(tmp_path, T0, RecorderState.PAUSED, pid=pid)
         assert measured(gauges)["recorder_restarts_total"] == restarts
     clock.at += 3600 * NS_PER_S
     assert measured(gauges)["recorder_live"] == 0

@@ -71,7 +71,6 @@ def outlines_in(bag_dir: Path) -> list[tuple[int, str]]:
 
 
 def stored(memory: Memory) -> list[str]:
-    assert memory.scanner is not None
     assert memory.scanner.store is not None
     return sorted(memory.scanner.store.paths())
 
@@ -102,7 +101,6 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
         pass
     outlines = outlines_in(tmp_path)
     memory, backfill = storing(tmp_path, reading="after")
-    assert memory.scanner is not None
     before = len(memory.scanner.fragments_of_others())
     assert backfill.follow()
     assert 0 < len(memory.scanner.fragments_of_others()) < before
@@ -111,9 +109,7 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
     assert memory.scanner.fragments_of_others() == []
     # They depend on no settings.
     assert outlines_in(tmp_path) == outlines != []
-    known = storing(tmp_path, reading="before")[0].scanner
-    assert known is not None
-    assert known.fragments_of_others() == []
+    assert storing(tmp_path, reading="before")[0].scanner.fragments_of_others() == []
 
 
 def test_bags_that_a_crash_left_open_keep_nothing_from_being_joined(

@@ -13,12 +13,13 @@ import anyio.lowlevel
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.health import NAMED, Health, keep_fresh
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
@@ -26,21 +27,6 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 T0 = 1_784_023_200 * NS_PER_S
-
-
-def beat(state: RecorderState, *, updated: int = T0, last_error: str | None = None) -> Heartbeat:
-    return Heartbeat(
-        pid=1,
-        updated=updated,
-        state=state,
-        recordings=(),
-        since=T0,
-        bytes_written=0,
-        subscribed=("/a", "/b"),
-        silent=("/b",),
-        last_error=last_error,
-        interval_s=2.0,
-    )
 
 
 def memory_at(bag_dir: Path, *, seconds: int = 0) -> Memory:
@@ -105,7 +91,7 @@ async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) 
 
 
 async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), restarts=2, missing=("/c",)))
+    beat(tmp_path, T0, RecorderState.RECORDING, restarts=2, silent=("/b",), missing=("/c",))
     reply = await Health(memory_at(tmp_path, seconds=3), "1")()
     assert reply["status"] == "ok"
     assert reply["recorder"] == {
@@ -128,28 +114,20 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("heartbeat", "seconds", "problem"),
+    ("state", "seconds", "problems"),
     [
-        (beat(RecorderState.RECORDING), 600, "the recorder died"),
-        (
-            beat(RecorderState.PAUSED, last_error="disk full"),
-            1,
-            "the recorder is paused: disk full",
-        ),
+        (RecorderState.RECORDING, 600, ["the recorder died"]),
+        (RecorderState.PAUSED, 1, ["the recorder is paused: disk full"]),
+        (RecorderState.STOPPED, 600, None),
     ],
 )
-async def test_a_recorder_that_does_not_record_degrades_it(
-    tmp_path: Path, heartbeat: Heartbeat, seconds: int, problem: str
+async def test_a_recorder_that_does_not_record_degrades_it_unless_it_was_stopped(
+    tmp_path: Path, state: RecorderState, seconds: int, problems: list[str] | None
 ) -> None:
-    write_heartbeat(tmp_path, heartbeat)
+    beat(tmp_path, T0, state, last_error="disk full")
     reply = await Health(memory_at(tmp_path, seconds=seconds), "1")()
-    assert reply["status"] == "degraded"
-    assert reply["problems"] == [problem]
-
-
-async def test_a_recorder_that_was_stopped_is_no_problem(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, beat(RecorderState.STOPPED))
-    assert (await Health(memory_at(tmp_path, seconds=600), "1")())["status"] == "ok"
+    assert reply["status"] == ("degraded" if problems else "ok")
+    assert reply.get("problems") == problems
 
 
 async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(tmp_path: Path) -> None:
@@ -201,17 +179,16 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
     for number in range(50):
         (tmp_path / f"{'x' * 200}{number}.mcap").write_bytes(b"no bag at all, but not empty")
     names = tuple(f"/topic_{n}/{'y' * 300}" for n in range(1000))
-    reply = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
-    write_heartbeat(
+    beat(
         tmp_path,
-        replace(
-            reply,
-            silent=names,
-            subscribed=names,
-            missing=names,
-            unheard=names[:5],
-            required_missing=names[:7],
-        ),
+        T0 + 3600 * NS_PER_S,
+        RecorderState.PAUSED,
+        last_error="z" * 100_000,
+        silent=names,
+        subscribed=names,
+        missing=names,
+        unheard=names[:5],
+        required_missing=names[:7],
     )
     said = await Health(memory_at(tmp_path, seconds=3600), "1")()
     assert len(json.dumps(said)) < 14_000
@@ -222,17 +199,15 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
 
 
 async def test_topics_that_are_offered_and_not_recorded_degrade_it(tmp_path: Path) -> None:
-    heard = beat(RecorderState.RECORDING)
-    write_heartbeat(
+    beat(
         tmp_path,
-        replace(
-            heard,
-            unknown_types=("/arm",),
-            unheard=("/scan",),
-            fell_silent=("/odom",),
-            required_missing=("/odom: it came regularly, and is silent",),
-            advice="look at the users",
-        ),
+        T0,
+        RecorderState.RECORDING,
+        unknown_types=("/arm",),
+        unheard=("/scan",),
+        fell_silent=("/odom",),
+        required_missing=("/odom: it came regularly, and is silent",),
+        advice="look at the users",
     )
     report = await Health(memory_at(tmp_path), "1.2.3")()
     assert report["status"] == "degraded"

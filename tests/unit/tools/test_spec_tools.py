@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import inspect
 import json
 import math
 import os
@@ -19,7 +18,7 @@ from ros2_memory.serving.mcp_server import _listed
 from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.arguments import At, LastMatchArguments, MotionArguments
 from ros2_memory.tools.build import build_tools
-from ros2_memory.tools.declaration import Signature, Tool, ToolDeclaration
+from ros2_memory.tools.declaration import Signature, Tool
 from ros2_memory.tools.instructions import instructions
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of, replied
@@ -299,15 +298,3 @@ def read(given: dict[str, Any]) -> LastMatchArguments:
 @pytest.mark.parametrize("given", ["position", ["position"], '["position"]', ("position",)])
 def test_fields_may_be_one_name_a_list_or_its_json_text(given: Any) -> None:
     assert read({"value": "x", "fields": given}).fields == ("position",)
-
-
-@pytest.mark.parametrize("declaration", DECLARATIONS, ids=lambda each: each.names[0].name)
-def test_a_query_has_a_parameter_for_each_argument(declaration: ToolDeclaration) -> None:
-    memory, call, *parameters = inspect.signature(declaration.query).parameters
-    assert (memory, call) == ("memory", "call")
-    arguments = set(declaration.arguments.model_fields)
-    of_declaration = {"between"} | ({"by"} if declaration.count else set())
-    assert set(parameters) == arguments - of_declaration
-    if declaration.count is not None:
-        memory, call, *counting = inspect.signature(declaration.count).parameters
-        assert {"by"} <= set(counting) <= arguments
