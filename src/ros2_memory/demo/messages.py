@@ -63,10 +63,9 @@ STREAMS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Message `k` of a stream; `t` is the robot's time (s since its start) that it describes."""
+    """A message of a stream; `t` is the robot's time (s since its start) that it describes."""
 
     stream: Stream
-    k: int
     log_time: Ns
     publish_time: Ns
     t: float
@@ -82,25 +81,19 @@ class MessageSchedule:
     t0: Ns
     start: Ns
 
-    def message(self, stream: Stream, k: int) -> Message:
-        """Returns message `k` of the stream."""
-        published = self.t0 + k * stream.period
-        heard = max(published, self.start) + _delay(stream, k)
-        return Message(stream, k, heard, published, (published - self.t0) / NS_PER_S)
-
     def messages(self, stream: Stream) -> Iterator[Message]:
         """Yields the stream's messages from the start on, without end; one if it is latched."""
-        for k in count(self._first(stream)):
-            yield self.message(stream, k)
+        first = 0 if stream.latched else -((self.t0 - self.start) // stream.period)
+        for k in count(first):
+            published = self.t0 + k * stream.period
+            heard = max(published, self.start) + _delay(stream, k)
+            yield Message(stream, heard, published, (published - self.t0) / NS_PER_S)
             if stream.latched:
                 break
 
     def everything(self) -> Iterator[Message]:
         """Yields all streams' messages in the order in which they are received, without end."""
         return merge(*map(self.messages, STREAMS), key=lambda message: message.log_time)
-
-    def _first(self, stream: Stream) -> int:
-        return 0 if stream.latched else -((self.t0 - self.start) // stream.period)
 
 
 def _delay(stream: Stream, k: int) -> Ns:

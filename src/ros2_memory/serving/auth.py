@@ -41,8 +41,6 @@ HEALTH_PATH: Final = "/health"
 MCP_PATH: Final = "/mcp"
 RECORDING_PATH: Final = "/health/recording"
 LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-AUTHENTICATED: Final = "ros2_memory.authenticated"
-"""The key in the scope of a request to `/health`: whether it showed the token."""
 
 VARIABLE: Final = "MEMORY_API_TOKEN"
 FILE_VARIABLE: Final = "MEMORY_API_TOKEN_FILE"
@@ -56,7 +54,7 @@ LOG_INTERVAL_S: Final = 60.0
 _ROBOTS: Final = "ros2_memory.robots"
 """The key in the scope of a request: the robots that its token is for; absent where for all."""
 _ADMITTED: Final = "ros2_memory.admitted"
-"""The key in the state of a request, which its connection can read."""
+"""The key in the state of a request, which its connection and `/health` can read."""
 _SAME_SITE: Final = frozenset({"same-origin", "none"})
 """Values of Sec-Fetch-Site for a page of this server, or no page at all."""
 _ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
@@ -100,8 +98,8 @@ class TokenGate:
     """Passes on requests with the right `Authorization: Bearer ...` (RFC 6750, section 2.1).
 
     Every other request is answered with 401 before its body is read. `/health` is passed on without
-    a token too, marked as such. A token in a query string is not accepted, since query strings are
-    logged. Only tokens' digests are kept, and digests are compared in constant time.
+    a token too, and is not admitted then. A token in a query string is not accepted, since query
+    strings are logged. Only tokens' digests are kept, and digests are compared in constant time.
 
     `token` is for everything. Each of `limited` is for the questions of MCP alone, about the
     robots that it has here; for `/health` it counts as none.
@@ -131,14 +129,14 @@ class TokenGate:
         is_health = scope["path"] in {HEALTH_PATH, RECORDING_PATH}
         if is_right and robots is None:
             admit(scope)
-            await self._app({**scope, AUTHENTICATED: True}, receive, send)
+            await self._app(scope, receive, send)
         elif is_health and (is_right or not shown):
-            await self._app({**scope, AUTHENTICATED: False}, receive, send)
+            await self._app(scope, receive, send)
         elif is_right and not scope["path"].startswith(_QUESTIONS):
             await _FORBIDDEN(scope, receive, send)
         elif is_right:
             admit(scope)
-            await self._app({**scope, AUTHENTICATED: False, _ROBOTS: robots}, receive, send)
+            await self._app({**scope, _ROBOTS: robots}, receive, send)
         else:
             self._log_refused(scope, is_wrong=bool(shown))
             refusal = _unauthorized(is_wrong=bool(shown), speaks_mcp=scope["path"] == MCP_PATH)

@@ -19,12 +19,12 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from ros2_memory.serving.auth import (
-    AUTHENTICATED,
     HEALTH_PATH,
     MCP_PATH,
     RECORDING_PATH,
     ForgeryGuard,
     TokenGate,
+    is_admitted,
 )
 from ros2_memory.serving.page import Page
 from ros2_memory.serving.request_limits import RequestLimits
@@ -108,16 +108,13 @@ def web_app(
         for json_response in (True, False)
     )
 
-    def shows_all(request: Request) -> bool:
-        return not needs_token or request.scope.get(AUTHENTICATED, False)
-
     async def show_health(request: Request) -> JSONResponse:
         report = await health()
         # Enough for a monitor that only watches that the server is up.
-        return JSONResponse(report if shows_all(request) else {"status": report["status"]})
+        return JSONResponse(report if is_admitted(request.scope) else {"status": report["status"]})
 
     async def show_recording(request: Request) -> JSONResponse:
-        return _recording(await health(), all_of_it=shows_all(request))
+        return _recording(await health(), all_of_it=is_admitted(request.scope))
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:

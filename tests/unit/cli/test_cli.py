@@ -43,10 +43,6 @@ class TestAsk:
         assert "\x1b" not in shown
         assert "\\x1b[31mred" in shown
 
-    def test_a_name_that_no_tool_has_lists_those_that_are(self, exits: Program) -> None:
-        listed = "the tools are: list_recorded_topics, data_time_range"
-        assert listed in exits(1, "ask where_am_i").out
-
     def test_without_a_name_the_tools_are_listed_with_their_arguments(self, exits: Program) -> None:
         assert "seconds_ago, topic?, tolerance_s?" in exits(0, "ask").out
 

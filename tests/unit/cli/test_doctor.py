@@ -116,11 +116,6 @@ def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
     assert f"MEMORY_CONFIG_DIR={beside}" in output
 
 
-def test_a_refused_configuration_is_an_error(examined: Examined) -> None:
-    wrong = examined(2, "server.prot=1")
-    assert "server.prot" in wrong["config"][0]["seen"]
-
-
 def test_data_from_the_future_means_that_the_clock_is_wrong(
     robot: Path, examined: Examined
 ) -> None:
@@ -201,6 +196,13 @@ class Fault(NamedTuple):
             2,
             ["ros: .*/opt/ros/none/setup.bash.* -> .*recorder.setup_files"],
             setting="recorder.setup_files=[/opt/ros/none/setup.bash]",
+        ),
+        Fault(2, ["config: server.prot: .*-> correct the key"], setting="server.prot=1"),
+        Fault(
+            1,
+            ["topics: /mic in retention.topics is no topic that is recorded -> compare"],
+            setting="'retention.topics={/odom: {max_age_h: 1}, /o*: {max_age_h: 1}, "
+            "/mic: {max_age_h: 1}}'",
         ),
         Fault(2, ["server: .*-> .*ros2-memory-server"], setting="server.port=1"),
         Fault(2, ["disk: .*-> recording pauses"], setting="retention.min_free_gb=1000000.0"),
@@ -380,14 +382,6 @@ def test_the_list_that_up_wrote_beside_the_bags_is_that_of_its_recorder(
     assert any("another list" in each["seen"] for each in examined(1)["topics"])
     (robot / "topics.yaml").write_text("topics: [/odom]\n")
     assert "topics" not in examined(0)
-
-
-def test_a_shorter_life_of_a_topic_that_nobody_records_is_reported(
-    robot: Path, examined: Examined
-) -> None:
-    lives = "{/odom: {max_age_h: 1}, /o*: {max_age_h: 1}, /mic: {max_age_h: 1}}"
-    [finding] = examined(1, f"'retention.topics={lives}'")["topics"]
-    assert finding["seen"] == "/mic in retention.topics is no topic that is recorded"
 
 
 def test_what_is_not_read_is_reported_with_its_reason(robot: Path, examined: Examined) -> None:

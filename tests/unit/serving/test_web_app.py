@@ -168,7 +168,8 @@ FOREIGN = [
 @pytest.mark.parametrize("host", ["127.0.0.1", EVERYWHERE, "192.168.7.20", "robot.lan"])
 async def test_every_path_refuses_the_host_names_of_other_sites(host: str) -> None:
     async with client(app(host)) as http:
-        for path, name in product(PATHS[1:], FOREIGN):
+        others = ["192.168.7.20:9203"] if host == "127.0.0.1" else []
+        for path, name in product(PATHS[1:], [*FOREIGN, *others]):
             response = await http.get(path, headers={"host": name})
             assert response.status_code == 421, (path, name)
 
@@ -191,12 +192,6 @@ async def test_the_server_answers_to_its_own_names_and_addresses(host: str, name
     async with client(app(host)) as http:
         response = await http.get("/health", headers={"host": name, "origin": f"http://{name}"})
     assert response.status_code == 200
-
-
-async def test_a_loopback_server_does_not_answer_to_other_addresses() -> None:
-    async with client(app("127.0.0.1")) as http:
-        response = await http.get("/health", headers={"host": "192.168.7.20:9203"})
-    assert response.status_code == 421
 
 
 PATHS = ["/", "/health", "/sse", "/mcp", "/messages/"]
