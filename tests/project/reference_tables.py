@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
+    from ros2_memory.core.errors import EpisodicError
     from ros2_memory.tools.declaration import Tool
 
 SOURCE: Final = ROOT / "src" / "ros2_memory"
@@ -106,6 +107,11 @@ def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
         f"- {', '.join(names)} ({kind}): {told.removesuffix(' (ns)')}"
         for (kind, told), names in alike.items()
     )
+
+
+def codes(cls: type[EpisodicError]) -> set[str]:
+    """The codes of an error and of those below it."""
+    return {cls.code}.union(*(codes(each) for each in cls.__subclasses__()))
 
 
 def exit_table() -> str:

@@ -15,6 +15,7 @@ from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.retention.policy import RetentionLimits
+from tests.project.reference_tables import codes
 from tests.support.bags import text, write_mcap
 from tests.support.heartbeats import beat
 from tests.support.memories import ROOT, memory_of
@@ -40,10 +41,6 @@ QUERIES = [
 CALL = Answered("ask", "no_data: gap", 0.03, 12, "abc", {"read": 2.0})
 
 
-def codes(cls: type[EpisodicError] = EpisodicError) -> set[str]:
-    return {cls.code}.union(*(codes(each) for each in cls.__subclasses__()))
-
-
 def shown(bag_dir: Path) -> dict[str, dict[str, set[str]]]:
     """Every series of a memory that has a recorder, with its labels and their values."""
     write_mcap(bag_dir / "a" / "a_0.mcap", [text(1_700_000_000 * NS_PER_S, "x")])
@@ -62,7 +59,7 @@ def shown(bag_dir: Path) -> dict[str, dict[str, set[str]]]:
             for label, value in sample.labels.items():
                 series.setdefault(label, set()).add(value)
     answers = found["ros2_memory_answers_total"]
-    answers["outcome"] = codes() | {"ok", "cancelled"}
+    answers["outcome"] = codes(EpisodicError) | {"ok", "cancelled"}
     answers["reason"] = {""} | {reason.value for reason in NoDataReason}
     return found
 

@@ -171,12 +171,11 @@ def test_every_log_event_stands_there_with_its_fields() -> None:
 
 
 def test_every_error_code_and_every_reason_stands_there() -> None:
-    def codes(cls: type[EpisodicError]) -> set[str]:
-        return {cls.code}.union(*(codes(each) for each in cls.__subclasses__()))
-
     tables = set(re.findall(r"^\| `(\w+)` \|", page("errors"), re.MULTILINE))
     tables -= {"error", "reason"}  # their heads
-    expected = codes(EpisodicError) - {"no_data"} | {reason.value for reason in NoDataReason}
+    expected = reference.codes(EpisodicError) - {"no_data"} | {
+        reason.value for reason in NoDataReason
+    }
     assert tables == expected
 
 

@@ -7,7 +7,6 @@ for what the registry demands of packages of PyPI.
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import sys
@@ -16,10 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
-from mcp import Client
-from mcp.client.stdio import StdioServerParameters, stdio_client
-from mcp.types import TextContent
 
+from tests.project.test_documents import asked
 from tests.support.memories import ROOT
 from tests.support.robot_run import write_run
 
@@ -63,10 +60,4 @@ async def test_a_client_that_runs_the_package_so_is_answered(tmp_path: Path) -> 
         if variable["name"] not in given:
             assert not variable.get("isRequired")
             given[variable["name"]] = variable["default"]
-    server = StdioServerParameters(command=program, args=arguments, env=given)
-    with Path(os.devnull).open("w", encoding="utf-8") as log:
-        async with Client(stdio_client(server, errlog=log)) as client:
-            result = await client.call_tool("get_position_seconds_ago", {"seconds_ago": 1})
-    [block] = result.content
-    assert isinstance(block, TextContent)
-    assert json.loads(block.text)["topic"] == "/odom"
+    assert (await asked(program, arguments, given))["reply"]["bags"] == 1

@@ -8,6 +8,7 @@ from mcp import Client
 
 from ros2_memory import package_version
 from ros2_memory.bootstrap import (
+    build_backfill,
     build_memory,
     build_reader,
     build_server,
@@ -27,26 +28,30 @@ def test_what_a_reader_refuses_is_told_in_its_own_words(tmp_path: Path) -> None:
         build_reader(refused)
 
 
-@pytest.mark.parametrize(
-    ("override", "key", "expected"),
-    [
-        ("server.name=memory_two", "name", "memory_two"),
-        ("data.time_tolerance_s=0.7", "tolerance", "default 0.7"),
-    ],
-)
-async def test_the_server_is_built_as_configured(
-    tmp_path: Path, override: str, key: str, expected: str
-) -> None:
-    chosen = settings(tmp_path, override)
+async def test_the_server_is_built_as_configured(tmp_path: Path) -> None:
+    chosen = settings(tmp_path, "server.name=memory_two", "data.time_tolerance_s=0.7")
     async with Client(build_server(chosen, build_memory(chosen))) as client:
-        info = client.server_info
-        assert info is not None
-        texts = {
-            "name": info.name,
-            "tolerance": str([tool.description for tool in (await client.list_tools()).tools]),
-        }
-        assert info.version == version("ros2-memory") == package_version()
-    assert expected in texts[key]
+        info, tools = client.server_info, (await client.list_tools()).tools
+    assert info is not None
+    assert (info.name, info.version) == ("memory_two", version("ros2-memory"))
+    assert info.version == package_version()
+    assert "default 0.7" in str([tool.description for tool in tools])
+
+
+def test_a_memory_stores_columns_unless_it_is_told_not_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    bag_dir = tmp_path / "bags"
+    bag_dir.mkdir()
+    without = settings(bag_dir, "recorder=none", "store.enabled=false")
+    memory = build_memory(without)
+    assert memory.scanner.store is None
+    assert build_backfill(without, memory).filling is None
+    store = build_memory(settings(bag_dir, "recorder=none")).scanner.store
+    assert store is not None
+    assert store.path is not None
+    assert store.path.is_relative_to(tmp_path / "cache")
 
 
 async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:

@@ -19,15 +19,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.layout import LIST_FILE
+from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
 from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
+from ros2_memory.columns.store import FILE
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, log_entry, odom, text, write_mcap
 from tests.support.forked_commands import write_command
-from tests.support.housekeepers import own_all
+from tests.support.housekeepers import own_all, recorded_before
+from tests.unit.cli.conftest import left
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -236,6 +238,26 @@ class TestRecordings:
         # Without the bag that had some of it, and what has a part in common with that.
         with closing(sqlite3.connect(store)) as base:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
+
+
+class TestIndex:
+    def test_it_fills_the_store_beside_the_bags(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+    ) -> None:
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(recorded_before(tmp_path)))
+        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+        left(write_mcap(tmp_path / "rec" / "rec_0.mcap", seconds(0, 5)))
+        (line,) = exits(0, "index").err.splitlines()
+        assert line.endswith("1 of 1 bag is stored")
+        assert (tmp_path / OWN_FOLDER / FILE).is_file()
+
+    def test_where_no_store_can_be_written_it_says_so(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+    ) -> None:
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+        (tmp_path / OWN_FOLDER).write_text("a file where a folder should be")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / OWN_FOLDER))
+        assert "XDG_CACHE_HOME" in exits(2, "index").err
 
 
 class TestCat:

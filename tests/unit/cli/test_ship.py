@@ -126,15 +126,12 @@ def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
 
 
 def test_full_batches_do_not_wait_for_each_other(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ship: Ship, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
     waited: list[float] = []
     monkeypatch.setattr(ship_module, "_wait", waited.append)
-    settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake"]
-    hourly = ["deployment=lake", "lake.commit_interval_s=3600"]
-    assert cli.main(["ship", "--once", *hourly, *settings]) == 0
+    ship(0, "lake.commit_interval_s=3600")
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
     assert waited == []
 

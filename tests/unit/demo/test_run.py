@@ -1,19 +1,15 @@
-"""How the demo's server is started, on a free port and by nobody's settings; and what is printed.
-
-That fits a terminal, and leaves nothing of an answer unsaid.
-"""
+"""What the demo prints, which fits a terminal and leaves nothing unsaid; and what it refuses."""
 
 from __future__ import annotations
 
 import json
-import socket
 from pathlib import Path
 
 import pytest
 
-from ros2_memory.core.errors import ConfigError, EpisodicError
+from ros2_memory.core.errors import ConfigError
 from ros2_memory.demo.questions import QUESTIONS, Exchange
-from ros2_memory.demo.run import format_exchange, run_demo, running_server
+from ros2_memory.demo.run import format_exchange, run_demo
 
 REPLY = json.dumps(
     {"samples": [{"timestamp": 1_800_000_000.25 + k, "value": "in the hall"} for k in range(40)]},
@@ -37,16 +33,6 @@ def test_the_call_is_shown_as_it_was_made() -> None:
 def test_a_long_reply_is_cut_and_says_so() -> None:
     last = format_exchange(1, Exchange(QUESTIONS[0], REPLY, "Yes.", right=True)).splitlines()[-1]
     assert f"{len(REPLY):,} characters in all" in last
-
-
-def test_a_server_that_cannot_listen_is_told_by_its_last_words(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with (
-            pytest.raises(EpisodicError, match=rf"(?s)exit code 1.*port {port} .* in use"),
-            running_server(tmp_path, port),
-        ):
-            pass
 
 
 @pytest.mark.parametrize("duration_s", [89.9, 86_401.0, float("nan")])

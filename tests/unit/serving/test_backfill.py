@@ -1,12 +1,9 @@
-"""The store of columns is filled bag by bag, by a server and by the command."""
+"""The store of columns is filled bag by bag."""
 
 from __future__ import annotations
 
-import logging
-import os
 import sqlite3
 import sys
-import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +12,10 @@ from typing import TYPE_CHECKING
 import anyio
 import anyio.lowlevel
 import pytest
-import structlog
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.cli import main
 from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.columns import fill
 from ros2_memory.columns.fill import Batch, Filling, Progress, StoreLimits
@@ -35,7 +30,6 @@ from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
@@ -192,43 +186,3 @@ async def test_health_tells_how_much_is_stored(tmp_path: Path) -> None:
     backfill.filling.store.refusals, backfill.filling.store.refused_for = 2, "too large"
     reply = await Health(memory, "1.2.3", backfill)()
     assert reply["store_refusals"] == {"count": 2, "reason": "too large"}
-
-
-# The command
-
-
-@pytest.fixture
-def own_logging() -> Iterator[None]:
-    """Logging as it was before a command set it up."""
-    root = logging.getLogger()
-    level, handlers = root.level, root.handlers[:]
-    root.handlers = []
-    yield
-    root.level, root.handlers = level, handlers
-    logging.captureWarnings(capture=False)
-    structlog.reset_defaults()
-
-
-@pytest.mark.usefixtures("own_logging")
-def test_the_command_fills_the_store_beside_the_bags(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(recorded_before(tmp_path)))
-    path = bag(tmp_path, 0)
-    hour_ago = time.time_ns() - 3600 * NS_PER_S
-    os.utime(path, ns=(hour_ago, hour_ago))
-    assert main(["index"]) == 0
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("1 of 1 bag is stored")
-    assert (tmp_path / OWN_FOLDER / FILE).is_file()
-
-
-@pytest.mark.usefixtures("own_logging")
-def test_where_no_store_can_be_written_the_command_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
-    (tmp_path / OWN_FOLDER).write_text("a file where a folder should be")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / OWN_FOLDER))
-    assert main(["index"]) == 2
-    assert "XDG_CACHE_HOME" in capsys.readouterr().err
