@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+import traceback
+
 import pytest
 
 from ros2_memory.config import exit_on_config_error, load_settings
+from ros2_memory.core.errors import ConfigError
 from tests.support.config_folders import refusal
 
 
@@ -66,12 +70,18 @@ class TestRefusals:
             "server={token: s3cret",
             "lake.properties={s3.secret-access-key: s3cret",
             "lake.password=s3cret,other",
+            "server.api_token=s3cret",
+            "+api_token=[s3cret",
+            "API_TOKEN='s3cret",
         ],
     )
     def test_show_no_secret_of_what_is_no_setting(self, override: str) -> None:
-        for message in (refusal(override), refusal(MEMORY_CONFIG_OVERRIDES=f"'{override}")):
-            assert "s3cret" not in message
-            assert "secret" in message or "shell" in message
+        variables = [{"MEMORY_CONFIG_OVERRIDES": text} for text in (override, f"'{override}")]
+        for overrides, env in (([override], {}), *(((), variable) for variable in variables)):
+            with pytest.raises(ConfigError) as caught:
+                load_settings(overrides, env)
+            assert "s3cret" not in "".join(traceback.format_exception(caught.value))
+            assert re.search("secret|shell|token", str(caught.value))
 
 
 class TestExit:

@@ -12,7 +12,6 @@ import contextvars
 from collections import Counter, deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import BusyError
@@ -76,7 +75,12 @@ class FairQueue:
         except RuntimeError as error:
             self._release(client)
             raise BusyError(STOPPING if self._stopped else _NO_THREAD) from error
-        running.add_done_callback(lambda _: _call_soon(loop, partial(self._release, client)))
+
+        def release(_: object) -> None:
+            with suppress(RuntimeError):  # the loop has ended, and with it the queue
+                loop.call_soon_threadsafe(self._release, client)
+
+        running.add_done_callback(release)
         return await asyncio.wrap_future(running)
 
     async def _wait_for_turn(self, client: Hashable) -> None:
@@ -137,8 +141,3 @@ class FairQueue:
             if not turn.done():
                 self._running[following] += 1
                 turn.set_result(None)
-
-
-def _call_soon(loop: asyncio.AbstractEventLoop, release: Callable[[], None]) -> None:
-    with suppress(RuntimeError):  # the loop has ended, and with it the queue
-        loop.call_soon_threadsafe(release)
