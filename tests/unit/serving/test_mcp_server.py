@@ -33,10 +33,8 @@ from ros2_memory.tools.build import build_tools, readable_tools
 from tests.support.robot_run import CALLS, write_run
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
-    from ros2_memory.tools.declaration import Tool
 
 T0 = 1_795_161_600 * NS_PER_S
 
@@ -122,16 +120,11 @@ async def test_what_is_only_read_is_no_tool_and_named_by_none(
     assert name not in detail.partition(";")[2]
 
 
-def words_of(tools: Iterable[Tool]) -> set[str]:
-    """Their names, but for words of English that replies use for keys."""
-    return {tool.name for tool in tools} - {"visits", "compare", "recap"}
-
-
 async def test_no_tool_names_another_that_is_not_offered(tmp_path: Path) -> None:
     write_run(tmp_path)
-    known = words_of(
-        [*build_tools(QuerySettings(), writing=True), *readable_tools(QuerySettings())]
-    )
+    tools = [*build_tools(QuerySettings(), writing=True), *readable_tools(QuerySettings())]
+    # But for words of English that replies use for keys.
+    known = {tool.name for tool in tools} - {"visits", "compare", "recap"}
     async with Client(server(tmp_path, "server.tools=spec")) as client:
         listed = (await client.list_tools()).tools
         assert len(listed) == 17

@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,15 +42,6 @@ def said(answer: Answer, replies: Replies = REPLIES) -> Any:
     reply = replies.answer(answer)
     assert not reply.is_error
     return json.loads(reply.text)
-
-
-def row(number: int) -> results.TopicRow:
-    return results.TopicRow(f"/topic_{number:04}", "std_msgs/msg/String", T0, T0 + 1, 7)
-
-
-def of_samples(values: list[Any], notes: tuple[str, ...] = ()) -> results.TopicRange:
-    samples = tuple(Sample(T0 + n * 123_456_789, each) for n, each in enumerate(values))
-    return results.TopicRange("/odom", "nav_msgs/msg/Odometry", 5000, samples, notes=notes)
 
 
 def driven(jumps: int = 0, jumped_m: float = 0.0) -> MotionTotals:
@@ -159,14 +149,14 @@ def test_long_lists_of_files_show_the_last_ones_and_their_number() -> None:
     assert shown["notes"] == ["damaged: the last 20 of 50 are listed"]
 
 
-def of_fields(values: list[Any], fields: tuple[str, ...]) -> results.TopicRange:
-    return replace(of_samples(values), fields=fields)
-
-
 def test_a_range_with_fields_is_a_table() -> None:
-    place = {"x": 1.0, "y": 2.0, "z": 0.0}
-    values = [{"position": place, "yaw": 1.25}, {"position": None, "yaw": 0.5}]
-    shown = said(of_fields(values, ("position", "yaw")))
+    place: Any = {"x": 1.0, "y": 2.0, "z": 0.0}
+    samples = (
+        Sample(T0, {"position": place, "yaw": 1.25}),
+        Sample(T0 + 123_456_789, {"position": None, "yaw": 0.5}),
+    )
+    fields = ("position", "yaw")
+    shown = said(results.TopicRange("/odom", "nav_msgs/msg/Odometry", 2, samples, fields=fields))
     assert shown["fields"] == [
         "timestamp", "position.x", "position.y", "position.z", "yaw", "position",
     ]  # fmt: skip

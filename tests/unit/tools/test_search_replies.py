@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
-from ros2_memory.history.context import Memory
 from tests.support.bags import (
     Msg,
     boolean,
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.core.model import JsonValue
 
 S = 10**9
 T0_S = 1_784_000_000
@@ -54,16 +52,6 @@ def numbers(ns: int, *held: int) -> Msg:
     return Msg("/numbers", "std_msgs/msg/Int32MultiArray", ns, body)
 
 
-def recalling(bag_dir: Path, recalls: bool, **more: Any) -> Memory:
-    """A memory of the bags, which has stored their columns where it recalls them."""
-    return memory_of(bag_dir, **more, recalls=recalls)
-
-
-def last(bag_dir: Path, recalls: bool, topic: str, kind: str, value: JsonValue, **more: Any) -> Any:
-    given = {"topic": topic, "condition_type": kind, "value": value, **more}
-    return asked(recalling(bag_dir, recalls), bag_dir, "find_last_match", **given)
-
-
 @pytest.fixture
 def bag_dir(tmp_path: Path) -> Path:
     first = [
@@ -82,18 +70,6 @@ def bag_dir(tmp_path: Path) -> Path:
     for nth, messages in enumerate([first, second, third]):
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
     return tmp_path
-
-
-def never(memory: Memory, bag_dir: Path, tool: str) -> Any:
-    topic = {
-        "find_last_match": {"topic": "/vision/*"},
-        "get_value_when": {"condition_topic": "/vision/*", "value_topic": "/bumper"},
-    }[tool]
-    condition = {"condition_type": "contains", "value": "scissors"}
-    return asked(memory, bag_dir, tool, **topic, **condition)
-
-
-each_search = pytest.mark.parametrize("tool", ["find_last_match", "get_value_when"])
 
 
 @each_way
@@ -139,27 +115,25 @@ def test_that_a_long_array_was_not_searched_is_said_whatever_the_newest_is(
     assert "notes" not in newest
 
 
-def list_splits(recording: Path, count: int) -> None:
-    names = "".join(f"  - {recording.name}_{n}.mcap\n" for n in range(count))
-    (recording / "metadata.yaml").write_text(
-        f"rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n{names}"
-    )
-
-
 @each_way
 def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_never(
     bag_dir: Path, recalls: bool
 ) -> None:
-    list_splits(bag_dir / "rec", 3)
+    names = "".join(f"  - rec_{n}.mcap\n" for n in range(3))
+    metadata = "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n"
+    (bag_dir / "rec" / "metadata.yaml").write_text(metadata + names)
     (bag_dir / "rec" / "rec_0.mcap").unlink()
     own = bag_dir / ".episodic" / "recordings.jsonl"
     own.parent.mkdir()
     inode = (bag_dir / "rec").stat().st_ino
     mine = json.dumps({"recording": "rec", "inode": inode})
     own.write_text(with_checks(mine))
-    assert last(bag_dir, recalls, "/rosout", "contains", "never") is None
+    wanted = {"topic": "/rosout", "condition_type": "contains", "value": "never"}
+    memory = memory_of(bag_dir, recalls=recalls)
+    assert asked(memory, bag_dir, "find_last_match", **wanted) is None
     (bag_dir / "rec" / "rec_1.mcap").rename(bag_dir / "rec" / "rec_0.mcap")
-    assert last(bag_dir, recalls, "/rosout", "contains", "never")["notes"]
+    memory = memory_of(bag_dir, recalls=recalls)
+    assert asked(memory, bag_dir, "find_last_match", **wanted)["notes"]
 
 
 def lie_in_a_message_index(path: Path) -> None:
@@ -174,11 +148,22 @@ def lie_in_the_chunk_indexes(path: Path) -> None:
     edit_summary(path, Opcode.CHUNK_INDEX, later)
 
 
-@each_search
+@pytest.mark.parametrize(
+    ("tool", "topics"),
+    [
+        ("find_last_match", {"topic": "/vision/*"}),
+        ("get_value_when", {"condition_topic": "/vision/*", "value_topic": "/bumper"}),
+    ],
+)
 @each_way
 @pytest.mark.parametrize("lie", [lie_in_a_message_index, lie_in_the_chunk_indexes])
 def test_a_bag_that_was_read_in_spite_of_its_lies_was_read(
-    bag_dir: Path, tool: str, recalls: bool, lie: Callable[[Path], None]
+    bag_dir: Path,
+    tool: str,
+    topics: dict[str, str],
+    recalls: bool,
+    lie: Callable[[Path], None],
 ) -> None:
     lie(bag_dir / "rec" / "rec_1.mcap")
-    assert never(recalling(bag_dir, recalls), bag_dir, tool) is None
+    wanted = {**topics, "condition_type": "contains", "value": "scissors"}
+    assert asked(memory_of(bag_dir, recalls=recalls), bag_dir, tool, **wanted) is None
