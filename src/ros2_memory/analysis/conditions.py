@@ -514,9 +514,7 @@ def _kind(value: JsonValue) -> str:
     return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
-def _descend(
-    node: T, segment: str, pick: Callable[[list[T], int], list[T]] = element_at
-) -> Iterator[T]:
+def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> Iterator[T]:
     if isinstance(node, dict):
         if segment in node:
             yield node[segment]

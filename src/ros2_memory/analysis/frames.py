@@ -152,6 +152,7 @@ class _History:
         moving: by parent.
         static: in the order in which they were received.
         clock: which time of the moving ones counts.
+        hold_ns: how long they are valid beyond the times between which they are known.
     """
 
     def __init__(
@@ -160,8 +161,10 @@ class _History:
         moving: Mapping[str, Edge],
         static: Sequence[StampedTransform],
         clock: TfClock,
+        hold_ns: Ns,
     ) -> None:
         self._child = child
+        self._hold_ns = hold_ns
         names = [*moving, *(transform.parent.lstrip("/") for transform in static)]
         counts = [*(len(edge.stamps) for edge in moving.values()), *(1 for _ in static)]
         self.parents = list(dict.fromkeys(names))
@@ -180,9 +183,9 @@ class _History:
         self._rotation = joined.rotation[rows]
         self._parent = np.repeat([self.parents.index(name) for name in names], counts)[rows]
 
-    def at(self, times: Times, hold_ns: Ns) -> FramePoses:
-        """Returns the transforms at some times; beyond those that are known, for so long."""
-        before, after, ratio, valid = self._bracket(times, hold_ns)
+    def at(self, times: Times) -> FramePoses:
+        """Returns the transforms at some times."""
+        before, after, ratio, valid = self._bracket(times)
         x, y, z = self._translation[before].T
         to_x, to_y, to_z = self._translation[after].T
         moved = x + (to_x - x) * ratio, y + (to_y - y) * ratio, z + (to_z - z) * ratio
@@ -191,9 +194,10 @@ class _History:
         turned = slerp((qx, qy, qz, qw), (to_qx, to_qy, to_qz, to_qw), ratio)
         return FramePoses(moved, turned, valid)
 
-    def parents_at(self, times: Times, hold_ns: Ns) -> Times:
+    def parents_at(self, times: Times) -> Times:
         """Returns which of the parents the child is in at some times, by their numbers."""
-        return self._parent[self._bracket(times, hold_ns).before]
+        before, *_ = self._bracket(times)
+        return self._parent[before]
 
     def newest_parent(self) -> str:
         """Returns the parent where no time is given."""
@@ -223,36 +227,28 @@ class _History:
             " extrapolated; ask for a time in that range",
         )
 
-    def _bracket(self, times: Times, hold_ns: Ns) -> _Bracket:
+    def _bracket(self, times: Times) -> tuple[Times, Times, Floats, Mask]:
+        """Returns the rows between which each of some times lies, and how far: 0 is at the former.
+
+        Where nothing is interpolated, both are the row that counts. And whether one does.
+        """
         count = len(self._times)
         # The first static transform holds before it was received, too.
         static = count - 1 + np.maximum(self._since.searchsorted(times, "right"), 1)
         if not count:
-            return _Bracket(static, static, 0.0 * static, static >= 0)
+            return static, static, 0.0 * static, static >= 0
         after = self._times.searchsorted(times, "right")
         before, after = np.maximum(after - 1, 0), np.minimum(after, count - 1)
         start, stop = self._times[before], self._times[after]
         since, until = abs(times - start), abs(stop - times)
         is_between = (after > before) & (stop - start <= TF_CACHE_NS)
-        valid = is_between | (np.minimum(since, until) <= hold_ns)
+        valid = is_between | (np.minimum(since, until) <= self._hold_ns)
         nearest = np.where(is_between | (since <= until), before, after)
         is_mixed = is_between & (since > 0) & (self._parent[before] == self._parent[after])
         ratio = is_mixed * since / np.maximum(stop - start, 1)
         if len(self._since):
             nearest, valid = np.where(valid, nearest, static), static >= 0
-        return _Bracket(nearest, np.where(is_mixed, after, nearest), ratio, valid)
-
-
-class _Bracket(NamedTuple):
-    """The rows of a history between which each of some times lies; `ratio` 0 is at the former.
-
-    Where nothing is interpolated, both are the row that counts. `valid`: whether one does.
-    """
-
-    before: Times
-    after: Times
-    ratio: Floats
-    valid: Mask
+        return nearest, np.where(is_mixed, after, nearest), ratio, valid
 
 
 class FrameTree:
@@ -380,14 +376,14 @@ class FrameTree:
         """Returns rows of times apart in which the first frame that has several parents has one."""
         for frame in frames:
             if len(self._parents_at(frame, times)) > 1:
-                numbers = self._histories[frame].parents_at(times, self._hold_ns)
+                numbers = self._histories[frame].parents_at(times)
                 return [rows[numbers == number] for number in np.unique(numbers)]
         return []
 
     def _pose_in_ancestor(self, ancestor: str, chain: Iterable[str], times: Times) -> FramePoses:
         """Returns the pose of the first frame of a chain in one of the frames above it."""
         below = takewhile(lambda frame: frame != ancestor, chain)
-        steps = [self._histories[frame].at(times, self._hold_ns) for frame in below]
+        steps = [self._histories[frame].at(times) for frame in below]
         return reduce(_product, reversed(steps)) if steps else _identity(times)
 
     def _parents_at(self, child: str, times: Times) -> Sequence[str]:
@@ -397,13 +393,14 @@ class FrameTree:
             return ()
         if len(history.parents) == 1:
             return history.parents
-        return [history.parents[n] for n in np.unique(history.parents_at(times, self._hold_ns))]
+        return [history.parents[number] for number in np.unique(history.parents_at(times))]
 
     def _history(self, child: str) -> _History | None:
         """Returns the transforms of a frame in those above it; None, if it is a root."""
         if child not in self._histories and (child in self._moving or child in self._static):
             moving, static = self._moving.get(child, {}), self._static.get(child, ())
-            self._histories[child] = _History(child, moving, static, self.clock)
+            history = _History(child, moving, static, self.clock, self._hold_ns)
+            self._histories[child] = history
         return self._histories.get(child)
 
     def _no_path_at(self, name: str, time: Ns) -> NoDataError:
@@ -436,7 +433,7 @@ class FrameTree:
         at = np.array(time, np.int64)
         for above in self._chain(frame, at):
             history = self._history(above)
-            if history is not None and not history.at(at, self._hold_ns).valid:
+            if history is not None and not history.at(at).valid:
                 return history.nothing_at(time)
         return None
 

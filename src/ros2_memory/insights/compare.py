@@ -48,7 +48,7 @@ from ros2_memory.places.pose_frames import (
     known_track,
     places_in,
 )
-from ros2_memory.places.two_paths import FarPoint, farthest_apart, placed_standstills, stood_at
+from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import (
     ComparedMover,
@@ -424,26 +424,21 @@ def _path_differences(
         ]
         for track, drive in zip(tracks, drives, strict=True)
     ]
-    stood: list[StandstillPlace] = []
+    stood: list[tuple[float, StandstillPlace]] = []
     for at in stood_at(*stands):
-        this_s, other_s = (unix_from_ns(duration) for duration in at.durations)
+        this_s, other_s = (seconds or 0.0 for seconds in at.seconds)
         if differ(this_s, other_s, _LEAST["stood_s"]):
-            inside = places_at(places, frame, at.x, at.y)
-            stood.append(StandstillPlace((at.x, at.y), inside, Pair(this_s, other_s), at.since))
-    stood.sort(key=lambda stand: -abs((stand.seconds.this or 0.0) - (stand.seconds.other or 0.0)))
+            named = at._replace(inside=places_at(places, frame, *at.place))
+            stood.append((abs(this_s - other_s), named))
+    stood.sort(key=lambda row: -row[0])
     points = farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region)
-    this, other = (_with_named_place(places, frame, point) for point in points)
-    return frame, tuple(stood), (this, other)
-
-
-def _with_named_place(
-    places: Sequence[Place], frame: str, point: FarPoint | None
-) -> FarFromOther | None:
-    """Returns a point with its named place; None where there is none, or the paths are equal."""
-    if point is None or point.away_m < _LEAST_APART_M:
-        return None
-    inside = places_at(places, frame, point.x, point.y)
-    return FarFromOther((point.x, point.y), inside, point.away_m, point.time)
+    this, other = (
+        None
+        if point is None or point.away_m < _LEAST_APART_M
+        else point._replace(inside=places_at(places, frame, *point.place))
+        for point in points
+    )
+    return frame, tuple(at for _, at in stood), (this, other)
 
 
 def _minutes_in_places(

@@ -14,6 +14,8 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
 from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.regions import Steps
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.results import FarFromOther, Pair, StandstillPlace
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -34,15 +36,6 @@ _CANDIDATES: Final = 64
 _SAMPLES_OF_STAND: Final = 9
 
 
-class FarPoint(NamedTuple):
-    """A point of a path (m), when the robot was first there, and its distance from the other."""
-
-    x: float
-    y: float
-    time: Ns
-    away_m: float
-
-
 class PlacedStandstill(NamedTuple):
     """A standstill at a place (m)."""
 
@@ -50,15 +43,6 @@ class PlacedStandstill(NamedTuple):
     y: float
     start: Ns
     duration: Ns
-
-
-class StoodAt(NamedTuple):
-    """How long the robot stood at a place (m) in each of two windows, and since when first."""
-
-    x: float
-    y: float
-    durations: tuple[Ns, Ns]
-    since: tuple[Ns | None, Ns | None]
 
 
 class _Steps(NamedTuple):
@@ -74,8 +58,8 @@ def farthest_apart(
     this: tuple[RobotTrack, TimeWindow],
     other: tuple[RobotTrack, TimeWindow],
     region: Region | None = None,
-) -> tuple[FarPoint | None, FarPoint | None]:
-    """Returns the point of each path that is farthest from the other one.
+) -> tuple[FarFromOther | None, FarFromOther | None]:
+    """Returns the point of each path that is farthest from the other one; in no named place.
 
     Only the part of each path in its window counts, and in the region, if one is given.
     None where it has no point, or the other way has none at all.
@@ -106,7 +90,7 @@ def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
     return _Steps(here + share * (there - here), here + until * (there - here), start, stop)
 
 
-def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarPoint | None:
+def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarFromOther | None:
     points, times = _sampled(steps)
     if region is not None:
         inside = [region.contains(x, y) for x, y in points.tolist()]
@@ -126,7 +110,7 @@ def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarPoint |
     farthest = int(np.argmax(away))
     nth = int(tried[farthest])
     x, y = points[nth].tolist()
-    return FarPoint(x, y, int(times[nth]), away[farthest])
+    return FarFromOther((x, y), (), away[farthest], int(times[nth]))
 
 
 def _sampled(steps: _Steps) -> tuple[Floats, Times]:
@@ -190,8 +174,10 @@ def _is_known(track: RobotTrack, at: Ints) -> Flags:
     return np.asarray(between | before | after)
 
 
-def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]) -> list[StoodAt]:
-    """Returns the places where the robot stood in two windows, and how long in each.
+def stood_at(
+    this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
+) -> list[StandstillPlace]:
+    """Returns the places where the robot stood in two windows, and how long in each; in no named.
 
     A place is where it stood longest within `SAME_STAND_M`.
     """
@@ -212,4 +198,7 @@ def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
         earliest = since[nth][side]
         since[nth][side] = stand.start if earliest is None else min(earliest, stand.start)
     places = zip(middles[: len(durations)].tolist(), durations, since, strict=True)
-    return [StoodAt(x, y, (a, b), (first, second)) for (x, y), (a, b), (first, second) in places]
+    return [
+        StandstillPlace((x, y), (), Pair(*map(unix_from_ns, lasted)), (first, second))
+        for (x, y), lasted, (first, second) in places
+    ]

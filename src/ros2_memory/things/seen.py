@@ -428,9 +428,12 @@ class Watching:
     def _digest(self, around: _Surroundings) -> str:
         """Returns what tells apart the sights of other settings, static transforms or sessions."""
         window = around.window
-        statics = [
+        transforms = [
             [
-                (static, static.log_time if window.contains(static.log_time) else 0)
+                (
+                    *(static.parent, static.child, static.transform),
+                    static.log_time if window.contains(static.log_time) else 0,
+                )
                 for static in static_in(self._view.sessions.static(lender), window)
             ]
             for _, lender, _ in around.sessions
@@ -445,10 +448,7 @@ class Watching:
             for session, lender, slices in around.sessions
         ]
         limits = self._view.limits
-        transforms = [
-            [(static.parent, static.child, static.transform, time) for static, time in of_session]
-            for of_session in statics
-        ]
+
         settings = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
         return _hashed((VERSION, settings, transforms, sessions))
 

@@ -68,7 +68,7 @@ def test_the_farthest_point_is_as_far_as_any_laid_along_the_way(
         assert point is not None
         away = np.hypot(*(own[:, None] - other[None]).transpose(2, 0, 1)).min(axis=1)
         assert point.away_m == pytest.approx(float(away.max()), abs=0.16)
-        here = np.array((point.x, point.y))
+        here = np.array(point.place)
         assert np.hypot(*(own - here).T).min() < 0.03
         assert np.hypot(*(other - here).T).min() == pytest.approx(point.away_m, abs=0.03)
 
@@ -78,7 +78,7 @@ def test_a_vertex_that_was_jumped_to_and_from_is_no_place_of_the_way() -> None:
     way = dataclasses.replace(way, fastest_mps=10.0)
     far = farthest_apart((way, EVER), (track([(0.0, 0.0, 0.0)]), EVER))[0]
     assert far is not None
-    assert far.x == 1.0
+    assert far.place[0] == 1.0
 
 
 def test_standstills_are_where_the_track_is_and_nowhere_where_it_is_not() -> None:
@@ -110,8 +110,9 @@ def test_every_standstill_is_of_one_place_and_near_to_it(
 ) -> None:
     found = stood_at(one, two)
     for side, given_ones in enumerate((one, two)):
-        assert sum(at.durations[side] for at in found) == sum(each.duration for each in given_ones)
+        seconds = sum(at.seconds[side] or 0.0 for at in found)
+        assert seconds == pytest.approx(sum(each.duration for each in given_ones) / S)
         for each in given_ones:
-            assert min(math.dist((at.x, at.y), (each.x, each.y)) for at in found) <= 0.5
-    assert {(at.x, at.y) for at in found} <= {(each.x, each.y) for each in (*one, *two)}
-    assert [at.durations for at in stood_at(two, one)] == [at.durations[::-1] for at in found]
+            assert min(math.dist(at.place, (each.x, each.y)) for at in found) <= 0.5
+    assert {at.place for at in found} <= {(each.x, each.y) for each in (*one, *two)}
+    assert [at.seconds for at in stood_at(two, one)] == [at.seconds[::-1] for at in found]

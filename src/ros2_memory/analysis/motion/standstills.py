@@ -264,7 +264,7 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
     first_times, last_times = slots.firsts[firsts], slots.lasts[lasts]
     starts_ns = numbers[begins] * BLOCK_NS
     means = slots.means[inner]
-    noises = slots.noises[inner] / np.sqrt(slots.counts[inner])
+    noises = slots.noises(inner, inner + 1) / np.sqrt(slots.counts[inner])
     lows, highs = (
         np.rint(extreme.reduceat(means, begins) * PER_METRE).astype(np.int64)
         for extreme in (np.minimum, np.maximum)
@@ -288,35 +288,6 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
         blocks.starts[begin] = slots.edge(first, last, -1)
         blocks.ends[stop - 1] = slots.edge(last, first, 1)
     return blocks
-
-
-class _Bends(NamedTuple):
-    """Second differences of poses, slot by slot.
-
-    Attributes:
-        squares: of their lengths (m2).
-        edges: where those of each slot begin, and where the last one's stop.
-    """
-
-    squares: Floats
-    edges: Ints
-
-    def noises(self, firsts: Ints, stops: Ints) -> Floats:
-        """Returns the standard deviation (m) of the poses in ranges of slots.
-
-        By a median, since a stopping robot bends once; 0 where there is no bend.
-        """
-        begins = self.edges[firsts]
-        counts = self.edges[stops] - begins
-        middles = np.zeros(counts.size)
-        # Most ranges have as many: their rows are sorted at once.
-        for count in np.unique(counts[counts > 0]).tolist():
-            which, middle = np.flatnonzero(counts == count), (count - 1) // 2
-            rows = self.squares[begins[which][:, None] + np.arange(count)]
-            middles[which] = np.partition(rows, middle, axis=1)[:, middle]
-        # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
-        deviations: Floats = np.sqrt(middles / 6 / 0.6)
-        return deviations
 
 
 class _Slots:
@@ -344,10 +315,11 @@ class _Slots:
         return means
 
     @cached_property
-    def bends(self) -> _Bends:
-        """The second differences of poses: each is of the slot of its middle pose.
+    def _bends(self) -> tuple[Floats, Ints]:
+        """The squares (m2) of second differences of poses: each is of the slot of its middle pose.
 
-        A slot with enough poses has those inside of it alone.
+        And where those of each slot begin, and the last one's stop. A slot with enough poses has
+        those inside of it alone.
         """
         bends = self.positions[:-2] - 2 * self.positions[1:-1] + self.positions[2:]
         slot = np.repeat(np.arange(len(self)), self.counts)
@@ -355,26 +327,39 @@ class _Slots:
         is_short = self.times[2:] - self.times[:-2] <= _SPARSE_NS
         is_counted = is_inside | (is_short & (self.counts[slot[1:-1]] < _OWN_BENDS))
         counts = np.bincount(slot[1:-1][is_counted], minlength=len(self))
-        return _Bends(row_sums(bends * bends)[is_counted], np.r_[0, np.cumsum(counts)])
+        return row_sums(bends * bends)[is_counted], np.r_[0, np.cumsum(counts)]
 
-    @cached_property
-    def noises(self) -> Floats:
-        """The standard deviation (m) of the poses of each slot; 0 where they are too few."""
-        slots = np.arange(len(self))
-        return self.bends.noises(slots, slots + 1)
+    def noises(self, firsts: Ints, stops: Ints) -> Floats:
+        """Returns the standard deviation (m) of the poses in ranges of slots.
+
+        By a median, since a stopping robot bends once; 0 where there is no bend.
+        """
+        squares, edges = self._bends
+        begins = edges[firsts]
+        counts = edges[stops] - begins
+        middles = np.zeros(counts.size)
+        # Most ranges have as many: their rows are sorted at once.
+        for count in np.unique(counts[counts > 0]).tolist():
+            which, middle = np.flatnonzero(counts == count), (count - 1) // 2
+            rows = squares[begins[which][:, None] + np.arange(count)]
+            middles[which] = np.partition(rows, middle, axis=1)[:, middle]
+        # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
+        deviations: Floats = np.sqrt(middles / 6 / 0.6)
+        return deviations
 
     def links(self) -> Flags:
         """Returns whether the robot may have stood still from each slot to the next with poses."""
         follows = self.firsts[1:] - self.lasts[:-1] <= SILENCE_NS
         apart_m = _lengths(np.diff(self.means, axis=0))
         allowed_m = DRIFT_MPS * (np.diff(self.numbers) * SLOT_NS / NS_PER_S)
-        many = self.bends.edges[2:] - self.bends.edges[:-2]
+        _, edges = self._bends
+        many = edges[2:] - edges[:-2]
         unsure = np.flatnonzero(follows & (apart_m > allowed_m) & (many > 0))
         if unsure.size:
             spread = np.sqrt(1 / self.counts[unsure] + 1 / self.counts[unsure + 1])
             # Few of them may show much less noise than there is, hence the allowance.
             factor = _NOISE_FACTOR * (1 + 4 / many[unsure]) * spread
-            noise = self.bends.noises(unsure, unsure + 2)
+            noise = self.noises(unsure, unsure + 2)
             allowed_m[unsure] = np.maximum(allowed_m[unsure], factor * noise)
         linked: Flags = follows & (apart_m <= allowed_m)
         return linked
@@ -390,7 +375,7 @@ class _Slots:
         low, high = sorted((at, at - step * min(_PLACE_SLOTS - 1, abs(at - other))))
         at_end = self.positions[self.begins[low] : self.stops[high]]
         place = at_end.mean(axis=0)
-        noise = float(self.bends.noises(np.array([low]), np.array([high + 1]))[0])
+        noise = float(self.noises(np.array([low]), np.array([high + 1]))[0])
         reach = max(_NEAREST_M, _ELSEWHERE * noise, 1.2 * float(_lengths(at_end - place).max()))
         far = np.searchsorted(self.numbers, self.numbers[at] + step * _OUTWARDS, side="left")
         low, high = sorted((at, int(far)))
