@@ -40,7 +40,6 @@ def edge(
     time: int,
     transform: Transform | float = IDENTITY,
     *,
-    log_time: int | None = None,
     static: bool = False,
 ) -> StampedTransform:
     """An edge stamped at `time`; a number stands for a shift along x."""
@@ -49,9 +48,7 @@ def edge(
         if isinstance(transform, Transform)
         else Transform((transform, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     )
-    return StampedTransform(
-        parent, child, time, time if log_time is None else log_time, held, static
-    )
+    return StampedTransform(parent, child, time, time, held, static)
 
 
 @dataclass(frozen=True)

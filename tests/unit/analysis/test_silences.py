@@ -19,7 +19,7 @@ from ros2_memory.analysis.silences import (
 from ros2_memory.core.spans import united
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Sequence
 
 S = 10**9
 MINUTE, HOUR = 60 * S, 3600 * S
@@ -33,26 +33,17 @@ class Activity(NamedTuple):
     pacing: Pacing
 
 
-def heard(*runs: tuple[int, int], hz: int = 1) -> Activity:
-    """A topic that is recorded at a rate during runs."""
+def heard(*runs: tuple[int, int]) -> Activity:
+    """A topic that is recorded once in a second during runs."""
     length = sum(last - first for first, last in runs)
-    count = length * hz // S
+    count = length // S
     spacings = {0: Spacing(len(runs), length, max(count, 1))}
     return Activity(runs, Pacing(spacings, count, length))
 
 
-def found(together: tuple[str, ...] = (ODOM, SEEN), **runs: Activity) -> list[Silence]:
-    return silences_of({f"/{name}": each for name, each in runs.items()}, [together])
-
-
-def silences_of(
-    activities: Mapping[str, Activity],
-    together: Iterable[Iterable[str]],
-    gaps: Sequence[tuple[int, int]] = (),
-) -> list[Silence]:
-    periods = usual_periods({topic: activity.pacing for topic, activity in activities.items()})
-    runs = {topic: activity.runs for topic, activity in activities.items()}
-    return silences(periods, runs, together, gaps)
+def found(odom: Activity, seen: Activity) -> list[Silence]:
+    periods = usual_periods({ODOM: odom.pacing, SEEN: seen.pacing})
+    return silences(periods, {ODOM: odom.runs, SEEN: seen.runs}, [(ODOM, SEEN)])
 
 
 def all_of(parts: Sequence[Activity]) -> Activity:
@@ -107,12 +98,12 @@ BURST = Activity(((0, HOUR), (5 * HOUR, 9 * HOUR)), Pacing({0: Spacing(3, 6 * S,
 def test_a_topic_is_silent_while_others_are_heard(
     odom: Activity, seen: Activity, expected: tuple[int, int, int] | None
 ) -> None:
-    assert found(odom=odom, seen=seen) == ([] if expected is None else [Silence(SEEN, *expected)])
+    assert found(odom, seen) == ([] if expected is None else [Silence(SEEN, *expected)])
 
 
 def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:
     days = tuple((at * 24 * HOUR, at * 24 * HOUR + 16 * HOUR) for at in range(5))
-    nights = found(odom=heard((0, 112 * HOUR)), seen=heard(*days))
+    nights = found(heard((0, 112 * HOUR)), heard(*days))
     assert [each.length for each in nights] == 4 * [8 * HOUR]
 
 
@@ -125,7 +116,7 @@ def test_a_silence_lies_between_messages_while_others_are_heard(
 ) -> None:
     seen = all_of([heard((a * S, (a + n) * S)) for a, n in drawn])
     odom = all_of([heard((a * S, (a + n) * S)) for a, n in others])
-    for each in found(odom=odom, seen=seen):
+    for each in found(odom, seen):
         own, other = (seen, odom) if each.topic == SEEN else (odom, seen)
         assert all(last <= each.start or first >= each.end for first, last in own.runs)
         on = [max(0, min(b, each.end) - max(a, each.start)) for a, b in other.runs]

@@ -28,14 +28,14 @@ def at(seconds: float) -> int:
     return BEGIN + round(seconds * S)
 
 
-def driving(until: float, stops: float, hz: int = 10) -> list[Msg]:
+def driving(until: int, stops: float) -> list[Msg]:
     """Drives 0.4 m/s up to a time, and then stands."""
-    times = [nth / hz for nth in range(round(until * hz))]
+    times = [nth / 10 for nth in range(until * 10)]
     return [odom(at(t), 0.4 * min(t, stops), 0.0, 0.0) for t in times]
 
 
-def commanded(until: float, stops: float, hz: int = 10) -> list[Msg]:
-    times = [nth / hz for nth in range(round(until * hz))]
+def commanded(until: int, stops: float) -> list[Msg]:
+    times = [nth / 10 for nth in range(until * 10)]
     return [command(at(t), 0.4 if t < stops else 0.0) for t in times]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -119,30 +120,23 @@ def test_the_size_of_a_long_array_is_no_value_of_it(tmp_path: Path, *, recalls: 
         assert len(reply["changes"] if "changes" in how else reply["rows"]) == 10
 
 
-def only(memory: Memory, tables: int, monkeypatch: pytest.MonkeyPatch) -> Memory:
-    """The memory, whose time for reading is over after so many tables of each question."""
-    left = [tables]
+def test_a_search_that_runs_out_of_time_says_from_where_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After four tables of each question."""
+    looks = count(1)
 
     def check(_: HeldValues, at: int) -> None:
-        left[0] -= 1
-        if left[0] < 0:
+        if next(looks) % 5 == 0:
             raise QueryTimeoutError(f"out of time at {at}")
 
     monkeypatch.setattr(sightings, "says_episodes", lambda *_: True)
     monkeypatch.setattr(HeldValues, "_check", check)
-    return memory
-
-
-def test_a_search_that_runs_out_of_time_says_from_where_to_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory = only(written(tmp_path), 4, monkeypatch)
     given = {"topic": "/task", "condition_type": "equals"}
-    some = ask(memory, "find_matches", **given, value="rest")
+    some = ask(written(tmp_path), "find_matches", **given, value="rest")
     assert (some["at_least"], some["more"]) == (1, True)
     assert f"ran out of time at {BEGIN + 260}" in some["notes"][0]
-    memory = only(written(tmp_path / "again"), 4, monkeypatch)
-    none = ask(memory, "find_matches", **given, value="wash the potato")
+    none = ask(written(tmp_path / "again"), "find_matches", **given, value="wash the potato")
     assert (none["error"], none["searched_back_to"]) == ("timeout", BEGIN + 260)
 
 

@@ -5,39 +5,32 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory import queries
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import fields
-from tests.support.bags import Msg, boolean, odom, text, write_mcap
-from tests.support.memories import memory_of
+from tests.support.bags import boolean, odom, text, write_mcap
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
-    from ros2_memory.results import TopicRange
+    pass
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
 WHOLE = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 100)
 
 
-def asked(folder: Path, messages: list[Msg], *fields: str, most: int = 2) -> TopicRange:
-    write_mcap(folder / "bag.mcap", messages)
-    topic = messages[0].topic
-    return queries.topic_range(
-        memory_of(folder), Call(), topic, WHOLE, max_samples=most, fields=fields
-    )
-
-
 def test_a_window_with_too_many_messages_to_read_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)]
-    [covariance] = asked(tmp_path, driven, "pose.covariance").extremes
-    assert (covariance.least, covariance.least_at) == (0.0, BEGIN)
+    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)])
+    window = {"start": BEGIN / S, "end": BEGIN / S + 100, "fields": ["pose.covariance"]}
+    memory = memory_of(tmp_path)
+    whole = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", **window)
+    assert whole["extremes"]["pose.covariance"]["min"] == 0.0
     monkeypatch.setattr(fields, "MAX_MESSAGES", 3)
-    answer = asked(tmp_path, driven, "pose.covariance")
-    assert answer.extremes == ()
-    assert fields.TOO_MANY in answer.notes
+    answer = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", **window)
+    assert "extremes" not in answer
+    assert fields.TOO_MANY in answer["notes"]
 
 
 @pytest.mark.parametrize("apart", [True, False])

@@ -25,10 +25,8 @@ STALLS = ((8.0, 11.0), (16.0, 16.7))
 FLAG = {"topic": "/chatter", "condition_type": "contains", "value": "zzz"}
 
 
-def at_rates(
-    length: float, stalls: Sequence[tuple[float, float]], slow: Sequence[tuple[float, float]] = ()
-) -> list[Msg]:
-    """Odometry at 200 Hz, a flag at 50 Hz, both off in `stalls` and `slow`; a text at 10 Hz."""
+def at_rates(slow: Sequence[tuple[float, float]] = ()) -> list[Msg]:
+    """Odometry at 200 Hz, a flag at 50 Hz, both off in `STALLS` and `slow`; a text at 10 Hz."""
 
     def is_on(t: float, off: Sequence[tuple[float, float]]) -> bool:
         return not any(start <= t < stop for start, stop in off)
@@ -36,14 +34,14 @@ def at_rates(
     def at(t: float) -> int:
         return BEGIN * S + round(t * S)
 
-    fast = [*stalls, *slow]
+    fast = [*STALLS, *slow]
     messages = [
-        odom(at(n / 200), n / 200, 0.0) for n in range(int(200 * length)) if is_on(n / 200, fast)
+        odom(at(n / 200), n / 200, 0.0) for n in range(200 * LENGTH) if is_on(n / 200, fast)
     ]
-    flags = [n / 50 + 0.001 for n in range(int(50 * length))]
+    flags = [n / 50 + 0.001 for n in range(50 * LENGTH)]
     messages += [boolean(at(t), data=True) for t in flags if is_on(t, fast)]
-    texts = [n / 10 + 0.001 for n in range(int(10 * length))]
-    messages += [text(at(t), "here") for t in texts if is_on(t, stalls)]
+    texts = [n / 10 + 0.001 for n in range(10 * LENGTH)]
+    messages += [text(at(t), "here") for t in texts if is_on(t, STALLS)]
     return sorted(messages, key=lambda message: message.log_time)
 
 
@@ -64,7 +62,7 @@ def memory_with(
 @pytest.fixture(params=["mcap", "db3", "stored", "cut into splits"], scope="module")
 def stalled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Memory:
     tmp_path = tmp_path_factory.mktemp("stalled")
-    messages = at_rates(LENGTH, STALLS, slow=((22, 24),))
+    messages = at_rates(slow=((22, 24),))
     splits = 7 if request.param == "cut into splits" else 1
     kind = "db3" if request.param == "db3" else "mcap"
     memory = memory_with(tmp_path / "bags", messages, splits, kind)
@@ -95,7 +93,7 @@ def test_a_window_in_a_gap_within_a_bag_was_not_recorded(stalled: Memory) -> Non
 
 @pytest.mark.anyio
 async def test_health_counts_the_gaps_of_the_last_hour(tmp_path: Path) -> None:
-    memory = memory_with(tmp_path, at_rates(LENGTH, STALLS))
+    memory = memory_with(tmp_path, at_rates())
     health = Health(memory, "1")
     shown = await health()
     health.stop()

@@ -39,6 +39,7 @@ from tests.support.memories import asked, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.results import RememberedMoment
 
 S = 10**9
 T0 = 1_790_000_000 * S
@@ -63,13 +64,15 @@ def beating(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, at: i
     write_heartbeat(bag_dir, Heartbeat(1, at, state, (), at, 0, (), (), None, 2.0))
 
 
-def remember(memory: Memory, label: str = "charger found", *, before: float = 30) -> Any:
-    return remember_moment(memory, Call(), label, seconds_before=before, seconds_after=0)
+def remember(memory: Memory, call: Call | None = None) -> RememberedMoment:
+    return remember_moment(
+        memory, call or Call(), "charger found", seconds_before=30, seconds_after=0
+    )
 
 
 def refusal(memory: Memory, call: Call | None = None) -> str:
     with pytest.raises(RefusedError) as caught:
-        remember_moment(memory, call or Call(), "here", seconds_before=30, seconds_after=0)
+        remember(memory, call)
     return str(caught.value)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,21 +18,12 @@ from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
-from tests.support.moving_map import BEGIN, MovingMap, S, write_moving_map
+from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.rooms import BEGIN as ROOMS_BEGIN
 from tests.support.rooms import ROOMS, asked_of, draw, write
 
 LEFT = {"x": [-1, 2], "y": [-1, 4]}
 ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)
-
-
-def driven(truth: MovingMap, low: float, high: float) -> float:
-    """Metres that were driven in the map between two x."""
-    return sum(
-        math.dist(before, after)
-        for before, after in pairwise(truth.places)
-        if low <= (before[0] + after[0]) / 2 <= high
-    )
 
 
 def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_path: Path) -> None:

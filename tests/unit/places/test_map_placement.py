@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import TYPE_CHECKING
-
-import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
@@ -18,32 +17,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map that moves, in fifty bags."""
-    folder = tmp_path_factory.mktemp("moving")
-    write_moving_map(folder, 1, seconds=100, split_s=2.0)
-    return folder
-
-
-class _Looks:
-    """A clock that shows how often it was looked at."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self) -> float:
-        self.count += 1
-        return self.count
-
-
 def test_a_map_of_which_it_is_not_known_whether_transforms_lead_there_is_not_denied(
-    moving: Path,
+    tmp_path: Path,
 ) -> None:
+    write_moving_map(tmp_path, 1, seconds=100, split_s=2.0)
     outcomes = set()
-    for ticks in range(1, 40, 4):
+    for looks in range(1, 40, 4):  # how often the clock may be looked at before the time is over
         # A memory of its own each time: what one call found out, the next knows.
-        view = View(memory_of(moving), Call(Deadline.after(ticks, _Looks())))
+        view = View(memory_of(tmp_path), Call(Deadline.after(looks, map(float, count()).__next__)))
         try:
             outcomes.add(map_placement(view, "/odom", "map").frame_id)
         except QueryTimeoutError:

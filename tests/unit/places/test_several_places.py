@@ -19,10 +19,8 @@ from hypothesis import strategies as st
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import AtTime
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
-from ros2_memory.queries import position
 from tests.support.bags import (
     Msg,
     boolean,
@@ -345,20 +343,3 @@ def test_the_frame_of_the_robot_is_the_map_or_the_one_asked_for(tmp_path: Path) 
     assert robot(frame_id="odom") == "odom"
     with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
         robot(frame_id="moon")
-
-
-def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_another(
-    tmp_path: Path,
-) -> None:
-    truth = write_moving_map(tmp_path, 1, seconds=60)
-    memory = in_places(memory_of(tmp_path))
-    at, place = truth.times[150], truth.places[150]
-    own = position(memory, Call(), AtTime(at_s=at / S))
-    assert (own.pose.frame_id, own.pose.places) == ("odom", ("room",))
-    there = position(memory, Call(), AtTime(at_s=at / S), frame_id="map")
-    assert there.pose.frame_id == "map"
-    assert there.pose.position[:2] == pytest.approx(place, abs=0.05)
-    reply = asked(memory, tmp_path, "get_position_at", timestamp=at / S, frame_id="map")
-    assert reply["in"] == "room"
-    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
-        position(memory, Call(), AtTime(at_s=at / S), frame_id="moon")

@@ -29,9 +29,9 @@ EXAMPLES = 12 if LONG else 4
 THERE = {"x": 10.0, "y": 0.0, "radius_m": 1.0}
 
 
-def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list[Msg]:
+def line(*legs: tuple[float, float], begin: float = 0.0) -> list[Msg]:
     """Odometry at 5 Hz along x: legs of (seconds, metres per second)."""
-    messages = []
+    messages, x = [], 0.0
     for length, speed in legs:
         for _ in range(round(length * 5)):
             messages.append(odom(BEGIN + round(begin * S), x, 0.0, 0.0))

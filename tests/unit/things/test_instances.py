@@ -30,10 +30,8 @@ def bag_of(
     )
 
 
-def seen_at(
-    x: float, y: float, label: str = "mug", score: float | None = None
-) -> list[PlacedDetection]:
-    return [PlacedDetection(label, (x, y, 0.7), score)]
+def seen_at(x: float, y: float, label: str = "mug") -> list[PlacedDetection]:
+    return [PlacedDetection(label, (x, y, 0.7))]
 
 
 def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None:

@@ -43,15 +43,17 @@ def call(looks: int) -> Call:
     return Call(Deadline.after(looks, map(float, count()).__next__))
 
 
+def eight_bags(bag_dir: Path, part: float = 1.0) -> Memory:
+    """A memory of eight bags, each with a thing of its own; a part of them is stored."""
+    moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
+    write_splits(bag_dir, [message for some in moments for message in some])
+    return with_store(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
+
+
 @pytest.fixture
 def fresh(tmp_path: Path) -> Callable[[], Memory]:
-    """Makes memories of eight bags, each with a thing of its own; two bags are stored.
-
-    None knows what another has read.
-    """
-    moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
-    write_splits(tmp_path, [message for some in moments for message in some])
-    stored = with_store(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).scanner
+    """Makes memories of eight bags, of which two are stored; none knows what another has read."""
+    stored = eight_bags(tmp_path, 0.25).scanner
     assert stored is not None
     return lambda: replace(
         memory_of(tmp_path, limits=NAMED), scanner=Scanner(stored.store, tmp_path)
@@ -99,14 +101,11 @@ def test_a_count_says_since_when_it_counted(fresh: Callable[[], Memory]) -> None
 
 @pytest.fixture
 def crowded(tmp_path: Path) -> Memory:
-    """A memory of eight bags, each with a thing of its own."""
-    moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
-    write_splits(tmp_path, [message for some in moments for message in some])
-    return with_store(memory_of(tmp_path, limits=NAMED), tmp_path)
+    return eight_bags(tmp_path)
 
 
-def labels_and_notes(memory: Memory, deadline: Deadline) -> tuple[set[str], list[str]]:
-    found = find_things(memory, Call(deadline))
+def labels_and_notes(memory: Memory) -> tuple[set[str], list[str]]:
+    found = find_things(memory, Call(Deadline.after(60)))
     notes = [note for note in found.notes if "too many sightings" in note]
     assert found.all_counted == (not notes)
     return {each.label for each in found.things}, notes
@@ -129,9 +128,9 @@ def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     monkeypatch.setattr(scanner, "caches", caches)
     monkeypatch.setattr(known, "_FEWER", 100)
     monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
-    labels_and_notes(crowded, Deadline.after(60))
+    labels_and_notes(crowded)
     monkeypatch.setattr(known, "_ESTIMATING_S", 1e6)
-    compared = [len(labels_and_notes(crowded, Deadline.after(60))[0]) for _ in range(5)]
+    compared = [len(labels_and_notes(crowded)[0]) for _ in range(5)]
     assert compared == [1, 2, 4, 8, 8]
 
 
@@ -169,7 +168,7 @@ def test_of_a_window_before_what_was_compared_what_was_seen_until_its_end_is_com
             assert thing.still_there is None or thing.still_there.state == "in_view"
             [note] = [note for note in found.notes if "too many sightings" in note]
             assert f"until {begin_of(nth) + 600}" in note
-    labels, [note] = labels_and_notes(crowded, Deadline.after(60))
+    labels, [note] = labels_and_notes(crowded)
     assert labels == {label for label, *_ in THINGS[5:]}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import pytest
 
 from ros2_memory.columns import scan
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.sights import JoinedSights, joined
+from ros2_memory.columns.sights import joined
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.things import placing
@@ -28,34 +27,8 @@ if TYPE_CHECKING:
 APART_S = SIGHTS_NS // 10**9
 
 
-def sights_in(memory: Memory) -> JoinedSights:
-    stretches = [one for some in Watching(View(memory, Call())).newest_first() for one in some]
-    parts = [part.packed for stretch in stretches for part in stretch.sights]
-    sections = [0 for stretch in stretches for _ in stretch.sights for _ in stretch.sessions]
-    return joined(parts, sections, sections)
-
-
 def things_in(memory: Memory) -> tuple[Thing, ...]:
     return find_things(memory, Call()).things
-
-
-def made_in(bag_dir: Path) -> World:
-    """A store of all bags, with the sights that follow from its parts."""
-    world = World.of(bag_dir)
-    world.fill()
-    make(world.memory)
-    return world
-
-
-def make(memory: Memory, *, is_joined: bool = False) -> None:
-    assert memory.scanner is not None
-    deque(Watching(View(memory, Call())).made(EVERYTHING, is_joined=is_joined), maxlen=0)
-    memory.scanner.write_fragments()
-
-
-def another(world: World) -> Memory:
-    """The memory of another process over the same store."""
-    return replace(world.memory, scanner=Scanner(world.store, world.bag_dir))
 
 
 def test_a_latched_text_that_each_recording_received_hinders_no_storing(
@@ -69,10 +42,15 @@ def test_a_latched_text_that_each_recording_received_hinders_no_storing(
         said = replace(said, publish_time=BEGIN * 10**9)
         write_mcap(tmp_path / f"rec_{nth}" / f"rec_{nth}_0.mcap", [said, *messages], layout)
     plain = things_in(World.of(tmp_path).memory)
-    world = made_in(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    assert world.memory.scanner is not None
+    assert [*Watching(View(world.memory, Call())).made(EVERYTHING)]
+    world.memory.scanner.write_fragments()
     assert [thing.label for thing in plain] == ["mug"]
     monkeypatch.delattr(placing, "sights_of")
-    assert things_in(another(world)) == plain
+    another = replace(world.memory, scanner=Scanner(world.store, tmp_path))
+    assert things_in(another) == plain
 
 
 @pytest.mark.parametrize("apart_s", [0, 3 * 10**8])
@@ -84,5 +62,11 @@ def test_a_bag_of_odd_times_has_the_sights_of_its_messages_alone(
         *looked(apart_s + 20, apart_s + 30, HERE, ("cup", 2.0, 0.0)),
     ]
     write_splits(tmp_path, odd, split_s=10.0**10)
-    world = World.of(tmp_path)
-    assert sights_in(world.memory).labels == ("cup", "mug")
+    stretches = [
+        one
+        for some in Watching(View(World.of(tmp_path).memory, Call())).newest_first()
+        for one in some
+    ]
+    parts = [part.packed for stretch in stretches for part in stretch.sights]
+    sections = [0 for stretch in stretches for _ in stretch.sights for _ in stretch.sessions]
+    assert joined(parts, sections, sections).labels == ("cup", "mug")

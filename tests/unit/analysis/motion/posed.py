@@ -26,11 +26,9 @@ if TYPE_CHECKING:
 
 
 def posed(
-    rows: Iterable[tuple[int, Vector3 | list[float]]],
-    turns: Sequence[Quaternion] | None = None,
-    speeds: Sequence[float] | None = None,
+    rows: Iterable[tuple[int, Vector3 | list[float]]], turns: Sequence[Quaternion] | None = None
 ) -> Poses:
-    """Poses at log times (ns), with unit quaternions and stated speeds (m/s) where given."""
+    """Poses at log times (ns), with unit quaternions where given."""
     times, positions = zip(*rows, strict=True) if (rows := [*rows]) else ((), ())
     count = len(times)
     return Poses(
@@ -38,7 +36,7 @@ def posed(
         np.array(positions, np.float64).reshape(-1, 3),
         np.full((count, 4), math.nan) if turns is None else np.array(turns, np.float64),
         FrameCodes(np.zeros(count, np.uint32), ("odom",)),
-        np.full(count, math.nan) if speeds is None else np.array(speeds, np.float64),
+        np.full(count, math.nan),
     )
 
 

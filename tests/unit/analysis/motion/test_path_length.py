@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,19 +11,11 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.trajectory import Trajectory
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call
-from ros2_memory.history.view import TimeRange
-from ros2_memory.insights.recap import recap
-from ros2_memory.queries import trajectory_summary
-from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of
 from tests.unit.analysis.motion.posed import posed, way_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
@@ -38,9 +29,10 @@ def line(speed: float, hertz: float, seconds: float) -> Points:
     return np.column_stack([x, 0 * x, 0 * x])
 
 
-def arc(speed: float, hertz: float, seconds: float, radius: float = 0.5) -> Points:
-    angle = line(speed, hertz, seconds)[:, 0] / radius
-    return np.column_stack([radius * np.sin(angle), radius * (1 - np.cos(angle)), 0 * angle])
+def arc(speed: float, hertz: float, seconds: float) -> Points:
+    """With a radius of half a metre."""
+    angle = line(speed, hertz, seconds)[:, 0] / 0.5
+    return np.column_stack([0.5 * np.sin(angle), 0.5 * (1 - np.cos(angle)), 0 * angle])
 
 
 def noisy(points: Points, sigma: float, seed: int = 1, axes: int = 3) -> Points:
@@ -60,19 +52,10 @@ def summarise(points: Points, hertz: float, cuts: Sequence[int] | None = None) -
     return way_of(posed(rows), 10.0, cuts).trajectory()
 
 
-# Standing
-
-
 def test_a_robot_that_creeps_in_its_noise_gets_where_it_gets() -> None:
     poses = noisy(line(0.002, 50, LONG_S), 0.005)
     for found in (summarise(poses, 50), summarise(poses, 50, range(0, len(poses), 500))):
         assert found.totals.distance_m == pytest.approx(1.8, rel=0.05)
-
-
-# Driving
-
-
-# Parts
 
 
 def cuts_of(poses: Points, count: int, seed: int) -> list[int]:
@@ -105,40 +88,6 @@ def test_without_noise_any_cuts_give_the_same_length(seed: int, count: int) -> N
     assert found.totals.distance_m == pytest.approx(plain_sum(poses), rel=1e-9)
 
 
-# Speed
-
-
-# Gaps, jumps and resets
-
-
-def history(
-    folder: Path, legs: Sequence[tuple[float, float, float]], *, split_s: float = 5.0
-) -> list[list[Msg]]:
-    """Odometry at 20 Hz along x: legs of (begin in seconds, from, to) at 1 m/s, in bags."""
-    bags: list[list[Msg]] = []
-    for begin, start, end in legs:
-        steps = round(abs(end - start) * 20)
-        run = [
-            odom(BEGIN + round((begin + nth / 20) * S), start + (end - start) * nth / steps, 0.0)
-            for nth in range(steps + 1)
-        ]
-        size = round(split_s * 20)
-        bags += [run[at : at + size] for at in range(0, len(run), size)]
-    for nth, messages in enumerate(bags):
-        write_mcap(folder / f"run_{nth}.mcap", messages)
-    return bags
-
-
-def replies(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What trajectory_summary and recap say of everything."""
-    memory = memory_of(folder)
-    span = TimeRange(start_s=BEGIN / S - 1, end_s=BEGIN / S + 1000)
-    shown = Replies(folder, 24_000)
-    way = json.loads(shown.answer(trajectory_summary(memory, Call(), span)).text)
-    told = json.loads(shown.answer(recap(memory, Call(), span)).text)
-    return way, told
-
-
 @pytest.mark.parametrize("split", [None, 0, 2, -3], ids=["one part", "at it", "after", "before"])
 @pytest.mark.parametrize("noise_m", [0.0, 0.003])
 @pytest.mark.parametrize(
@@ -167,6 +116,3 @@ def test_messages_lost_on_the_way_home_are_no_reset(lost: int) -> None:
     found = way_of(posed([*rows[: last + 1], *rows[250:]]), 10.0).trajectory()
     assert found.totals.resets == ()
     assert found.totals.distance_m == pytest.approx(5.0)
-
-
-# Waypoints

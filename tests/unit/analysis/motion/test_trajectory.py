@@ -16,7 +16,7 @@ from tests.support.strategies import points
 from tests.unit.analysis.motion.posed import posed, way_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.core.model import Vector3
@@ -25,22 +25,17 @@ S = NS_PER_S
 START = 1_700_000_000 * S
 
 
-def driven(
-    positions: Iterable[Vector3], step_ns: int = S, speeds: Sequence[float] | None = None
-) -> Poses:
-    """Poses at even steps of log time, with the messages' own speeds where given."""
-    rows = ((START + nth * step_ns, place) for nth, place in enumerate(positions))
-    return posed(rows, speeds=speeds)
+def driven(positions: Iterable[Vector3], step_ns: int = S) -> Poses:
+    """Poses at even steps of log time."""
+    return posed((START + nth * step_ns, place) for nth, place in enumerate(positions))
 
 
 def along_x(*metres: float) -> list[Vector3]:
     return [(x, 0.0, 0.0) for x in metres]
 
 
-def summarise(
-    poses: Poses, fastest_mps: float = 10.0, at_most: int = 50, cuts: Sequence[int] | None = None
-) -> Trajectory:
-    return way_of(poses, fastest_mps, cuts).trajectory(at_most)
+def summarise(poses: Poses, fastest_mps: float = 10.0, at_most: int = 50) -> Trajectory:
+    return way_of(poses, fastest_mps).trajectory(at_most)
 
 
 def path_length(positions: Iterable[Vector3]) -> float:
