@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.history import clock_steps
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, battery, boolean, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
@@ -18,9 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.history.context import Memory
-    from ros2_memory.storage.base import Record
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -71,18 +68,6 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
         assert reply["counts"]["clock steps"] == 1
         later = asked(memory, tmp_path, "recap", start=BEGIN + 100, end=BEGIN + 150)
         assert "clock steps" not in later["counts"]
-
-
-def test_a_suspected_hole_is_read_once(tmp_path: Path) -> None:
-    memory = with_store(recorded(tmp_path, shown=lambda t: t + 8.0 * (t > 55)), tmp_path)
-    first = steps(memory, tmp_path)
-    stored = replace(memory, reader=Unreadable())
-    assert steps(stored, tmp_path) == first != []
-
-
-class Unreadable(McapReader):
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        raise AssertionError(path, topic, window)
 
 
 def steps(memory: Memory, folder: Path) -> list[Any]:
