@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ros2_memory.core.arrays import Groups, distinct_rows, rows_of
+from ros2_memory.core.arrays import Groups, distinct_rows, rows_of, run_starts
 from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, NS_PER_US
 
@@ -248,7 +248,7 @@ def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tupl
     detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, near)
     if len(names) > MAX_LABELS:
         rows, nth = distinct_rows((detections.slice, label))
-        begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
+        begins = run_starts(rows[:, 0])
         before = np.repeat(begins, np.diff(begins, append=len(rows)))
         detections = rows_of(detections, (np.arange(len(rows)) - before <= MAX_LABELS)[nth])
     return detections, tuple(names)
@@ -263,7 +263,7 @@ def _label_groups(detections: _Detections) -> tuple[Ints, Ints]:
     rows, nth = distinct_rows((group, detections.message))
     counts = np.bincount(nth, minlength=len(rows))
     order = np.lexsort((-counts, rows[:, 0]))
-    begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
+    begins = run_starts(rows[:, 0])
     sizes = np.diff(begins, append=len(rows))
     together: Ints = counts[order][begins + np.minimum(sizes, _TOGETHER_MESSAGES) - 1]
     return group, together
@@ -275,7 +275,7 @@ def _clusters(group: Ints, message: Ints, x: Ints, y: Ints) -> Ints:
     Detections are ordered by group, and by message. Each is of the nearest spot, no two of a
     message of one. Mostly a group is one spot: all lie near the mean of those before.
     """
-    begins = np.flatnonzero(np.diff(group, prepend=-1))
+    begins = run_starts(group)
     start = np.repeat(begins, np.diff(begins, append=len(group)))
     nth = np.arange(len(group)) - start
     away = np.zeros(len(group))

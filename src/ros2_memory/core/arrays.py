@@ -79,6 +79,11 @@ def begins_of(group: Ints, groups: int) -> Ints:
     return begins
 
 
+def run_starts(numbers: Ints) -> Ints:
+    """Returns where each run of equal numbers begins."""
+    return np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
+
+
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
     """Returns some rows of a table, which is a dataclass with a column in each field."""
     names = [column.name for column in fields(table)]

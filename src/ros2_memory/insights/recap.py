@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.intervals import IntervalTable, united
 from ros2_memory.analysis.motion.standstills import SHORTEST_NS
+from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -417,8 +418,7 @@ def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[
 
 def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
     near = deleted_between(view, TimeWindow(begin, until))
-    spans = [(max(start, begin), min(stop, until)) for start, stop in near]
-    deleted = unix_from_ns(sum(stop - start for start, stop in spans))
+    deleted = unix_from_ns(length_in(near, begin, until))
     if not deleted:
         return "nothing was recorded"
     whole = unix_from_ns(until - begin)

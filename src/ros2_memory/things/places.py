@@ -31,7 +31,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
 from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Flags, Ints, Look, Spot
-from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.arrays import distinct_rows, run_starts
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 
@@ -220,7 +220,7 @@ def stays_in(sightings: Sightings, thing: Ints) -> list[Ints]:
     `thing` has their numbers, from 0 without a gap, in order.
     """
     series = _Series.of(sightings, thing)
-    begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
+    begins = run_starts(series.thing)
     variance = _visit_variances(*_differences(series), len(begins))
     stays = np.cumsum(_are_moved(series, variance))
     return np.split(stays - stays[begins][series.thing], begins[1:])
@@ -256,10 +256,10 @@ def _differences(series: _Series) -> tuple[Floats, Ints]:
 
     Not by the two that differ most: between these it may have been moved. Ascending for each thing.
     """
-    starts = np.flatnonzero(np.diff(series.visit, prepend=-1))
+    starts = run_starts(series.visit)
     sums, thing = np.add.reduceat(series.columns, starts, axis=1), series.thing[starts]
     means = sums / sums[0]
-    begins = np.flatnonzero(np.diff(thing, prepend=-1))
+    begins = run_starts(thing)
     normal = np.add.reduceat(_squares(sums, _VISIT_MM**2), begins, axis=2).transpose(2, 0, 1)
     fit = np.linalg.solve(normal[:, :, :3] + np.diag(_PRIOR), normal[:, :, 3:])
     off = means[3:] - np.einsum("iv,vij->jv", means[:3], fit[thing])
@@ -312,7 +312,7 @@ def _squares(sums: Floats, visit: Floats | float) -> Floats:
 def _are_moved(series: _Series, variance: Floats) -> Flags:
     """Returns the sightings before which a thing was moved; `variance` of visits is by thing."""
     moved = np.zeros(len(series.n), np.bool_)
-    begins = np.flatnonzero(np.diff(series.thing, prepend=-1)).tolist()
+    begins = run_starts(series.thing).tolist()
     waiting = deque(pairwise([*begins, len(moved)]))
     while waiting:
         spans, size = [], 0
@@ -336,7 +336,7 @@ def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
 
     `variance` is that of the visit of each sighting.
     """
-    begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
+    begins = run_starts(series.thing)
     looks = np.cumsum(series.n)
     of_others, total = (looks - series.n)[begins], np.add.reduceat(series.n, begins)
     old_looks = looks - of_others[series.thing]

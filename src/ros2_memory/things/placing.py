@@ -29,6 +29,7 @@ from ros2_memory.analysis.sights import (
     fixes_of,
     sights_of,
 )
+from ros2_memory.core.arrays import run_starts
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
@@ -237,7 +238,7 @@ class Placer:
                 if self._sessions.of(rows.recording) != session:
                     continue
                 slices = rows.times // _SAID_NS
-                firsts = np.flatnonzero(np.diff(slices, prepend=slices[:1] - 1))
+                firsts = run_starts(slices)
                 for stored in messages_of(view, rows.some(firsts)):
                     message = view.bags.decode(stored)
                     if message is None:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.core.arrays import run_starts
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -275,13 +276,12 @@ def _vertices(part: PartialTrack, keeps: Mask, recordings: Times) -> NDArray[np.
             off += away * away
         away = turned[waiting] - turned[start] - (turned[end] - turned[start]) * share
         off = np.maximum(off, away * away)
-        first = np.flatnonzero(np.append([True], after[1:] != after[:-1]))
+        first = run_starts(after)
         worst = np.maximum.reduceat(off, first)
         worst_here = np.repeat(worst, np.diff(first, append=waiting.size))
         is_bent = worst_here > TOLERANCE_M * TOLERANCE_M
         splits = np.flatnonzero(is_bent & (off == worst_here))
-        of_step = after[splits]
-        splits = splits[np.append([True], of_step[1:] != of_step[:-1])[: splits.size]]
+        splits = splits[run_starts(after[splits])]
         kept[waiting[splits]] = True
         is_bent[splits] = False
         waiting = waiting[is_bent]

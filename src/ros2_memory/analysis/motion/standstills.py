@@ -44,7 +44,7 @@ import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.poses import headings
-from ros2_memory.core.arrays import narrowed, row_sums, rows_of, stacked
+from ros2_memory.core.arrays import narrowed, row_sums, rows_of, run_starts, stacked
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -296,7 +296,7 @@ class _Slots:
     def __init__(self, times: Ints, positions: Vectors) -> None:
         self.times, self.positions = times, positions
         slots = times // SLOT_NS
-        self.begins = np.flatnonzero(np.diff(slots, prepend=slots[:1] - 1))
+        self.begins = run_starts(slots)
         self.stops = np.r_[self.begins[1:], times.size]
         self.counts = self.stops - self.begins
         self.numbers = slots[self.begins]
@@ -529,7 +529,7 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     valid = np.flatnonzero(are_places(poses.positions))
     slots = poses.times[valid] // DROP_SLOT_NS
     # The first pose of each slot.
-    rows = valid[np.flatnonzero(np.diff(slots, prepend=slots[:1] - 1))]
+    rows = valid[run_starts(slots)]
     if rows.size < _DROP_SLOTS:
         return ()
     times, places = poses.times[rows], poses.positions[rows]
