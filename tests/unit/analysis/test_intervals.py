@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -19,12 +18,15 @@ from ros2_memory.analysis.intervals import (
 )
 from ros2_memory.core.timebase import NS_PER_S
 
-Messages = list[tuple[int, tuple[str, ...]]]
+Messages = list[tuple[int, dict[str, float | None]]]
+"""Their times (ns), and the score of each label."""
 
 MESSAGES = st.lists(
     st.tuples(
         st.sampled_from([0, 1, NS_PER_S, FLICKER_NS, FLICKER_NS + 1, SILENCE_NS, SILENCE_NS + 1]),
-        st.sets(st.sampled_from("abc")).map(lambda labels: tuple(sorted(labels))),
+        st.dictionaries(
+            st.sampled_from("abc"), st.sampled_from([None, -0.5, 0.2, 0.7, 0.71234, 88.0])
+        ),
     ),
     min_size=1,
     max_size=30,
@@ -32,23 +34,27 @@ MESSAGES = st.lists(
 
 
 @st.composite
-def histories(draw: st.DrawFn, begin: int = 0) -> Messages:
+def histories(draw: st.DrawFn) -> Messages:
     """Messages with silences and equal times."""
-    time, messages = begin, []
+    time, messages = 0, []
     for wait, labels in draw(MESSAGES):
         time += wait
         messages.append((time, labels))
     return messages
 
 
-def watched(messages: Messages, scores: Sequence[float | None] = ()) -> IntervalPart:
+def watched(messages: Messages) -> IntervalPart:
     labels = sorted({label for _, labels in messages for label in labels})
-    seen = [(nth, labels.index(label)) for nth, (_, some) in enumerate(messages) for label in some]
-    rows, codes = np.array(seen, np.int64).reshape(-1, 2).T
+    seen = [
+        (nth, labels.index(label), score)
+        for nth, (_, some) in enumerate(messages)
+        for label, score in some.items()
+    ]
+    rows, codes = np.array([each[:2] for each in seen], np.int64).reshape(-1, 2).T
+    scores = np.array([score for *_, score in seen], np.float64)
     times = np.array([time for time, _ in messages], np.int64)
-    best = np.array(scores or [None] * len(rows), np.float64)
     return IntervalPart(
-        messages[0][0], messages[-1][0], visible_in(times, rows, codes, best, labels)
+        messages[0][0], messages[-1][0], visible_in(times, rows, codes, scores, labels)
     )
 
 
@@ -56,27 +62,33 @@ def by_hand(messages: Messages) -> list[VisibleInterval]:
     """By the definition of an interval."""
     found: list[VisibleInterval] = []
     for label in "abc":
-        row: list[int] = []  # places of the messages of one interval
+        rows: list[list[int]] = []  # places of the messages of each interval
         for nth, (time, labels) in enumerate(messages):
             if label not in labels:
                 continue
-            if row:
-                apart = time - messages[row[-1]][0]
-                follows = row[-1] == nth - 1 and apart <= SILENCE_NS
-                if not (follows or apart <= FLICKER_NS):
-                    found.append(VisibleInterval(label, messages[row[0]][0], messages[row[-1]][0]))
-                    row = []
-            row.append(nth)
-        if row:
-            found.append(VisibleInterval(label, messages[row[0]][0], messages[row[-1]][0]))
+            last = rows[-1][-1] if rows else nth
+            apart = time - messages[last][0]
+            if rows and (apart <= FLICKER_NS or (last == nth - 1 and apart <= SILENCE_NS)):
+                rows[-1].append(nth)
+            else:
+                rows.append([nth])
+        for row in rows:
+            scores = [score for nth in row if (score := messages[nth][1][label]) is not None]
+            best = max(scores, default=None)
+            found.append(VisibleInterval(label, messages[row[0]][0], messages[row[-1]][0], best))
     return sorted(found, key=lambda each: (each.first, each.label))
 
 
 @given(histories())
 def test_a_thing_is_in_view_as_long_as_it_is_missed_for_a_moment_only(messages: Messages) -> None:
-    part = watched(messages)
-    assert list(part.visible.intervals()) == by_hand(messages)
-    assert (part.first, part.last) == (messages[0][0], messages[-1][0])
+    seen, expected = watched(messages).visible, by_hand(messages)
+    rounded = [
+        each._replace(best=None if each.best is None else round(each.best, 4)) for each in expected
+    ]
+    assert [*seen.intervals()] == rounded
+    assert [*seen.scoring(0.7).intervals()] == [
+        each for each in rounded if each.best is None or each.best >= 0.7
+    ]
 
 
 @given(histories(), st.data())
@@ -135,37 +147,3 @@ def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
         usual = (times[-1] - times[0]) / max(1, len(times) - 1)
         edges = [start, *times, end]
         assert max(b - a for a, b in pairwise(edges)) <= max(NS_PER_S, 3 * usual)
-
-
-@given(
-    messages=st.lists(
-        st.tuples(st.integers(1, 6), st.sampled_from([None, -0.5, 0.2, 0.7, 0.71234, 88.0])),
-        min_size=1,
-        max_size=20,
-    ),
-    cuts=st.sets(st.integers(0, 20)),
-)
-def test_the_best_score_of_an_interval_is_the_same_however_a_history_is_cut(
-    messages: list[tuple[int, float | None]], cuts: set[int]
-) -> None:
-    times = np.cumsum([seconds * NS_PER_S for seconds, _ in messages]).tolist()
-    ends = sorted({0, len(messages), *(cut for cut in cuts if cut < len(messages))})
-    parts = [
-        watched(
-            [(time, ("a",)) for time in times[begin:end]],
-            [score for _, score in messages[begin:end]],
-        )
-        for begin, end in pairwise(ends)
-    ]
-    whole = joined(parts).visible
-    for each in whole.intervals():
-        scores = [
-            score
-            for at, (_, score) in zip(times, messages, strict=True)
-            if each.first <= at <= each.last and score is not None
-        ]
-        assert each.best == (round(max(scores), 4) if scores else None)
-    kept = whole.scoring(0.7).intervals()
-    assert kept == tuple(
-        each for each in whole.intervals() if each.best is None or each.best >= 0.7
-    )

@@ -14,7 +14,7 @@ from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
@@ -33,13 +33,22 @@ def recorded(
     is_on: Callable[[float], bool] = lambda t: True,
 ) -> Memory:
     """A robot whose clock shows `shown` seconds, that has driven for `driven` at a time."""
+
+    def at_beat(t: float) -> Iterator[Msg]:
+        at = BEGIN * S + round(shown(t) * S)
+        if is_on(t):
+            yield odom(at, SPEED * driven(t), 0.0, 0.0)
+            yield from [boolean(at + 1, data=False)] * (t % 1 == 0)
+
+    return written(folder, at_beat)
+
+
+def written(folder: Path, at_beat: Callable[[float], Iterable[Msg]]) -> Memory:
+    """A recording in splits, of what a robot publishes at each beat of its own time (s)."""
     for number in range(SPLITS):
-        messages: list[Msg] = []
-        for beat in range(number * SPLIT * HZ, (number + 1) * SPLIT * HZ):
-            t = beat / HZ
-            at = BEGIN * S + round(shown(t) * S)
-            messages += [odom(at, SPEED * driven(t), 0.0, 0.0)] * is_on(t)
-            messages += [boolean(at + 1, data=False)] * (is_on(t) and beat % HZ == 0)
+        beats = range(number * SPLIT * HZ, (number + 1) * SPLIT * HZ)
+        messages = [message for beat in beats for message in at_beat(beat / HZ)]
+        messages.sort(key=lambda message: message.log_time)
         write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
     return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
 
@@ -158,18 +167,14 @@ def stamped(
     is_lost: Callable[[float], bool] = lambda t: False,
 ) -> Memory:
     """A robot that stands, whose sensors stamp by a clock of their own, logged after a delay."""
-    for number in range(SPLITS):
-        messages: list[Msg] = []
-        for beat in range(number * SPLIT * HZ, (number + 1) * SPLIT * HZ):
-            at, logged = (
-                BEGIN * S + round((beat / HZ + extra) * S) for extra in (0.0, delay(beat / HZ))
-            )
-            if not is_lost(beat / HZ):
-                messages.append(odom(at, 1.0, 0.0, 0.0, log_time=logged))
-                messages.append(battery(at + 1000, 0.5, log_time=logged + 1))
-        messages.sort(key=lambda message: message.log_time)
-        write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
-    return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
+
+    def at_beat(t: float) -> Iterator[Msg]:
+        at, logged = (BEGIN * S + round((t + extra) * S) for extra in (0.0, delay(t)))
+        if not is_lost(t):
+            yield odom(at, 1.0, 0.0, 0.0, log_time=logged)
+            yield battery(at + 1000, 0.5, log_time=logged + 1)
+
+    return written(folder, at_beat)
 
 
 @pytest.mark.parametrize("by", [2.0, 0.8])

@@ -20,7 +20,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,8 +46,7 @@ def written(folder: Path, *, stored: bool = False) -> Memory:
     later.insert(5, text((BEGIN + 909) * S, "rest", "/task"))
     write_splits(folder, [*said, *beats], 100, "a")
     write_mcap(folder / "c" / "c_0.mcap", later)
-    memory = memory_of(folder)
-    return with_store(memory, folder) if stored else memory
+    return memory_of(folder, recalls=stored)
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["bags", "store"])
@@ -99,8 +98,7 @@ def test_numbers_are_written_as_everywhere_else(tmp_path: Path) -> None:
     )
     given = {"topic": "/battery_state", "start": BEGIN, "end": BEGIN + 14, "fields": ["percentage"]}
     for stored in (False, True):
-        memory = memory_of(tmp_path)
-        memory = with_store(memory, tmp_path) if stored else memory
+        memory = memory_of(tmp_path, recalls=stored)
         reply = ask(memory, "get_topic_in_range", changes=True, **given)
         assert [row["value"] for row in reply["changes"]] == [0, 0.1, 0.2]
         reply = ask(memory, "get_topic_in_range", by="value", **given)

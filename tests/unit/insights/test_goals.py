@@ -20,7 +20,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
 from tests.support.bags import Msg, goals, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, replied, with_store
+from tests.support.memories import memory_of, replied
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -157,10 +157,7 @@ def test_however_the_history_is_cut_the_same_is_told(
         expected.append((f"/drive goal {words[end]} after {length} s", begun, at))
     with TemporaryDirectory() as folder:
         found = told(Path(folder), history(*messages), 0, 200, cut, recalls=recalls)
-        memory = memory_of(Path(folder))
-        searched = found_in(
-            with_store(memory, Path(folder)) if recalls else memory, "above", 3, "status"
-        )
+        searched = found_in(memory_of(Path(folder), recalls=recalls), "above", 3, "status")
     assert [(text, begin, end) for _, text, begin, end, _ in found] == expected
     assert [
         (f"/drive goal {status} after {end - begin:g} s", begin, end)

@@ -31,7 +31,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -204,8 +204,7 @@ def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
         if step % 10 == 0:
             messages.append(tf(at, transform(at, "map", "odom", (-2.0 * nth, nth + 1.0, 0.0))))
     write_splits(tmp_path, messages)
-    memory = in_places(memory_of(tmp_path))
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = in_places(memory_of(tmp_path, recalls=recalls))
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 200)
     found = recap(memory, Call(), span)
     own = recap(memory, Call(), span, frame_id="odom")

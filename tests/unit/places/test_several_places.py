@@ -22,7 +22,6 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
 from tests.support.bags import (
-    Msg,
     boolean,
     octets,
     odom,
@@ -31,7 +30,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S, write_moving_map
 from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, runs_of, write
@@ -270,36 +269,26 @@ def in_places(memory: Memory) -> Memory:
     return replace(memory, limits=replace(memory.limits, places=PLACES))
 
 
-def docking(folder: Path, *, changes: bool) -> Memory:
-    """Words each second for a minute; docked but from 20 s to 40 s."""
-    messages: list[Msg] = [odom(MAP_BEGIN, 0.0, 0.0)]
-    for second in range(60):
-        at = MAP_BEGIN + second * S
-        messages.append(text(at + S // 2, "hello"))
-        docked = not 20 <= second < 40
-        if not changes or second in {0, 20, 40}:
-            messages.append(boolean(at, docked, topic="/is_docked"))
-    write_splits(folder, messages)
-    return memory_of(folder)
-
-
 @pytest.mark.parametrize("changes", [False, True], ids=["each second", "on change"])
 @each_way
 def test_matches_count_while_another_topic_meets_a_condition(
     tmp_path: Path, changes: bool, recalls: bool
 ) -> None:
-    memory = docking(tmp_path, changes=changes)
-    memory = with_store(memory, tmp_path) if recalls else memory
-    undocked = WhileCondition("/is_docked", "equals", False)
-    [found] = find_matches(
-        memory, Call(), "/chatter", "contains", "hello", during=(undocked,)
-    ).sightings
-    assert ((found.first - MAP_BEGIN) / S, (found.last - MAP_BEGIN) / S) == (20.5, 39.5)
-    docked = WhileCondition("/is_docked", "equals", True)
-    later, earlier = find_matches(
-        memory, Call(), "/chatter", "contains", "hello", during=(docked,)
-    ).sightings
-    assert [(each.first - MAP_BEGIN) / S for each in (earlier, later)] == [0.5, 40.5]
+    """Words each second for a minute; docked but from 20 s to 40 s."""
+    messages = [odom(MAP_BEGIN, 0.0, 0.0)]
+    for second in range(60):
+        at = MAP_BEGIN + second * S
+        messages.append(text(at + S // 2, "hello"))
+        if not changes or second in {0, 20, 40}:
+            messages.append(boolean(at, not 20 <= second < 40, topic="/is_docked"))
+    write_splits(tmp_path, messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    for docked, spans in ((False, [(20.5, 39.5)]), (True, [(40.5, 59.5), (0.5, 19.5)])):
+        other = WhileCondition("/is_docked", "equals", docked)
+        found = find_matches(memory, Call(), "/chatter", "contains", "hello", during=(other,))
+        assert [
+            ((each.first - MAP_BEGIN) / S, (each.last - MAP_BEGIN) / S) for each in found.sightings
+        ] == spans
 
 
 @each_way

@@ -16,12 +16,11 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import SILENCE_NS
 from tests.support.bags import Msg, boolean, odom, text, write_splits
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 T0 = 1_784_000_000
@@ -49,19 +48,6 @@ def life(seconds: int, silent: Mapping[str, Sequence[tuple[float, float]]] | Non
     ]
 
 
-def world(
-    folder: Path,
-    messages: Iterable[Msg],
-    *,
-    name: str = "rec",
-    split_s: int = 10,
-    stored: bool = False,
-) -> Memory:
-    write_splits(folder, messages, split_s, name)
-    memory = memory_of(folder)
-    return with_store(memory, folder) if stored else memory
-
-
 def cells(reply: Any) -> dict[str, Any]:
     """The row of all bins, by column."""
     return dict(zip(reply["columns"][1:], reply["all"], strict=True))
@@ -69,9 +55,10 @@ def cells(reply: Any) -> dict[str, Any]:
 
 def test_pauses_of_the_recording_are_no_unknown_time(tmp_path: Path) -> None:
     """What was not recorded is in the gaps: a robot that is off is nowhere."""
-    world(tmp_path, life(60), name="first")
+    write_splits(tmp_path, life(60), name="first")
     later = [replace(one, log_time=one.log_time + 600 * S) for one in life(60)]
-    memory = world(tmp_path, later, name="second")
+    write_splits(tmp_path, later, name="second")
+    memory = memory_of(tmp_path)
     for scope in ({"where": HERE}, {"while": CALM}):
         assert "unknown_s" not in asked(memory, tmp_path, "find_matches", **PRESSED, **scope)
     assert "unknown_s" not in asked(memory, tmp_path, "visits", **HERE)
@@ -101,7 +88,8 @@ def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: 
     bounds = first, last, start * S, min(end * S, last)
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
-        memory = world(bag_dir, messages, split_s=split_s, stored=stored)
+        write_splits(bag_dir, messages, split_s)
+        memory = memory_of(bag_dir, recalls=stored)
         window = {"start": start, "end": end}
         for given, name in (({"where": HERE}, "/odom"), ({"while": CALM}, "/mood")):
             if len(times[name]) < 20:

@@ -83,26 +83,18 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     assert elsewhere.notes == ()
 
 
-def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_path: Path) -> None:
-    first = line((10, 0.0), (20, 0.5))
-    second = line((10, 0.0), (20, 0.5), begin=1000.0)
-    memory = remembering(tmp_path, first + second)
+@pytest.mark.parametrize("in_map", [False, True])
+def test_visits_of_before_a_restart_of_odometry_are_marked_unless_they_are_in_a_map(
+    tmp_path: Path, *, in_map: bool
+) -> None:
+    twice = [each for begin in (0, 1000) for each in line((10, 0.0), (20, 0.5), begin=begin)]
+    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (0.5, 0.0, 0.0)), topic="/tf_static")
+    memory = remembering(tmp_path, [*[fixed] * in_map, *twice])
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
-    assert [each.restarts for each in answer.visits] == [0, 1]
-    assert any("odometry restarted" in note for note in answer.notes)
-    recalled = with_store(memory, tmp_path)
-    assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
-
-
-def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
-    first = line((10, 0.0), (20, 0.5))
-    second = line((10, 0.0), (20, 0.5), begin=1000.0)
-    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 1.0, 0.0)), topic="/tf_static")
-    memory = remembering(tmp_path, [fixed, *first, *second])
-    answer = visits(memory, Call(), 5.0, 1.0, radius_m=1.0)
-    assert answer.frame_id == "map"
-    assert [each.restarts for each in answer.visits] == [0, 0]
-    assert answer.total == 2
+    assert answer.frame_id == ("map" if in_map else "odom")
+    assert [each.restarts for each in answer.visits] == [0, int(not in_map)]
+    assert any("odometry restarted" in note for note in answer.notes) is not in_map
+    assert visits(with_store(memory, tmp_path), Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
 def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_path: Path) -> None:
@@ -245,8 +237,8 @@ def test_a_pose_that_cannot_be_decoded_hides_no_visit(
 ) -> None:
     way = line((20.0, 0.1))
     way[nth] = replace(way[nth], body=way[nth].payload[:40])
-    memory = remembering(tmp_path, way)
-    memory = with_store(memory, tmp_path) if recalls else memory
+    write_splits(tmp_path, way)
+    memory = memory_of(tmp_path, recalls=recalls)
     found = visits(memory, Call(), 0.0, 0.0)
     assert len(found.visits) == 1
     assert found.frame_id == "odom"
