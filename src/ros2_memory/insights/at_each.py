@@ -5,6 +5,7 @@ Each is answered as if it were asked alone.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import replace
 from datetime import date, datetime, time, timedelta
 from typing import TYPE_CHECKING, Final
@@ -18,6 +19,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import START_SLACK_NS, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.counts.bins import local_offset
 from ros2_memory.history.coverage import recorded_reach
 from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_window
 from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingAt, OneAnswer
@@ -143,10 +145,9 @@ def _local_time_ns(day: date, at: time) -> Ns:
     """Returns when it is a local time on a day; for one that clocks skip, when they skip it."""
     local = datetime.combine(day, at)
     # By the time before clocks are put forward, what is skipped is later than by that after.
-    low, high = local.replace(fold=1).timestamp(), local.timestamp()
-    while high - low > 1:
-        middle = (low + high) // 2
-        ahead = datetime.fromtimestamp(middle).astimezone().utcoffset()
-        is_before = ahead == datetime.fromtimestamp(low).astimezone().utcoffset()
-        low, high = (middle, high) if is_before else (low, middle)
-    return ns_from_unix(high)
+    after_s, at_s = (local.replace(fold=fold).timestamp() for fold in (1, 0))
+    if at_s <= after_s:
+        return ns_from_unix(at_s)
+    skipped = range(int(after_s), int(at_s))
+    passed_s = bisect_left(skipped, local_offset(skipped.stop), key=local_offset)
+    return ns_from_unix(skipped.start + passed_s)

@@ -165,7 +165,7 @@ def _compare_things(
     )
     for window in windows:
         note_undecoded(view, window)
-    things = known_things(view, limits.min_score, limits.labels, both)
+    things = known_things(view, limits.min_score, both)
     note_other_frames(view, things, where)
     first, second = sorted(windows, key=lambda window: (window.start, window.stop))
     frame = next(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from heapq import merge
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.clock_steps import Elapsed
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     CONTEXT_NS,
@@ -51,6 +50,7 @@ from ros2_memory.places.pose_frames import NEWEST_POSE_NS
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.view import View
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
@@ -77,11 +77,11 @@ class Drive:
     between moments of the window.
     """
 
+    elapsed: Elapsed
     path: PathSlice | None = None
     trajectory: Trajectory | None = None
     standstills: tuple[Stop, ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
-    elapsed: Elapsed = field(default_factory=Elapsed)
 
     @property
     def valid_trajectory(self) -> Trajectory | None:
@@ -133,12 +133,12 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         standstills, drops = _standstills_in(view, topic, TimeWindow(begin, window.stop))
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")
-        return Drive(elapsed=elapsed)
+        return Drive(elapsed)
     if path is None:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")
-        return Drive(None, None, standstills, drops, elapsed)
+        return Drive(elapsed, None, None, standstills, drops)
     trajectory = across_steps(path.trajectory(0), path, elapsed)
-    return Drive(path, trajectory, standstills, drops, elapsed)
+    return Drive(elapsed, path, trajectory, standstills, drops)
 
 
 def _standstills_in(

@@ -205,7 +205,7 @@ def farthest_from(
     value: JsonValue,
     topic: str,
     spans: Sequence[tuple[Ns, Ns]],
-    frame_id: str | None = None,
+    frame_id: str | None,
 ) -> FarthestPose | None:
     """Returns the pose in some times (both ends inclusive, in order) that is farthest from a point.
 

@@ -89,7 +89,7 @@ def find_things(
         )
     note_robots(view, view.pose_topic, window)
     undecoded = note_undecoded(view, window)
-    known = known_things(view, lowest, limits.labels, window)
+    known = known_things(view, lowest, window)
     view.notes.retract_outside(whole)
     note_other_frames(view, known, region)
     asked = {known.labels.key(label): label for label in labels}

@@ -29,7 +29,7 @@ from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import SIGHTS_NS, SeenStretch, Watching, spots_in
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Sequence
 
     from ros2_memory.core.model import TimeWindow, Vector3
     from ros2_memory.history.sessions import Session
@@ -116,9 +116,7 @@ class KnownThings:
         )
 
 
-def known_things(
-    view: View, min_score: float, spellings: Mapping[str, Sequence[str]], window: TimeWindow
-) -> KnownThings:
+def known_things(view: View, min_score: float, window: TimeWindow) -> KnownThings:
     """Returns the things known at a window's end. Notes say what could not be read.
 
     Raises:
@@ -127,10 +125,10 @@ def known_things(
     latest = view.snapshot.latest
     until = -(-window.stop // SIGHTS_NS) * SIGHTS_NS
     ahead = view.snapshot.dating.ahead_from
-    by_all = _Loader(view, min_score, spellings, ahead if window.stop <= ahead else MAX_NS)
+    by_all = _Loader(view, min_score, ahead if window.stop <= ahead else MAX_NS)
     known = by_all.known() if by_all.reaches(window.start) else None
     if (known is None or known.crowded or known.since is None) and until <= (latest or until):
-        then = _Loader(view, min_score, spellings, MAX_NS, until).known()
+        then = _Loader(view, min_score, MAX_NS, until).known()
         if known is not None and known.reaches_back(window):
             return replace(then, later=known) if then.reaches_back(window) else known
         known = then
@@ -172,19 +170,13 @@ class _Loader:
     Args:
         view: has the bags.
         min_score: detections with a lower score do not count.
-        spellings: other spellings of labels, by the name to be shown.
+
         ahead: what is dated later is left out: a clock was wrong, unless that is asked for.
         until: likewise, of an estimate of a time before.
     """
 
-    def __init__(
-        self,
-        view: View,
-        min_score: float,
-        spellings: Mapping[str, Sequence[str]],
-        ahead: Ns,
-        until: Ns = MAX_NS,
-    ) -> None:
+    def __init__(self, view: View, min_score: float, ahead: Ns, until: Ns = MAX_NS) -> None:
+        spellings = view.limits.labels
         described = tuple(sorted((name, tuple(others)) for name, others in spellings.items()))
         key = (min_score, described, view.limits.map_frame, view.pose_topic, ahead)
         self._view = view

@@ -106,10 +106,10 @@ class Labels:
         spellings: other spellings, by the name that is to be shown.
     """
 
-    def __init__(self, spellings: Mapping[str, Iterable[str]] | None = None) -> None:
+    def __init__(self, spellings: Mapping[str, Iterable[str]]) -> None:
         self._keys: dict[str, str] = {}
         self._shown: dict[str, str] = {}
-        for name, variants in (spellings or {}).items():
+        for name, variants in spellings.items():
             key = singular(name)
             self._shown[key] = name
             for spelling in (name, *variants):

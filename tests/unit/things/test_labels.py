@@ -27,7 +27,7 @@ from ros2_memory.things.labels import Labels, moves_by_itself
     ],
 )
 def test_case_spacing_and_a_plural_do_not_matter(one: str, other: str) -> None:
-    assert Labels().key(one) == Labels().key(other)
+    assert Labels({}).key(one) == Labels({}).key(other)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import pytest
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
@@ -86,17 +85,6 @@ def test_find_things_answers_from_the_newest_bags_and_says_since_when(
         assert (answer.total < len(THINGS)) == bool(told)
         first = begin_of(len(THINGS) - answer.total)
         assert all(str(first) in note for note in told), told
-
-
-def test_a_count_says_since_when_it_counted(fresh: Callable[[], Memory]) -> None:
-    answers = in_time(
-        lambda short: count_matches(fresh(), short, TOPIC, "contains", "thing", by="day")
-    )
-    told = {any("only what is after" in note for note in each.notes) for each in answers}
-    assert told == {True, False}
-    for answer in answers:
-        for note in answer.notes:
-            assert "only what is after" not in note or "2 of 8 bags" in note
 
 
 @pytest.fixture
