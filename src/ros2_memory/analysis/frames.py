@@ -303,7 +303,7 @@ class FrameTree:
         is_known = name == self.target or self.reaches(name)
         return self._compose(name, times) if is_known else None
 
-    def carriers(self, frame: str, odometry: str = "") -> tuple[str, str] | None:
+    def carriers(self, frame: str, odometry: str) -> tuple[str, str] | None:
         """Returns what a frame is fixed to by static transforms, and the body that carries that.
 
         The body is the frame next to the world, which is the target, odometry, and what is above

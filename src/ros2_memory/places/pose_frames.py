@@ -243,7 +243,7 @@ class MapPlacement:
     frame_id: str
     pose_frame: str
     is_map: bool
-    above: tuple[str, ...] = ()
+    above: tuple[str, ...]
 
     @property
     def frames(self) -> tuple[str, ...]:

@@ -118,9 +118,9 @@ class KnownTrack:
     """
 
     track: RobotTrack
-    since: Ns | None = None
-    left_out: int = 0
-    others: tuple[RobotTrack, ...] = ()
+    since: Ns | None
+    left_out: int
+    others: tuple[RobotTrack, ...]
 
     @property
     def tracks(self) -> tuple[RobotTrack, ...]:

@@ -173,7 +173,7 @@ class Near(NamedTuple):
     """
 
     circle: Circle
-    label: str = ""
+    label: str
 
     def those_near(
         self, found: Iterable[_FoundThing], others: Sequence[_FoundThing]

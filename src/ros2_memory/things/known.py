@@ -70,10 +70,10 @@ class KnownThings:
     estimate: Estimate
     labels: Labels
     frames: tuple[str, ...]
-    since: Ns | None = None
-    has_map: bool = True
-    crowded: bool = False
-    until: Ns = MAX_NS
+    since: Ns | None
+    has_map: bool
+    crowded: bool
+    until: Ns
     later: KnownThings | None = None
 
     @property
