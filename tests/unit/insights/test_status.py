@@ -20,7 +20,6 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.status import memory_status
 from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -76,9 +75,7 @@ def beating(folder: Path, state: RecorderState, at: float, **more: Any) -> None:
 
 
 def shown(memory: Memory, folder: Path) -> dict[str, Any]:
-    reply: dict[str, Any] = json.loads(
-        Replies(folder, 24_000).answer(memory_status(memory, Call())).text
-    )
+    reply: dict[str, Any] = asked(memory, folder, "memory_status")
     return reply
 
 

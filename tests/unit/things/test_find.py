@@ -28,7 +28,7 @@ from tests.support.bags import (
     transform,
     write_splits,
 )
-from tests.support.memories import asked, memory_of, replied
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -372,8 +372,7 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
     many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(36)]
     elsewhere = [("thing 00", 2.0, 5.0), *many[1:]]
     write_splits(tmp_path, [*looked(0, 8, HERE, *many), *looked(100, 108, HERE, *elsewhere)])
-    reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
-    answer = json.loads(reply.text)
+    answer = ask(tmp_path, limit=100)
     [moved] = [row for row in answer["things"] if row["label"] == "thing 00"]
     assert (moved["moved_times"], moved["since"]) == (1, moved["last_seen"] - 7.0)
     assert all("since" not in row for row in answer["things"] if row is not moved)
