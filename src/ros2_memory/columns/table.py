@@ -29,6 +29,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
+from ros2_memory.core.arrays import in_ranges
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
@@ -210,8 +212,7 @@ class Elements:
         """Returns the elements of some rows, which become the rows 0, 1, 2 and so on."""
         first = np.searchsorted(self.owners, positions, "left")
         counts = np.searchsorted(self.owners, positions, "right") - first
-        before = np.cumsum(counts) - counts
-        taken = np.repeat(first - before, counts) + np.arange(int(counts.sum()))
+        taken = in_ranges(first, counts)
         return Elements(
             np.repeat(np.arange(positions.size), counts),
             {path: _taken(column, taken) for path, column in self.columns.items()},

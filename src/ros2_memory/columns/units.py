@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.walk import within
 from ros2_memory.columns.writing import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
-from ros2_memory.core.arrays import Groups, distinct_rows
+from ros2_memory.core.arrays import Groups, distinct_rows, in_ranges
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.index.segment import in_time
@@ -228,7 +227,7 @@ class Rows:
             return np.zeros(index.size, np.int64)
         groups = Groups.of(distinct_rows((numbers, times))[1])
         ranks = np.empty_like(groups.order)
-        ranks[groups.order] = within(groups.sizes)
+        ranks[groups.order] = in_ranges(np.zeros_like(groups.sizes), groups.sizes)
         return ranks[index - begin]
 
     def some(self, positions: IntArray) -> Rows:

@@ -23,7 +23,7 @@ from ros2_memory.columns.table import (
     Numbers,
     Texts,
 )
-from ros2_memory.core.arrays import gathered
+from ros2_memory.core.arrays import gathered, in_ranges
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import SEQUENCE, Batch, IntArray
 
@@ -217,7 +217,7 @@ class _Walk:
             data = gathered(self.buffer, np.dtype(f"V{count * step.size}"), places).tobytes()
             return np.frombuffer(data, step.dtype)
         return gathered(
-            self.buffer, step.dtype, np.repeat(places, counts) + within(counts) * step.size
+            self.buffer, step.dtype, np.repeat(places, counts) + _within(counts) * step.size
         )
 
     def _read_sequence(
@@ -273,17 +273,16 @@ def _steady(
     second = _aligned(first - rest + ends[rest], plan.align)
     steady = second % unit
     step = _aligned(ends[steady], plan.align) - steady
-    nth = within(counts)
+    nth = _within(counts)
     begins = np.where(nth == 0, first[owners], second[owners] + (nth - 1) * step[owners])
     last = np.where(counts > 1, second + (counts - 2) * step, first)
     end = last - last % unit + ends[last % unit]
     return begins, np.where(counts > 0, end, at)
 
 
-def within(counts: IntArray) -> IntArray:
+def _within(counts: IntArray) -> IntArray:
     """Returns the numbers from 0 up to each count, exclusive, one after the other."""
-    before = np.cumsum(counts) - counts
-    return np.arange(int(counts.sum())) - np.repeat(before, counts)
+    return in_ranges(np.zeros_like(counts), counts)
 
 
 def entries_of_codes(entries: IntArray, codes: IntArray) -> tuple[IntArray, IntArray]:
@@ -295,7 +294,7 @@ def entries_of_codes(entries: IntArray, codes: IntArray) -> tuple[IntArray, IntA
     """
     begins = np.searchsorted(entries, codes)
     counts = np.searchsorted(entries, codes, side="right") - begins
-    return counts, np.repeat(begins, counts) + within(counts)
+    return counts, in_ranges(begins, counts)
 
 
 def add_sequence(

@@ -248,30 +248,40 @@ def drawn_of(type_name: str, messages: Sequence[object]) -> Drawn:
 
 def message(type_name: str, random: Random, *, is_odd: bool = True) -> object:
     """A message with values that tests look for; `is_odd`: NaN and infinities among them."""
-    build: Any = store().types[type_name]
-    drawn = store().fielddefs[type_name][1]
-    made = [_value(each, random, is_odd) for _, each in drawn]
-    return build(*made)
+    return message_in(store(), type_name, random, is_odd=is_odd)
 
 
-def _value(drawn: Any, random: Random, is_odd: bool) -> object:
-    node, about = drawn
-    if node == Nodetype.BASE:
-        return _scalar(about[0], random, is_odd)
-    if node == Nodetype.NAME:
-        if about == "geometry_msgs/msg/Quaternion":
-            return _quaternion(random)
-        return message(about, random, is_odd=is_odd)
-    element, size = about
-    if node == Nodetype.SEQUENCE:
-        size = min(random.choice([0, 1, 1, 2, 3, 10]), size or 10)
-        if element[0] == Nodetype.NAME:
-            size = min(size, 3)
-    values = [_value(element, random, is_odd) for _ in range(size)]
-    if element[0] == Nodetype.NAME or element[1][0] in {"string", "wstring"}:
-        return values
-    kind = {"byte": "int8", "char": "uint8"}.get(element[1][0], element[1][0])
-    return np.array(values, dtype=kind)
+def message_in(
+    types: Typestore,
+    type_name: str,
+    random: Random,
+    *,
+    is_odd: bool = True,
+    longest: int | None = None,
+) -> object:
+    """As `message`, of a type in a store, with sequences that have so many elements at most."""
+
+    def value(drawn: Any) -> object:
+        node, about = drawn
+        if node == Nodetype.BASE:
+            return _scalar(about[0], random, is_odd)
+        if node == Nodetype.NAME:
+            if about == "geometry_msgs/msg/Quaternion":
+                return _quaternion(random)
+            return message_in(types, about, random, is_odd=is_odd, longest=longest)
+        element, size = about
+        is_named = element[0] == Nodetype.NAME
+        if node == Nodetype.SEQUENCE:
+            most = longest if longest is not None else 3 if is_named else 10
+            size = min(random.choice([0, 1, 1, 2, 3, 10]), size or 10, most)
+        values = [value(element) for _ in range(size)]
+        if is_named or element[1][0] in {"string", "wstring"}:
+            return values
+        kind = {"byte": "int8", "char": "uint8"}.get(element[1][0], element[1][0])
+        return np.array(values, dtype=kind)
+
+    build: Any = types.types[type_name]
+    return build(*(value(each) for _, each in types.fielddefs[type_name][1]))
 
 
 def _scalar(kind: str, random: Random, is_odd: bool) -> object:

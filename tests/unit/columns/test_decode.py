@@ -17,6 +17,7 @@ from tests.support.examples import LONG, examples
 from tests.support.leaves import Comparison
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 from tests.unit.columns.decoded_bags import bag_of, decoded_alike, tables_of
+from tests.unit.columns.drawn_tables import message_in
 from tests.unit.columns.drawn_types import DrawnTypes, drawn_types
 
 
@@ -62,7 +63,9 @@ def test_messages_of_any_definition_are_decoded_as_rosbags_does(
     payloads = [
         bytes(
             store.serialize_cdr(
-                types.message(store, chance, longest), types.root, little_endian=is_little
+                message_in(store, types.root, chance, longest=longest),
+                types.root,
+                little_endian=is_little,
             )
         )
         for _ in range(chance.randint(1, 6))
@@ -88,7 +91,9 @@ def test_damaged_payloads_are_decoded_or_left_out_as_rosbags_decides(
     store = types.store()
     payloads = []
     for _ in range(4):
-        payload = bytearray(store.serialize_cdr(types.message(store, chance, 3), types.root))
+        payload = bytearray(
+            store.serialize_cdr(message_in(store, types.root, chance, longest=3), types.root)
+        )
         at = chance.randrange(4, max(len(payload), 5))
         match chance.randrange(5):
             case 0:

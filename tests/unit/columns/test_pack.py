@@ -31,7 +31,7 @@ from ros2_memory.columns.steps import (
     RELATIVE,
     Step,
 )
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.table import Texts, column_bytes
 from ros2_memory.columns.zones import Zones
 from tests.support.examples import examples
 
@@ -115,6 +115,12 @@ def test_zones_are_exact(column: Values) -> None:
     assert zone.words is None
     if zone.nulls in {0, len(column)} and len({*there}) <= 1:
         assert pack(column, METRES).data == b""
+
+
+def test_what_is_unpacked_of_a_constant_column_is_one_value() -> None:
+    assert column_bytes(unpacked(pack(np.full(1000, 7, np.uint8)))) == 1
+    assert column_bytes(unpacked(pack(Texts.of(["map"] * 1000)))) < 100
+    assert column_bytes(unpacked(pack(np.arange(1000) / 3.0))) == 8 * 1000
 
 
 def test_regular_times_and_decimals_in_single_precision_take_little() -> None:

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
-from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
+from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
+from tests.support.listed_bags import odom_bag
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN, write_moving_map
@@ -174,13 +174,9 @@ def test_one_sentence_counts_all_things_and_names_a_few(things: dict[str, str]) 
 DAY = 24 * 3600 * S
 
 
-def split(
-    number: int, *, state: BagState = BagState.CLOSED, notes: tuple[str, ...] = ()
-) -> BagFile:
+def split(number: int, notes: tuple[str, ...] = ()) -> BagFile:
     start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
-    topics = (TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),)
-    summary = BagSummary(topics, notes=notes)
-    return BagFile(f"/b/rec/rec_{number}.mcap", 1, end, state, summary, start, end)
+    return odom_bag(f"/b/rec/rec_{number}.mcap", start, end, written=end, notes=notes)
 
 
 def torn(number: int, written: int | None = T0 + DAY, folder: str = "rec") -> SetAside:

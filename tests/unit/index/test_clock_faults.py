@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
-from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS
 from ros2_memory.index.clock_faults import (
     FIRST_BAGS_NS,
@@ -17,6 +17,10 @@ from ros2_memory.index.clock_faults import (
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import StepBack
 from ros2_memory.index.timeline import Timeline
+from tests.support.listed_bags import odom_bag
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import BagFile
 
 S = 10**9
 HOUR = 3600 * S
@@ -26,8 +30,7 @@ NOW = 1_790_000_000 * S
 
 def bag(name: str, start: int, end: int | None = None, *, written: int = NOW) -> BagFile:
     end = start + 10 * S if end is None else end
-    summary = BagSummary((TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),))
-    return BagFile(f"/bags/rec/{name}", 1, written, BagState.CLOSED, summary, start, end)
+    return odom_bag(f"/bags/rec/{name}", start, end, written=written)
 
 
 def dating(

@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
-from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
+from tests.support.listed_bags import odom_bag
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
+    from ros2_memory.core.model import BagFile
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
 
 
-def bag(file: str, times: Sequence[float], topic: str = "/odom") -> BagFile:
+def bag(file: str, times: Sequence[float]) -> BagFile:
     """A bag with a message of one topic at each of these seconds."""
     first, last = BEGIN + round(times[0] * S), BEGIN + round(times[-1] * S)
-    topics = (TopicSummary(topic, "std_msgs/msg/Bool", "cdr", len(times), first, last),)
-    return BagFile(f"/bags/{file}.mcap", 1, 1, BagState.CLOSED, BagSummary(topics), first, last)
+    return odom_bag(f"/bags/{file}.mcap", first, last, count=len(times))
 
 
 def every(period: float, begin: float, stop: float) -> list[float]:

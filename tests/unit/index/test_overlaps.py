@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
-from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.spans import overlap_spans
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.history.context import Call, Memory
@@ -19,6 +17,7 @@ from ros2_memory.index import timeline
 from ros2_memory.index.recordings import Overlapping, overlapping_recordings
 from ros2_memory.queries import list_recorded_topics
 from tests.support.bags import odom, text, write_mcap
+from tests.support.listed_bags import odom_bag
 from tests.support.memories import memory_of
 
 T0 = 1_700_000_000
@@ -71,13 +70,6 @@ def test_folders_of_one_name_are_told_apart() -> None:
     assert [pair.names, other.names] == [("robin/run", "wren/run"), ("a", "b")]
 
 
-def bag(number: int, recording: int, start: int, length: int) -> BagFile:
-    """A bag of a recording, from a start for so many ns."""
-    name, end = f"/bags/r{recording}/{number}.mcap", start + length
-    summary = BagSummary((TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),))
-    return BagFile(name, 1, 1, BagState.CLOSED, summary, start, end)
-
-
 halves_of_seconds = st.integers(0, 120).map(lambda number: number * NS_PER_S // 2)
 drawn_bags = st.lists(
     st.tuples(st.integers(0, 3), st.just(MIN_NS) | halves_of_seconds, halves_of_seconds)
@@ -88,7 +80,10 @@ drawn_bags = st.lists(
 def test_times_that_recordings_share_are_those_of_all_their_bags(
     drawn: Sequence[tuple[int, int, int]], size: int
 ) -> None:
-    bags = [bag(number, *times) for number, times in enumerate(drawn)]
+    bags = [
+        odom_bag(f"/bags/r{recording}/{number}.mcap", start, start + length)
+        for number, (recording, start, length) in enumerate(drawn)
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(timeline, "SEGMENT_BAGS", size)
         shared = timeline.Timeline.of(bags).shared_times

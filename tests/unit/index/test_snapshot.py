@@ -15,6 +15,7 @@ from ros2_memory.index import timeline as timelines
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
 
+S = 10**9
 ODOM = "nav_msgs/msg/Odometry"
 
 
@@ -47,6 +48,14 @@ def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> No
     assert len(snapshot.bags) == len(bags)
     assert Timeline.of([carried]).disk_use == (7, 0)
     assert Timeline().disk_use == (0, 0)
+
+
+def test_what_is_absent_within_a_bag_leaves_the_other_topics_of_it_alone() -> None:
+    bag = _bag("rec/rec_0.mcap", ("/odom", 0, 800 * S), ("/seen", 0, 800 * S))
+    absences = (("/seen", ((100 * S, 400 * S, 100),)),)
+    summary = BagSummary(bag.summary.topics, absences=absences)
+    snapshot = Snapshot(Timeline.of([bag._replace(summary=summary)]))
+    assert [snapshot.longest_silence(topic) for topic in ("/odom", "/seen")] == [0, 300 * S]
 
 
 bag_times = st.tuples(st.integers(0, 3000), st.integers(0, 200))

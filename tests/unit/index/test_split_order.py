@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
-from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import split_names_of, split_of, stem_of, steps_of
 from ros2_memory.index.timeline import Timeline
+from tests.support.listed_bags import odom_bag
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import BagFile
 
 S = 10**9
 
 
-def bag(name: str, start_s: int, end_s: int, *, folder: str = "rec") -> BagFile:
-    start, end = start_s * S, end_s * S
-    summary = BagSummary((TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),))
-    return BagFile(f"/bags/{folder}/{name}", 1, 1, BagState.CLOSED, summary, start, end)
+def bag(name: str, start_s: int, end_s: int) -> BagFile:
+    return odom_bag(f"/bags/rec/{name}", start_s * S, end_s * S)
 
 
 def split(number: int, start_s: int, end_s: int) -> BagFile:

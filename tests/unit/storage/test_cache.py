@@ -23,15 +23,6 @@ def test_caches_apart_share_a_capacity_and_no_key() -> None:
     assert (one.get("a"), other.get("a")) == (None, "other's")
 
 
-def test_what_is_taken_is_cached_no_more_and_leaves_room() -> None:
-    cache: ByteLru[str] = ByteLru(10_500)
-    cache.put("a", "first", 6000)
-    assert (cache.take("a"), cache.get("a"), cache.take("a")) == ("first", None, None)
-    cache.put("b", "second", 6000)
-    cache.put("c", "third", 4000)
-    assert (cache.get("b"), cache.get("c")) == ("second", "third")
-
-
 def test_most_of_a_circle_that_is_a_little_larger_than_the_cache_is_found() -> None:
     cache: ByteLru[int] = ByteLru(100_000)
     found = 0

@@ -1,4 +1,4 @@
-"""What is read of a summary section, compared with what the MCAP library reads."""
+"""What is read of a summary section."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.index import DoubtError, index_from_summary, read_summary
 from tests.support.bags import boolean, text, write_mcap
-from tests.support.mcap_surgery import SMALL, chunks_of, edit_summary
+from tests.support.mcap_surgery import SMALL, edit_summary
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,25 +24,6 @@ def bag(path: Path) -> Path:
     return write_mcap(
         path, [text(0, ""), boolean(0, data=True), *messages, boolean(12, data=True)], SMALL
     )
-
-
-def test_chunks_are_those_that_the_library_reads(tmp_path: Path) -> None:
-    path = bag(tmp_path / "a.mcap")
-    with OpenFile(path) as file:
-        found = read_summary(file).chunks
-    assert [
-        (chunk.offset, chunk.length, chunk.start, chunk.end, {*chunk.channels}) for chunk in found
-    ] == [
-        (
-            chunk.chunk_start_offset,
-            chunk.chunk_length,
-            chunk.message_start_time,
-            chunk.message_end_time,
-            {*chunk.message_index_offsets},
-        )
-        for chunk in chunks_of(path)
-    ]
-    assert {len(chunk.channels) for chunk in found} == {1, 2}
 
 
 @pytest.mark.parametrize(

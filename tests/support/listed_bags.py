@@ -1,0 +1,22 @@
+"""Bags as the index lists them, without their files."""
+
+from __future__ import annotations
+
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.timebase import Ns
+
+
+def odom_bag(
+    file: str,
+    start: Ns,
+    end: Ns,
+    *,
+    count: int = 2,
+    written: Ns = 1,
+    state: BagState = BagState.CLOSED,
+    notes: tuple[str, ...] = (),
+) -> BagFile:
+    """A bag of odometry from its first to its last message."""
+    topics = (TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", count, start, end),)
+    return BagFile(file, 1, written, state, BagSummary(topics, notes=notes), start, end)
