@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES
+from ros2_memory.core.text import dotted
 from ros2_memory.storage.base import SEQUENCE, Definition, Field
 
 if TYPE_CHECKING:
@@ -206,7 +207,7 @@ class _Planner:
             self._pass(1, 1)
         for entry in definition.fields:
             name = f"{entry.name}_" if keyword.iskeyword(entry.name) else entry.name
-            self.add_field(entry, _below(path, entry.name), _below(attribute, name))
+            self.add_field(entry, dotted(path, entry.name), dotted(attribute, name))
 
     def add_field(self, entry: Field, path: str, attribute: str) -> None:
         """Adds one field at its path."""
@@ -358,7 +359,3 @@ def _dtype(kind: str | Definition) -> np.dtype[np.generic[object]]:
     if not isinstance(kind, str) or kind not in _DTYPES:
         raise UnplannedError(f"it has fields of type {kind}")
     return np.dtype(_DTYPES[kind])
-
-
-def _below(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name

@@ -30,6 +30,7 @@ from ros2_memory.columns.values import (
     Level,
     UnknownShapeError,
 )
+from ros2_memory.core.text import dotted
 from ros2_memory.extract import POINTS, SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, Summary, ValueKind, kind_of_type
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
@@ -93,7 +94,7 @@ class Place(NamedTuple):
         """Returns the fields of the message that lies here."""
         level, path, _, _, depth = self
         return {
-            field.name: Place(level, _below(path, field.name), field.kind, field.length, depth + 1)
+            field.name: Place(level, dotted(path, field.name), field.kind, field.length, depth + 1)
             for field in definition.fields
             if field.name != _FILLER
         }
@@ -410,10 +411,6 @@ def _changed(node: Node, change: Callable[[Leaf], Leaf]) -> Node:
     if isinstance(node, dict):
         return type(node)({name: _changed(part, change) for name, part in node.items()})
     return node
-
-
-def _below(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name
 
 
 def _vector(level: Level, sources: Sequence[str]) -> Node:

@@ -41,6 +41,7 @@ from ros2_memory.columns.shown import UNKNOWN, ByType, Node, Shape, at_field, le
 from ros2_memory.columns.sources import Source, sources_in
 from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values
 from ros2_memory.columns.walk import entries_of_codes
+from ros2_memory.core.text import dotted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -133,7 +134,7 @@ def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
         yield path, node
     elif isinstance(node, dict):
         for name, inner in node.items():
-            yield from _flag_leaves(inner, f"{path}.{name}" if path else name)
+            yield from _flag_leaves(inner, dotted(path, name))
 
 
 def _entry_leaves(value: Node, type_name: str) -> _Entry:

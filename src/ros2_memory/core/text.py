@@ -46,6 +46,11 @@ _MOST_KEYS_CHARS: Final = 300
 """Of more places, or longer ones, a reply lists its own keys above them."""
 
 
+def dotted(path: str, name: str) -> str:
+    """Returns the dot-path of what has a name inside of what is at a path."""
+    return f"{path}.{name}" if path else name
+
+
 def counted(count: int, singular: str, plural: str | None = None) -> str:
     """Returns a number and its noun: `1 jump`, `2 jumps`."""
     return f"{count} {singular if count == 1 else plural or singular + 's'}"
@@ -115,7 +120,7 @@ def abbreviate(value: object, max_chars: int = 80) -> str:
     escaped.
     """
     text = json.dumps(_pruned(value, _MAX_DEPTH), ensure_ascii=False, default=_type_name)
-    return shortened(text.encode("utf-8", "backslashreplace").decode(), max_chars)
+    return shortened(encodable(text), max_chars)
 
 
 def _pruned(value: object, levels: int) -> object:
@@ -210,4 +215,4 @@ def _add_quoted_paths(value: JsonValue, path: str, paths: dict[str, None]) -> No
                 paths[path] = None
                 _add_quoted_paths(part, path, paths)
             else:
-                _add_quoted_paths(part, f"{path}.{name}" if path else name, paths)
+                _add_quoted_paths(part, dotted(path, name), paths)

@@ -91,10 +91,8 @@ def iso_local(ns: Ns) -> str | None:
 
     Rounded up to microseconds, as `unix_rounded_up`; whole seconds have no decimals.
     """
-    fraction = timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))
     try:
-        whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
-        return (whole + fraction).astimezone().isoformat()
+        return _with_offset(ns).isoformat()
     except (OverflowError, ValueError, OSError):
         return None
 
@@ -107,11 +105,15 @@ def local_time(ns: Ns) -> datetime:
     Raises:
         ValueError, OverflowError, OSError: the calendar does not have its year.
     """
-    whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
-    fraction = timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))
-    local = (whole + fraction).astimezone()
+    local = _with_offset(ns)
     naive = local.replace(tzinfo=None)
     return naive if naive.timestamp() == naive.replace(fold=1).timestamp() else local
+
+
+def _with_offset(ns: Ns) -> datetime:
+    whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
+    fraction = timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))
+    return (whole + fraction).astimezone()
 
 
 def local_text(ns: Ns) -> str | None:

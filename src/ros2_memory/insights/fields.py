@@ -9,7 +9,7 @@ import numpy as np
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.text import listed
+from ros2_memory.core.text import dotted, listed
 from ros2_memory.counts.numbers import GREATEST, LEAST, PieceNumbers, TooManyError
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import View, open_view
@@ -73,7 +73,7 @@ def fields_of(value: JsonValue, path: str = "") -> Iterator[tuple[str, str]]:
     """Yields dot-paths and the kinds of their values; a list is described by its first element."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from fields_of(inner, f"{path}.{name}" if path else name)
+            yield from fields_of(inner, dotted(path, name))
     elif isinstance(value, list):
         if value and isinstance(value[0], dict | list):
             yield from fields_of(value[0], path)

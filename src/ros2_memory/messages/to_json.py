@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
+from ros2_memory.core.text import dotted
 from ros2_memory.core.timebase import Ns, unix_from_ns, unix_rounded_up
 from ros2_memory.messages.conversions import (
     ABSENT,
@@ -217,7 +218,7 @@ class ExactJson:
             return [self.value(element, path, depth) for element in self._elements(node, path)]
         if isinstance(node, dict):
             entries, is_summary = self._entries(node, path), isinstance(node, Summary)
-            rendered = {name: self.value(node, _join(path, name), depth) for name, node in entries}
+            rendered = {name: self.value(node, dotted(path, name), depth) for name, node in entries}
             return Summary(rendered) if is_summary else rendered
         table = field_table_of(node)
         if table is None:
@@ -370,7 +371,3 @@ def _encodable(text: str) -> str:
 
 def _named(path: str) -> str:
     return path or "value"
-
-
-def _join(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name

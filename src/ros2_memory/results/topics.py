@@ -36,7 +36,7 @@ from ros2_memory.core.reply import (
     texts,
     unit,
 )
-from ros2_memory.core.text import named, quote
+from ros2_memory.core.text import dotted, named, quote
 from ros2_memory.core.timebase import NS_PER_S, Ns, local_time, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
 from ros2_memory.results.recap import SAID, Episode, Spell
@@ -185,7 +185,7 @@ def _parts(path: str, value: JsonValue) -> Iterator[tuple[str, JsonValue]]:
         yield path, value
         return
     for name, part in value.items():
-        yield from _parts(f"{path}.{name}" if path else name, part)
+        yield from _parts(dotted(path, name), part)
 
 
 @result("type", "topics", PAIRS("fields"))

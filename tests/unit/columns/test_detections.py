@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.columns.detections import DetectionColumns, Detections, detections_by
 from ros2_memory.columns.table import Table
@@ -94,17 +93,15 @@ def test_columns_detect_what_drawn_messages_detect(drawn: Drawn) -> None:
 
 @settings(max_examples=examples(80), deadline=None)
 @given(drawn_tables(SETTLED))
-def test_detections_of_common_types_need_no_reading(drawn: Drawn) -> None:
+def test_detections_of_common_types_need_no_reading_and_are_stored_but_for_rounding(
+    drawn: Drawn,
+) -> None:
     is_settled = compared(drawn.table, drawn.messages)
     # An object without a name may hold detections.
     every = [detections_in(each, drawn.type) for each in drawn.messages]
     assert is_settled or any(every)
-
-
-@settings(max_examples=examples(60), deadline=None)
-@given(drawn_tables(SETTLED), st.sampled_from([0.0, 1e-6]))
-def test_stored_columns_detect_the_same_but_for_rounding(drawn: Drawn, step: float) -> None:
-    compared(stored(drawn.table, step), drawn.messages, step)
+    for step in (0.0, 1e-6):
+        compared(stored(drawn.table, step), drawn.messages, step)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING
 
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import LABEL, Facts, State, Word, state_of, stated_by
 from ros2_memory.columns.stated import StatedColumns
@@ -75,11 +74,5 @@ def test_nothing_is_read_where_columns_hold_what_matters(drawn: Drawn) -> None:
         assert any(word.kind == LABEL for word, _ in facts)
     else:
         assert read == 0
-
-
-@settings(max_examples=examples(60), deadline=None)
-@given(drawn_tables(SETTLED), st.sampled_from([0.0, 1e-6]))
-def test_rounded_columns_have_messages_read_rather_than_state_what_is_wrong(
-    drawn: Drawn, step: float
-) -> None:
-    compared(stored(drawn.table, step), drawn)
+    for step in (0.0, 1e-6):  # what may be wrong, rounded, is read
+        compared(stored(drawn.table, step), drawn)

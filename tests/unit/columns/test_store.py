@@ -180,30 +180,19 @@ def test_columns_of_every_kind_come_back(tmp_path: Path) -> None:
     assert path.exists()
 
 
-def raise_version(file: Path) -> None:
-    with closing(sqlite3.connect(file)) as base:
-        base.execute("PRAGMA user_version = 99")
-
-
-def lower_version(file: Path) -> None:
-    with closing(sqlite3.connect(file)) as base:
-        base.execute("PRAGMA user_version = 0")
-
-
-def drop_table(file: Path) -> None:
-    with closing(sqlite3.connect(file)) as base:
-        base.execute("DROP TABLE part_column")
-
-
-@pytest.mark.parametrize("spoil", [raise_version, lower_version, drop_table])
+@pytest.mark.parametrize(
+    "statement",
+    ["PRAGMA user_version = 99", "PRAGMA user_version = 0", "DROP TABLE part_column"],
+)
 def test_a_file_of_another_version_or_without_a_table_is_set_aside_and_made_anew(
-    tmp_path: Path, spoil: Callable[[Path], None]
+    tmp_path: Path, statement: str
 ) -> None:
     write_bags(tmp_path)
     world = World.of(tmp_path)
     world.fill()
     world.store.close()
-    spoil(store_file(tmp_path))
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        base.execute(statement)
     again = World.of(tmp_path)
     assert check_all(again) == 4 * 24
     assert again.fill() == 4

@@ -24,26 +24,11 @@ topics = st.builds(
 several = st.lists(topics, max_size=6, unique_by=lambda each: (each.topic, each.type)).map(tuple)
 
 
-@given(several.filter(bool))
-def test_a_summary_spans_its_topics_and_each_topic_its_types(
-    given_topics: tuple[TopicSummary, ...],
-) -> None:
-    summary = BagSummary(given_topics)
-    assert summary.start == min(each.first for each in given_topics)
-    assert summary.end == max(each.last for each in given_topics)
-    for name in {each.topic for each in given_topics}:
-        alike = [each for each in given_topics if each.topic == name]
-        assert list(summary.of(name)) == alike
-        ends = min(each.first for each in alike), max(each.last for each in alike)
-        assert summary.span_of([name, "/nowhere"]) == ends
-    assert summary.of("/nowhere") == ()
-
-
 near = st.integers(0, 2**41)
 
 
 @given(several, moments, st.lists(near, min_size=24, max_size=24))
-def test_packing_changes_nothing(
+def test_a_summary_says_what_its_topics_do(
     given_topics: tuple[TopicSummary, ...], start: int, offsets: list[int]
 ) -> None:
     ends = zip(offsets[::2], offsets[1::2], strict=True)
@@ -60,6 +45,15 @@ def test_packing_changes_nothing(
         assert summary.count == sum(each.count for each in topics_of)
         some = range(len(topics_of))[::-2]
         if topics_of:
+            assert summary.start == min(each.first for each in topics_of)
+            assert summary.end == max(each.last for each in topics_of)
             assert numbers_of(summary.schema, 2 * summary.data, 2, some).tolist() == [
                 [[topics_of[at].count, topics_of[at].first, topics_of[at].last]] * 2 for at in some
             ]
+        for name in ("/a", "/b", "/c"):
+            of_name = tuple(each for each in topics_of if each.topic == name)
+            assert tuple(summary.of(name)) == of_name
+            if of_name:
+                first, last = summary.span_of([name, "/nowhere"])
+                assert first == min(each.first for each in of_name)
+                assert last == max(each.last for each in of_name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,9 +14,6 @@ from ros2_memory.messages.conversions import (
     xyz,
 )
 from tests.support import bags
-
-if TYPE_CHECKING:
-    pass
 
 
 def image(encoding: str, height: int = 2, width: int = 4, size: int = 24) -> object:

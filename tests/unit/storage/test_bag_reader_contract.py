@@ -28,7 +28,7 @@ from tests.support.examples import examples
 from tests.support.reader_cases import FILES, Shelf
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable
 
 
 on_every_shelf = pytest.mark.parametrize("shelf", FILES, ids=str)
@@ -304,22 +304,16 @@ def test_an_empty_file_is_open_and_nothing_had_reached_the_disk(
 
 
 @on_every_shelf
-def test_a_folder_in_place_of_a_bag_is_an_error_that_names_it(shelf: Shelf, tmp_path: Path) -> None:
-    reader = shelf.make_reader()
-    path = tmp_path / f"folder{shelf.suffix}"
-    path.mkdir()
-    with pytest.raises(BagError, match="not a regular file"):
-        reader.summarize(path)
-    with pytest.raises(EpisodicError):
-        reader.closing(path)
-
-
-@on_every_shelf
-def test_a_pipe_in_place_of_a_bag_does_not_hang(shelf: Shelf, tmp_path: Path) -> None:
-    path = tmp_path / f"pipe{shelf.suffix}"
-    os.mkfifo(path)
+@pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
+def test_a_folder_or_a_pipe_in_place_of_a_bag_is_an_error_that_names_it(
+    shelf: Shelf, tmp_path: Path, make: Callable[[Path], None]
+) -> None:
+    path = tmp_path / f"odd{shelf.suffix}"
+    make(path)
     with pytest.raises(BagError, match="not a regular file"):
         shelf.make_reader().summarize(path)
+    with pytest.raises(EpisodicError):
+        shelf.make_reader().closing(path)
 
 
 @on_every_shelf

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
     from mcap.records import ChunkIndex
 
-    from ros2_memory.storage.base import Record
+    from ros2_memory.storage.base import BagReader, Record
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"
 
 
-def read(reader: McapReader, path: Path, *topics: str, **how: Any) -> list[Record]:
+def read(reader: BagReader, path: Path, *topics: str, **how: Any) -> list[Record]:
     return list(reader.records(path, topics or ("/chatter",), EVERYTHING, **how))
 
 

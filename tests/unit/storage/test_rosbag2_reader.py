@@ -23,7 +23,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing, Record
+from ros2_memory.storage.base import Closing
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.scratch import Scratch
 from tests.support.bags import (
@@ -35,7 +35,9 @@ from tests.support.bags import (
     write_db3,
     write_mcap,
 )
+from tests.support.mcap_surgery import chatter
 from tests.support.memories import asked, memory_of
+from tests.unit.storage.test_mcap_reader import read, times
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -62,18 +64,6 @@ def scratch_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     root.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(root))
     return root
-
-
-def chatter(count: int, size: int = 10) -> list[Msg]:
-    return [text(time, f"{time:0{size}d}") for time in range(count)]
-
-
-def read(reader: Rosbag2Reader, path: Path, *topics: str) -> list[Record]:
-    return list(reader.records(path, topics or ("/chatter",), EVERYTHING))
-
-
-def times(records: list[Record]) -> list[int]:
-    return [record.log_time for record in records]
 
 
 def change(path: Path, *statements: str) -> Path:

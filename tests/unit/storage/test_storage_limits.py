@@ -288,26 +288,33 @@ class TestSqlite:
             base.commit()
         return path
 
-    def test_an_endless_view_in_place_of_a_table_is_refused(self, tmp_path: Path) -> None:
-        path = self.edited(
-            tmp_path,
-            "ALTER TABLE messages RENAME TO m",
-            "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1"
-            " FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n",
-        )
-        with pytest.raises(BagError, match="its messages is not a plain table"):
-            Rosbag2Reader().summarize(path)
-
-    def test_a_computed_column_is_refused(self, tmp_path: Path) -> None:
-        path = self.edited(
-            tmp_path, "ALTER TABLE messages ADD COLUMN more AS (zeroblob(900000000))"
-        )
-        with pytest.raises(BagError, match="its messages is not a plain table"):
-            Rosbag2Reader().summarize(path)
-
-    def test_a_table_of_messages_without_their_columns_is_refused(self, tmp_path: Path) -> None:
-        path = self.edited(tmp_path, "ALTER TABLE messages RENAME COLUMN data TO other")
-        with pytest.raises(BagError, match="lacks the tables topics and messages"):
+    @pytest.mark.parametrize(
+        ("statements", "reason"),
+        [
+            pytest.param(
+                "ALTER TABLE messages RENAME TO m;"
+                "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1"
+                " FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n",
+                "its messages is not a plain table",
+                id="an endless view",
+            ),
+            pytest.param(
+                "ALTER TABLE messages ADD COLUMN more AS (zeroblob(900000000))",
+                "its messages is not a plain table",
+                id="a computed column",
+            ),
+            pytest.param(
+                "ALTER TABLE messages RENAME COLUMN data TO other",
+                "lacks the tables topics and messages",
+                id="a column that is not there",
+            ),
+        ],
+    )
+    def test_a_table_that_is_not_what_it_is_called_is_refused(
+        self, tmp_path: Path, statements: str, reason: str
+    ) -> None:
+        path = self.edited(tmp_path, statements)
+        with pytest.raises(BagError, match=reason):
             Rosbag2Reader().summarize(path)
 
     def test_more_topics_than_any_robot_has_and_enormous_definitions_are_refused(

@@ -266,13 +266,13 @@ class FileRecord(NamedTuple):
         """Where the body begins in the file."""
         return self.offset + RECORD.size
 
-    def body(self, file: OpenFile, max_bytes: int = MAX_SECTION_BYTES) -> bytes:
+    def body(self, file: OpenFile) -> bytes:
         """Returns the body.
 
         Raises:
-            UnreadableError: it is larger than `max_bytes`, or not all there.
+            UnreadableError: it is larger than any can be, or not all there.
         """
-        if self.end - self.body_at > max_bytes:
+        if self.end - self.body_at > MAX_SECTION_BYTES:
             raise UnreadableError("damaged: a record is larger than any can be")
         return file.read(self.body_at, self.end - self.body_at)
 
