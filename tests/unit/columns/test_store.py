@@ -57,6 +57,15 @@ def write_bags(bag_dir: Path, count: int = 4) -> list[Path]:
     return paths
 
 
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """Four bags, all of them stored."""
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    return world
+
+
 def write_all_that_is_derived(bag_dir: Path) -> None:
     """A minute of each thing that the store derives rows from, and half of it in a copy."""
     messages = []
@@ -185,11 +194,8 @@ def test_columns_of_every_kind_come_back(tmp_path: Path) -> None:
     ["PRAGMA user_version = 99", "PRAGMA user_version = 0", "DROP TABLE part_column"],
 )
 def test_a_file_of_another_version_or_without_a_table_is_set_aside_and_made_anew(
-    tmp_path: Path, statement: str
+    world: World, tmp_path: Path, statement: str
 ) -> None:
-    write_bags(tmp_path)
-    world = World.of(tmp_path)
-    world.fill()
     world.store.close()
     with closing(sqlite3.connect(store_file(tmp_path))) as base:
         base.execute(statement)
@@ -213,11 +219,8 @@ def delete_file(path: Path) -> None:
 
 @pytest.mark.parametrize("fault", [replace_log, delete_file])
 def test_what_is_read_while_the_files_are_replaced_does_not_count(
-    tmp_path: Path, fault: Callable[[Path], None]
+    world: World, tmp_path: Path, fault: Callable[[Path], None]
 ) -> None:
-    write_bags(tmp_path)
-    world = World.of(tmp_path)
-    world.fill()
     failures = world.store.failures
 
     def read(connection: sqlite3.Connection) -> int:
@@ -232,11 +235,8 @@ def test_what_is_read_while_the_files_are_replaced_does_not_count(
 
 @pytest.mark.parametrize("fault", [replace_log, delete_file])
 def test_nothing_is_written_to_files_that_were_replaced(
-    tmp_path: Path, fault: Callable[[Path], None]
+    world: World, tmp_path: Path, fault: Callable[[Path], None]
 ) -> None:
-    write_bags(tmp_path)
-    world = World.of(tmp_path)
-    world.fill()
     fault(store_file(tmp_path))
 
     def write(_: sqlite3.Connection) -> None:
@@ -247,10 +247,9 @@ def test_nothing_is_written_to_files_that_were_replaced(
     assert check_all(world) == 4 * 24
 
 
-def test_a_file_that_turns_out_damaged_while_it_is_asked_costs_no_answer(tmp_path: Path) -> None:
-    write_bags(tmp_path)
-    world = World.of(tmp_path)
-    world.fill()
+def test_a_file_that_turns_out_damaged_while_it_is_asked_costs_no_answer(
+    world: World, tmp_path: Path
+) -> None:
     with closing(sqlite3.connect(store_file(tmp_path))) as base:
         base.execute("UPDATE part SET bags = 'none'")
         base.commit()
@@ -309,10 +308,9 @@ def test_a_disk_has_room_again_also_where_nothing_is_left_to_store(tmp_path: Pat
     assert world.store.trouble is None
 
 
-def test_a_file_that_another_program_has_locked_costs_no_answer(tmp_path: Path) -> None:
-    write_bags(tmp_path)
-    world = World.of(tmp_path)
-    world.fill()
+def test_a_file_that_another_program_has_locked_costs_no_answer(
+    world: World, tmp_path: Path
+) -> None:
     with closing(sqlite3.connect(store_file(tmp_path), isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         assert check_all(World.of(tmp_path)) == 4 * 24
@@ -336,10 +334,9 @@ def test_a_write_that_fails_meanwhile_costs_no_answer(
     assert world.store.is_failing
 
 
-def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(tmp_path: Path) -> None:
-    write_bags(tmp_path)
-    world = World.of(tmp_path)
-    world.fill()
+def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(
+    world: World, tmp_path: Path
+) -> None:
     scanner, [head, *_] = Scanner(world.store, tmp_path), world.store.parts("/odom")
     assert scanner.packed(head, "no such column", []) is None
     assert world.store.delete(world.store.paths())

@@ -9,18 +9,10 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.core.sd_notify import (
-    READY,
     STOPPING,
     notify,
     watchdog_interval_s,
 )
-
-
-@pytest.fixture
-def listener() -> socket.socket:
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    listener.settimeout(5)
-    return listener
 
 
 def set_only(monkeypatch: pytest.MonkeyPatch, env: dict[str, str]) -> None:
@@ -30,23 +22,15 @@ def set_only(monkeypatch: pytest.MonkeyPatch, env: dict[str, str]) -> None:
         monkeypatch.setenv(name, value)
 
 
-def test_it_is_told_over_a_socket_in_the_file_system(
-    tmp_path: Path, listener: socket.socket, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("kind", ["path", "abstract"])
+def test_it_is_told_over_a_socket(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    with listener:
-        listener.bind(str(tmp_path / "notify"))
-        assert notify(READY)
-        assert listener.recv(100) == b"READY=1"
-
-
-def test_it_is_told_over_an_abstract_socket(
-    listener: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    name = f"ros2-memory-test-{os.getpid()}"
-    monkeypatch.setenv("NOTIFY_SOCKET", "@" + name)
-    with listener:
-        listener.bind("\0" + name)
+    name = str(tmp_path / "notify") if kind == "path" else f"\0ros2-memory-test-{os.getpid()}"
+    monkeypatch.setenv("NOTIFY_SOCKET", name.replace("\0", "@"))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.settimeout(5)
+        listener.bind(name)
         assert notify(STOPPING, "STATUS=over")
         assert listener.recv(100) == b"STOPPING=1\nSTATUS=over"
 

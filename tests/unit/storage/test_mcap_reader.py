@@ -59,9 +59,14 @@ def times(records: list[Record]) -> list[int]:
     return [record.log_time for record in records]
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A bag of some small chunks."""
+    return write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+
+
 class TestReadingOnlyWhatIsWanted:
-    def test_a_summary_needs_no_chunk(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+    def test_a_summary_needs_no_chunk(self, path: Path) -> None:
         for number in range(len(chunks_of(path))):
             spoil_chunk(path, number)
         reader = McapReader()
@@ -76,9 +81,8 @@ class TestReadingOnlyWhatIsWanted:
         assert times(read(McapReader(), path, "/bumper")) == list(range(12, 40))
 
     def test_what_was_read_is_kept_within_the_cache(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
         reader = McapReader()
         whole = read(reader, path)
         for name in ("index_from_summary", "pairs_in", "chunk_data"):
@@ -87,10 +91,7 @@ class TestReadingOnlyWhatIsWanted:
         with pytest.raises(BagError):
             McapReader().summarize(path)
 
-    def test_a_bag_that_left_the_cache_has_the_same_messages_and_summary(
-        self, tmp_path: Path
-    ) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+    def test_a_bag_that_left_the_cache_has_the_same_messages_and_summary(self, path: Path) -> None:
         bags = bag_file.McapBags()
         summary = bags.summarize(path)
         bags.indexes = ByteLru(1 << 20)
@@ -117,9 +118,7 @@ def read_on(
 
 
 class TestIndexesThatAreWrong:
-    def test_statistics_that_are_wrong_are_noted_and_not_believed(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
-
+    def test_statistics_that_are_wrong_are_noted_and_not_believed(self, path: Path) -> None:
         edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 21))
         reader = McapReader()
         summary = reader.summarize(path)
@@ -253,9 +252,8 @@ class TestIndexesThatAreWrong:
         ],
     )
     def test_a_chunk_index_that_does_not_agree_with_its_chunk_is_named(
-        self, tmp_path: Path, at: int, value: Callable[[ChunkIndex], int] | None
+        self, path: Path, at: int, value: Callable[[ChunkIndex], int] | None
     ) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
         _, second, _, other, *_ = chunks_of(path)
         stated = other.chunk_start_offset if value is None else value(second)
 
@@ -289,10 +287,7 @@ class TestIndexesThatAreWrong:
         [note] = reader.summarize(path).notes
         assert note == "its message indexes do not hold what its statistics state"
 
-    def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(
-        self, tmp_path: Path
-    ) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+    def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(self, path: Path) -> None:
         hidden = chunks_of(path)[2]
         left = 20 - (hidden.message_end_time - hidden.message_start_time + 1)
 

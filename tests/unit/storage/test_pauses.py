@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, boolean, odom, write_db3, write_mcap
 
@@ -17,7 +16,9 @@ if TYPE_CHECKING:
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
-KINDS = ["mcap", "large chunks", "no chunks", "no summary", "db3"]
+KINDS = {"mcap": 1 << 12, "large chunks": 1 << 20, "no chunks": None, "no summary": 1 << 12}
+"""The sizes of their chunks."""
+on_each_kind = pytest.mark.parametrize("kind", [*KINDS, "db3"])
 
 
 def every(hz: float, seconds: float, *, but: tuple[tuple[float, float], ...] = ()) -> list[float]:
@@ -34,20 +35,14 @@ def bag_of(odometry: list[float], flags: list[float]) -> list[Msg]:
 def pauses(folder: Path, kind: str, messages: list[Msg]) -> Pauses:
     if kind == "db3":
         path = write_db3(folder / "bag.db3", messages)
-        return Rosbag2Reader().summarize(path).schema.pauses
-    path = folder / "bag.mcap"
-    if kind == "large chunks":
-        write_mcap(path, messages, McapLayout(chunk_size=1 << 20))
-    elif kind == "no chunks":
-        write_mcap(path, messages, McapLayout(chunk_size=None))
     else:
-        write_mcap(path, messages, McapLayout(chunk_size=1 << 12))
+        path = write_mcap(folder / "bag.mcap", messages, McapLayout(chunk_size=KINDS[kind]))
     if kind == "no summary":
         path.write_bytes(path.read_bytes()[: -path.stat().st_size // 50])
-    return McapReader().summarize(path).schema.pauses
+    return Rosbag2Reader().summarize(path).schema.pauses
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@on_each_kind
 def test_a_pause_of_all_topics_is_found_wherever_its_messages_lie(
     tmp_path: Path, kind: str
 ) -> None:
@@ -59,6 +54,6 @@ def test_a_pause_of_all_topics_is_found_wherever_its_messages_lie(
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@on_each_kind
 def test_a_slower_topic_that_goes_on_leaves_no_pause(tmp_path: Path, kind: str) -> None:
     assert pauses(tmp_path, kind, bag_of(every(50, 10, but=((3, 5),)), every(10, 10))) == ()
