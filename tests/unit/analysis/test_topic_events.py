@@ -16,6 +16,7 @@ from ros2_memory.analysis.facts import (
     Fact,
     State,
     Word,
+    joined_stated,
     stated_by,
 )
 from ros2_memory.analysis.intervals import IntervalTable
@@ -93,6 +94,21 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
     parts = [events_of(messages[begin:end]) for begin, end in ends]
     whole = joined_events([part for part in parts if part is not None])
     assert _comparable(whole) == _comparable(events_of(messages))
+
+
+@given(histories(), st.data())
+def test_messages_of_tables_that_overlap_are_taken_as_those_of_one(
+    history: tuple[Messages, list[int]], data: st.DataObject
+) -> None:
+    # Of equal times either may be first.
+    messages = [(time + nth, state) for nth, (time, state) in enumerate(history[0])]
+    tables = data.draw(st.lists(st.integers(0, 2), min_size=len(messages), max_size=len(messages)))
+    parts = [
+        [message for message, table in zip(messages, tables, strict=True) if table == nth]
+        for nth in range(3)
+    ]
+    stated = [stated_by(*([*each] for each in zip(*part, strict=True))) for part in parts if part]
+    assert _comparable(events_of_stated(joined_stated(stated))) == _comparable(events_of(messages))
 
 
 def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(

@@ -5,7 +5,6 @@ from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.facts import FLAG, MOST
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
@@ -30,8 +30,10 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
+from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.shared_bags import needs_recorded
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -44,6 +46,26 @@ def over(memory: Memory, begin: float, end: float) -> Recap:
 
 def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
     return [(each.text, (each.start - BEGIN) / S) for each in events if each.kind == kind]
+
+
+def _drive(
+    bag_dir: Path, legs: list[tuple[float, float]], *, begin: float = 0.0, hz: int = 50
+) -> list[tuple[float, float]]:
+    """Legs of (seconds, metres per second) from `begin` on, in bags of 7.3 s; when it stood."""
+    edges, places = [begin], [0.0]
+    for length, speed in legs:
+        edges.append(edges[-1] + length)
+        places.append(places[-1] + length * speed)
+    messages: list[Msg] = []
+    leg = 0
+    for nth in range(int((edges[-1] - begin) * hz) + 1):
+        time = begin + nth / hz
+        while leg + 1 < len(legs) and time >= edges[leg + 1]:
+            leg += 1
+        x = places[leg] + (time - edges[leg]) * legs[leg][1]
+        messages.append(odom(BEGIN + round(time * S), x, 0.0, 0.0))
+    write_splits(bag_dir, messages, 7.3)
+    return [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
 
 
 @settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -61,21 +83,30 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
 ) -> None:
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
-        # Half a metre in a second for 2 s, then it stands and drives in turn.
-        edges, x = [0.0, 2.0], [0.0, 1.0]
+        driven = [(2.0, 0.5)]
         for stands, drives in legs:
-            edges += [edges[-1] + stands, edges[-1] + stands + drives]
-            x += [x[-1], x[-1] + drives / 2]
-        end = edges[-1]
-        seconds = np.arange(0, end, 0.02)
-        rows = zip(seconds.tolist(), np.interp(seconds, edges, x).tolist(), strict=True)
-        write_splits(bag_dir, [odom(BEGIN + round(t * S), at, 0.0, 0.0) for t, at in rows], 7.3)
+            driven += [(stands, 0.0), (drives, 0.5)]
+        _drive(bag_dir, driven)
         memory = memory_of(bag_dir, recalls=recalls)
+        end = sum(length for length, _ in driven)
         # No part is so short that no pose is in it.
         inner = {round(0.1 + part * (end - 0.2), 1) for part in parts}
+        edges = [0.0, *sorted(inner), end]
         whole = over(memory, 0.0, end)
-        stood = [over(memory, *span).stood or 0 for span in pairwise([0.0, *sorted(inner), end])]
+        stood = [over(memory, *span).stood or 0 for span in pairwise(edges)]
         assert sum(stood) == pytest.approx(whole.stood or 0, abs=0.02 * S)
+
+
+def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
+    """The status of a vehicle after so many seconds, with these of its 40 booleans true."""
+    body = make(
+        "px4_msgs/msg/VehicleStatus",
+        timestamp=round(at * 1e6),
+        arming_state=1,
+        gcs_connection_lost_counter=0,
+        **{name: name in set_flags for name in STATUS_FLAGS},
+    )
+    return Msg(topic, "px4_msgs/msg/VehicleStatus", BEGIN + round(at * S), body)
 
 
 def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:
@@ -93,25 +124,11 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> Non
 
 
 def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path) -> None:
-    """All 40 booleans of the status of a vehicle flip four times in one bag."""
-    type_name = "px4_msgs/msg/VehicleStatus"
-    messages = [
-        Msg(
-            "/fmu/out/vehicle_status",
-            type_name,
-            BEGIN + at * S,
-            make(
-                type_name,
-                timestamp=at * 10**6,
-                arming_state=1,
-                gcs_connection_lost_counter=0,
-                **dict.fromkeys(STATUS_FLAGS, at in {1, 3}),
-            ),
-        )
-        for at in range(5)
-    ]
+    """All 40 booleans flip four times in one bag."""
+    messages = [_status(at, *(STATUS_FLAGS if at in {1, 3} else ())) for at in range(5)]
     write_mcap(tmp_path / "bag.mcap", messages)
-    answer = over(memory_of(tmp_path), 0, 10)
+    memory = memory_of(tmp_path)
+    answer = over(memory, 0, 10)
     assert dict(answer.counts) == {"on/off changes": 4 * 40}
     assert any(
         f"left out, because there are too many: {4 * 40 - 25} on/off changes" in note
@@ -204,7 +221,8 @@ def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
         if step % 10 == 0:
             messages.append(tf(at, transform(at, "map", "odom", (-2.0 * nth, nth + 1.0, 0.0))))
     write_splits(tmp_path, messages)
-    memory = in_places(memory_of(tmp_path, recalls=recalls))
+    memory = in_places(memory_of(tmp_path))
+    memory = with_store(memory, tmp_path) if recalls else memory
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 200)
     found = recap(memory, Call(), span)
     own = recap(memory, Call(), span, frame_id="odom")
@@ -335,3 +353,30 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["avg_speed"] <= path["max_speed"]
     assert path["duration_s"] == pytest.approx(7219.9)
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
+
+
+@needs_recorded
+def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path) -> None:
+    session = SESSIONS["session_mcap"]
+    for bag in session.folder.glob("*.mcap"):
+        (tmp_path / bag.name).write_bytes(bag.read_bytes())
+    memory = memory_of(tmp_path)
+    answer = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
+    assert answer.distance_m == pytest.approx(58 * SPEED, rel=0.002)
+    assert answer.stood == 0
+    assert answer.throughout == ("table",)
+    expected = [
+        ("cup in view", 5, 24),
+        ("scissors in view", 12, 5),
+        ("/bumper became true", 25, 1),
+        ("/bumper became false", 26, None),
+        ("scissors in view", 40, 5),
+    ]
+    assert [each.text for each in answer.events] == [text for text, _, _ in expected]
+    for event, (_, start, length) in zip(answer.events, expected, strict=True):
+        assert abs(session.since(unix_from_ns(event.start)) - start) < 0.05
+        if length is None:
+            assert event.end is None
+        else:
+            assert event.end is not None
+            assert abs(unix_from_ns(event.end - event.start) - length) < 0.05

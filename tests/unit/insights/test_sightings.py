@@ -1,21 +1,33 @@
 from __future__ import annotations
 
 import json
+import math
+import random
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from ros2_memory import queries
+from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
+    NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import JsonValue
-from ros2_memory.core.timebase import Deadline
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     boolean,
     detections,
@@ -28,8 +40,12 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import FixedClock
+from tests.support.closed_form import SESSIONS, position
+from tests.support.examples import examples
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, memory_of
+from tests.support.memories import asked, memory_of, with_store
+from tests.support.random_histories import write_history
+from tests.support.shared_bags import needs_recorded
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -38,6 +54,32 @@ if TYPE_CHECKING:
 S = 10**9
 BEGIN = 1_784_000_000 * S
 OBJECTS = "/vision/scene/scene_objects"
+PLACES = {"table": (1.5, 3.5, 0.4), "cup": (1.4, 3.6, 0.8), "scissors": (-2.5, 1.0, 0.75)}
+
+
+@needs_recorded
+@pytest.mark.parametrize(
+    ("label", "seen"),
+    [("scissors", [(40, 45), (12, 17)]), ("cup", [(5, 29)]), ("table", [(0, 64)])],
+)
+def test_sightings_of_a_recorded_session_are_the_closed_form(
+    label: str, seen: list[tuple[int, int]]
+) -> None:
+    session = SESSIONS["session_mcap"]
+    answer = find_matches(
+        memory_of(session.folder), Call(), "/vision/*/scene_objects", "contains", label
+    )
+    assert not answer.more
+    assert len(answer.sightings) == len(seen)
+    for sighting, (first, last) in zip(answer.sightings, seen, strict=True):
+        assert abs(session.since(unix_from_ns(sighting.first)) - first) < 0.05
+        assert abs(session.since(unix_from_ns(sighting.last)) - last) < 0.05
+        assert sighting.messages == last - first + 1
+        assert sighting.robot is not None
+        assert sighting.thing is not None
+        assert math.dist(sighting.robot.position[:2], position(last)) < 0.05
+        assert sighting.thing.frame_id == "odom"
+        assert math.dist(sighting.thing.position, PLACES[label]) < 0.05
 
 
 def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:
@@ -180,6 +222,65 @@ def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
         assert sighting.begun != any("ran out of time" in note for note in answer.notes)
     assert counts == sorted(counts)
     assert counts[0] < bags * 10 == counts[-1]
+
+
+def grouped(
+    memory: Memory, topic: str, kind: str, value: JsonValue
+) -> list[tuple[str, int, int, int]]:
+    """What sightings are, read off all messages in order."""
+    condition = parse_condition(kind, value, memory.limits.position_tolerance_m)
+    view = View(memory, Call(), memory.clock.now())
+    search = ReverseSearch(view, topic, condition)
+    rows: list[list[tuple[str, int]]] = []
+    under_way: dict[str, list[tuple[str, int]]] = {}
+    backwards = view.stream.messages(search.topics, TimeWindow.everything(), newest_first=True)
+    for each in reversed(list(backwards)):
+        name = each.record.channel.topic
+        row = under_way.get(name)
+        if not search.matches(each):
+            under_way.pop(name, None)
+        elif row is None or each.time - row[-1][1] > SILENCE_NS:
+            under_way[name] = [(name, each.time)]
+            rows.append(under_way[name])
+        else:
+            row.append((name, each.time))
+    told = [(row[0][0], row[0][1], row[-1][1], len(row)) for row in rows]
+    return sorted(told, key=lambda each: (-each[2], each[0]))
+
+
+ASKED: tuple[tuple[str, str, JsonValue], ...] = (
+    ("/vision/*", "contains", "cup"),
+    ("/vision/a", "contains", "e"),
+    ("/bumper", "equals", True),
+    ("/odom", "near_position", {"x": 0.0, "y": 0.0}),
+    ("/dock", "contains", "docked"),
+)
+
+
+@settings(max_examples=examples(40), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.0, 0.5, 1.0]))
+def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
+    seed: int, part: float
+) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        write_history(bag_dir, draw)
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
+        memory = with_store(plain, bag_dir, part=part)
+        for topic, kind, value in ASKED:
+            try:
+                expected = grouped(plain, topic, kind, value)
+            except NoDataError:
+                continue
+            answer = find_matches(memory, Call(), topic, kind, value, limit=100)
+            told = [(each.topic, each.first, each.last, each.messages) for each in answer.sightings]
+            assert sorted(told, key=lambda each: (-each[2], each[0])) == expected, (topic, value)
+            assert [each[2] for each in told] == sorted((each[2] for each in told), reverse=True)
+            assert find_matches(memory, Call(), topic, kind, value, limit=100) == answer
+            oldest = find_matches(memory, Call(), topic, kind, value, limit=2, oldest_first=True)
+            assert oldest.sightings == tuple(reversed(answer.sightings))[:2]
+            assert oldest.total == len(answer.sightings)
 
 
 def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) -> None:

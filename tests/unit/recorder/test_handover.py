@@ -70,10 +70,7 @@ class Stall(NamedTuple):
 
 
 class Recorder(NamedTuple):
-    """One recorder: when it begins and ends, in seconds, how deep its queues are.
-
-    The publishers' clock is ahead by `skew_s`.
-    """
+    """One recorder: when it begins and ends, in seconds, how deep its queues are."""
 
     start: float
     stop: float
@@ -81,7 +78,6 @@ class Recorder(NamedTuple):
     depth: int = 2
     splits: tuple[float, ...] = ()
     delay_ns: int = 20_000
-    skew_s: float = 0.0
 
     def receives(self, published: Iterable[Published]) -> list[Msg]:
         """What it writes: after a stall the newest messages of each queue, and the time of then."""
@@ -94,8 +90,7 @@ class Recorder(NamedTuple):
             at = each.at if stall is None else stall.at + stall.lasts
             made = text(T0, str(each.number), each.topic)
             log_time = T0 + round(at * S) + self.delay_ns
-            publish_time = T0 + round((each.at + self.skew_s) * S)
-            message = Msg(each.topic, made.type, log_time, made.body, publish_time)
+            message = Msg(each.topic, made.type, log_time, made.body, T0 + round(each.at * S))
             if stall is None:
                 received.append(message)
             else:
@@ -185,11 +180,11 @@ def hand_over(
     write_handovers({after: new, before: old})
 
 
-def handed_over(bag_dir: Path, *stalls: Stall, skew_s: float = 0.0) -> tuple[Path, Path]:
+def handed_over(bag_dir: Path, *stalls: Stall) -> tuple[Path, Path]:
     """The two recordings of a complete handover, of which the new recorder stalled."""
     published = publications(13)
-    Recorder(0, 7.5, skew_s=skew_s).writes(bag_dir / "a", published)
-    Recorder(4, 13, stalls, delay_ns=2_000_000, skew_s=skew_s).writes(bag_dir / "b", published)
+    Recorder(0, 7.5).writes(bag_dir / "a", published)
+    Recorder(4, 13, stalls).writes(bag_dir / "b", published)
     hand_over(bag_dir, 5)
     return bag_dir / "a", bag_dir / "b"
 
@@ -249,12 +244,8 @@ def test_short_recordings_that_follow_each_other_are_compared_in_pairs(tmp_path:
     assert sum(counted, Counter[int]()) == held_by[0] | held_by[1] | held_by[2]
 
 
-@pytest.mark.parametrize("skew_s", [-0.9, -0.123, 0.0, 0.9])
-def test_without_stalls_the_cut_is_right_and_nothing_is_listed(
-    tmp_path: Path, skew_s: float
-) -> None:
-    """Whatever clock the publishers have; the sidecar of the old recording stays as it is."""
-    old, new = handed_over(tmp_path, skew_s=skew_s)
+def test_without_stalls_nothing_is_listed_and_the_old_sidecar_stays(tmp_path: Path) -> None:
+    old, new = handed_over(tmp_path)
     before = (old / "handover.json").stat().st_mtime_ns
     assert settle_handover(old, new, READER)
     assert (old / "handover.json").stat().st_mtime_ns == before
@@ -316,6 +307,67 @@ def test_where_too_many_would_be_listed_all_count(
     assert settle_handover(*both, READER)
     for recording in both:
         assert numbers(recording, BagDirReader(READER)) == numbers(recording, READER)
+
+
+class Receiver(NamedTuple):
+    """When a recorder received, in seconds of the wall clock, and by how much later it did."""
+
+    start: float
+    stop: float
+    delay_s: float
+
+
+class Publisher(NamedTuple):
+    """Publishes at multiples of its period, by a clock that is off by `skew_s`."""
+
+    period_s: float
+    phase_s: float
+    skew_s: float
+
+
+@given(
+    publisher=st.builds(Publisher, st.floats(0.003, 0.3), st.floats(0, 0.3), st.floats(-0.9, 0.9)),
+    subscribed_s=st.floats(0.2, 5),
+    delays=st.tuples(st.floats(0, 0.002), st.floats(0, 0.002)),
+    ends_after_s=st.floats(0.0, 5.0),
+)
+def test_every_message_counts_exactly_once_whatever_the_publisher_and_the_delays(
+    publisher: Publisher,
+    subscribed_s: float,
+    delays: tuple[float, float],
+    ends_after_s: float,
+) -> None:
+    old, new = complete_sidecars(
+        Handover(),
+        "a",
+        "b",
+        began=T0,
+        both=T0 + round(subscribed_s * S),
+        ended=T0 + round((subscribed_s + 2) * S),
+        old_files=["a.mcap"],
+        new_files=["b.mcap"],
+        simulated=False,
+        clock=CutClock.PUBLISH,
+    )
+    recorders = {
+        "a.mcap": (old, Receiver(-10.0, subscribed_s + 2 + ends_after_s, delays[0])),
+        # A second later at most: it said that it had subscribed after it had.
+        "b.mcap": (new, Receiver(subscribed_s - 0.1, 20.0, delays[1])),
+    }
+    moment = -5 + publisher.phase_s
+    while moment < 15:
+        counted = 0
+        for file, (sidecar, receiver) in recorders.items():
+            received = moment + receiver.delay_s
+            if not receiver.start <= received < receiver.stop:
+                continue
+            published = T0 + round((moment + publisher.skew_s) * S)
+            logged = T0 + round(received * S)
+            counted += not any(
+                each.excludes(published, logged) for each in sidecar.exclusions(file)
+            )
+        assert counted == 1, moment
+        moment += publisher.period_s
 
 
 def bump(published: int, delay: int) -> Msg:

@@ -12,6 +12,7 @@ from ros2_memory.retention.policy import (
     DirContents,
     RetentionLimits,
     StoredBag,
+    StoredFile,
     by_hours,
     plan_deletions,
 )
@@ -42,6 +43,12 @@ def bag(
     at = written if written is not None else end or NOW
     number = zlib.crc32(name.encode()) if inode is None else inode
     return StoredBag(f"{recording}/{name}", recording, *span, at, 1, number, size)
+
+
+def another_name(of: StoredBag, file: StoredFile) -> StoredBag:
+    """The bag, if its name led to another file."""
+    device, inode = file.inode
+    return of._replace(device=device, inode=inode, size=file.size)
 
 
 def contents(
@@ -99,6 +106,13 @@ class TestAge:
     def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
         before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
         assert expired(contents(*before, after), LIMITS) == ()
+
+    def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
+        ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
+        boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
+        fresh = bag("fresh", 60 * S, written=NOW - HOUR)
+        deleted = expired(contents(ahead, boot, fresh, *hourly(172)), LIMITS)
+        assert names(deleted) == ["boot", "h171", "ahead", "h170", "h169"]
 
     def test_a_bag_without_messages_does_not_age_others_and_goes_with_its_time(self) -> None:
         old = bag("empty", None, written=NOW - 170 * HOUR + 1)
@@ -191,11 +205,18 @@ all_limits = st.builds(
 
 def without(held: DirContents, deleted: Iterable[StoredBag]) -> DirContents:
     """What lies there after these bags are deleted."""
-    gone = set(deleted)
-    bags = [each for each in held.bags if each not in gone]
+    gone = {each.path for each in deleted}
+    bags = [each for each in held.bags if each.path not in gone]
+    inodes = {file.inode for each in bags for file in each.files}
+    freed = {
+        file.inode: file.size
+        for each in held.bags
+        for file in each.files
+        if file.inode not in inodes
+    }
     free = held.free_bytes
     if free is not None:
-        free += sum(each.size for each in gone)
+        free += sum(freed.values())
     return replace(held, bags=bags, free_bytes=free)
 
 
@@ -234,6 +255,16 @@ class TestAlways:
         assert any(each.has_dates for each in left) == any(each.has_dates for each in held.bags)
 
     @given(stocks(), all_limits)
+    def test_no_more_is_deleted_than_needed(
+        self, held: DirContents, limits: RetentionLimits
+    ) -> None:
+        aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
+        deleted = [each for each in expired(held, limits) if each not in aged]
+        if deleted:
+            spared = [each for each in deleted if each.files != deleted[-1].files]
+            assert not fits(without(held, [*aged, *spared]), limits)
+
+    @given(stocks(), all_limits)
     def test_the_order_of_what_is_known_does_not_matter(
         self, held: DirContents, limits: RetentionLimits
     ) -> None:
@@ -268,11 +299,68 @@ class TestAlways:
         larger = replace(limits, max_total_bytes=limits.max_total_bytes + more)
         assert set(expired(held, larger)) <= set(expired(held, limits))
 
+    @given(stocks(), st.lists(moments, min_size=1, max_size=5))
+    def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
+        self, held: DirContents, ends: list[int]
+    ) -> None:
+        odd = [
+            bag(f"odd{number}", end, written=end, recording="ODD")
+            for number, end in enumerate(ends)
+            if end < 400 * HOUR + 1 or end > NOW
+        ]
+        held = replace(held, now=NOW)
+        more = replace(held, bags=(*held.bags, *odd))
+        # One that is longer than any recording counts as undated, too.
+        dated = (each for each in held.bags if each.end - each.start <= LIMITS.max_age_ns)
+        if any(NOW - 400 * HOUR <= each.end <= NOW for each in dated):
+            assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
+
+
+def sizes(files: Iterable[StoredFile]) -> dict[tuple[int, int], int]:
+    return {file.inode: file.size for file in files}
+
 
 class TestMoments:
+    """`kept` are files of moments, which other names of may be deleted."""
+
     def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
         bags = hourly(3)
         limits = replace(LIMITS, min_free_bytes=10)
-        saved = {file.inode: file.size for file in bags[-1].files}
-        found = plan_deletions(replace(contents(*bags, free_bytes=0), saved=saved), limits)
+        found = plan_deletions(
+            replace(contents(*bags, free_bytes=0), saved=sizes(bags[-1].files)), limits
+        )
         assert (names(found.to_delete), found.fits) == (["h1"], True)
+
+    @given(
+        st.lists(
+            st.tuples(st.integers(0, 200), st.integers(0, 6)),
+            min_size=1,
+            unique_by=lambda drawn: drawn[1],
+        ),
+        st.sets(st.integers(0, 8)),
+        st.integers(0, 120),
+    )
+    def test_what_is_said_of_the_budget_is_what_the_disk_would_show(
+        self, drawn: list[tuple[int, int]], kept: set[int], most: int
+    ) -> None:
+        def file(inode: int) -> StoredFile:
+            return StoredFile((1, inode), 10 + inode)
+
+        bags = [
+            another_name(bag(f"b{n}", NOW - hours * HOUR), file(inode))
+            for n, (hours, inode) in enumerate(drawn)
+        ]
+        limits = replace(LIMITS, max_total_bytes=most)
+        files = tuple(file(inode) for inode in kept)
+        found = plan_deletions(replace(contents(*bags), saved=sizes(files)), limits)
+
+        def shown(left: list[StoredBag]) -> int:
+            return sum({each.inode: each.size for each in (*files, *_files(left))}.values())
+
+        left = [each for each in bags if each not in found.to_delete]
+        assert found.total_bytes == shown(bags)
+        assert found.fits == (shown(left) <= most)
+
+
+def _files(bags: list[StoredBag]) -> list[StoredFile]:
+    return [each for bag in bags for each in bag.files]

@@ -13,6 +13,7 @@ from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
+from tests.support.examples import LONG
 from tests.support.fakes import failing
 from tests.support.log_lines import with_checks
 
@@ -108,24 +109,29 @@ def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_p
     assert RecordedTime(tmp_path).doubtful("ab") == {"a", "b"}
 
 
-def test_a_damaged_line_makes_no_recording_older_and_is_named(tmp_path: Path) -> None:
+def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b", "c")
     time = RecordedTime(tmp_path)
     end = recorded(time, "a", 90)
     end = recorded(time, "b", 90, since_s=end)
     recorded(time, "c", 120, since_s=end)
     path = tmp_path / FILE
-    right, lines = RecordedTime(tmp_path).since("abc"), path.read_text().splitlines()
+    right, whole = RecordedTime(tmp_path).since("abc"), path.read_bytes()
     assert right["a"] > right["b"] > right["c"] == 0
-    for number, line in enumerate(lines):
-        damaged = [*lines[:number], line.replace(".0", ".1"), *lines[number + 1 :]]
-        path.write_text("".join(f"{each}\n" for each in damaged))
+    for bit in range(0, 8 * len(whole), 1 if LONG else 7):
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
         with structlog.testing.capture_logs() as captured:
-            found = RecordedTime(tmp_path).since("abc")
-        assert all(found[name] <= right[name] + SAVE_S * S for name in "abc")
-        assert [(told["event"], told["lines"]) for told in captured] == [
-            ("recorded_time_damaged", [number + 1])
-        ]
+            spoiled = RecordedTime(tmp_path)
+            found = spoiled.since("abc")
+        assert spoiled.doubtful("abc") == {*"abc"}
+        # A flipped line end spoils two lines, and the one before these is two minutes older.
+        assert all(found[name] <= right[name] + 2 * SAVE_S * S for name in "abc")
+        if found != right:
+            [told] = captured
+            assert told["event"] == "recorded_time_damaged"
+            assert whole[: bit // 8].count(b"\n") + 1 in told["lines"]
 
 
 def test_what_is_gone_is_left_out_and_the_total_stays(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 from ros2_memory.analysis import sights
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -28,7 +30,8 @@ from tests.support.bags import (
     transform,
     write_splits,
 )
-from tests.support.memories import asked, memory_of
+from tests.support.examples import examples
+from tests.support.memories import asked, memory_of, replied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,10 +58,11 @@ def scene(
     in_map: bool = True,
     score: float = 0.9,
     map_off: float = 0.0,
+    height: float = 0.0,
 ) -> list[Msg]:
     """All messages of one moment: the robot at a pose in the map, and what it detects.
 
-    `map_off` is how far (m, along y) the map has moved under odometry.
+    `map_off` is how far (m, along y) the map has moved under odometry, `height` that of the floor.
     """
     at = BEGIN * S + round(at_s * S)
     x, y, yaw = robot
@@ -68,7 +72,7 @@ def scene(
     px, py = (x - ox) * cos - (y - oy) * sin, (x - ox) * sin + (y - oy) * cos
     messages = [odom(at, px, py, yaw - turn), tf(at, base(at, px, py, yaw - turn))]
     if in_map:
-        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, 0.0), turn)))
+        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, height), turn)))
     cos, sin = math.cos(-yaw), math.sin(-yaw)
     things = []
     for label, thing_x, thing_y in seen:
@@ -372,7 +376,8 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
     many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(36)]
     elsewhere = [("thing 00", 2.0, 5.0), *many[1:]]
     write_splits(tmp_path, [*looked(0, 8, HERE, *many), *looked(100, 108, HERE, *elsewhere)])
-    answer = ask(tmp_path, limit=100)
+    reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
+    answer = json.loads(reply.text)
     [moved] = [row for row in answer["things"] if row["label"] == "thing 00"]
     assert (moved["moved_times"], moved["since"]) == (1, moved["last_seen"] - 7.0)
     assert all("since" not in row for row in answer["things"] if row is not moved)
@@ -434,10 +439,13 @@ def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Pat
     "near",
     [
         "",
+        {},
         {"radius_m": 2},
         {"label": 5},
         {"label": "mug", "x": 1},
+        {"x": 1},
         {"label": "mug", "radius_m": -1},
+        {"label": "mug", "radius_m": "1"},
         {"label": "mug", "radius": 1},
         [1, 2],
         {"x": [0, 1], "y": [0, 1]},
@@ -490,3 +498,44 @@ def test_detections_that_cannot_be_decoded_are_no_silence_of_the_detector(
     for reply in (found, asked(memory, tmp_path, "compare", **whole)):
         assert "messages of /vision/scene/scene_objects could not be decoded, so" in str(reply)
     assert "no things are known" not in str(found)
+
+
+@settings(
+    max_examples=examples(6),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    moved=st.integers(45, 60),
+    split_s=st.sampled_from([4.0, 10.0, 17.0]),
+    back=st.booleans(),
+)
+@example(moved=45, split_s=10.0, back=True)
+@example(moved=54, split_s=10.0, back=False)
+def test_things_are_the_same_in_one_file_and_in_many(
+    tmp_path_factory: pytest.TempPathFactory, moved: int, split_s: float, back: bool
+) -> None:
+    """A cup is taken away while the robot looks elsewhere; then the robot looks again, or not."""
+    cup, book, mug = ("cup", 3.0, 0.5), ("book", 3.5, -1.0), ("mug", -1.5, 1.0)
+    messages = looked(0, moved, HERE, cup, book) + looked(moved, moved + 25, AWAY, mug)
+    if back:
+        messages += looked(moved + 25, moved + 50, HERE, book)
+    answers, missed_by = [], []
+    for each in (split_s, 1e6):
+        bag_dir = tmp_path_factory.mktemp("bags")
+        write_splits(bag_dir, messages, each)
+        answers.append(ask(bag_dir, NAMED))
+        [lost] = [each for each in answers[-1]["things"] if each["label"] == "cup"]
+        missed_by.append(lost["still_there"].pop("not_seen_where_expected", None))
+    assert answers[0] == answers[1]
+    assert [each is not None for each in missed_by] == [back, back]
+    if back:  # by when is known to a split, or a slice of one
+        assert abs(missed_by[0] - missed_by[1]) <= max(split_s, 15.0)
+
+
+def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
+    write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    table = Place("table", "map", Circle(3.0, 0.0, 1.0))
+    reply = ask(tmp_path, QuerySettings(places=(KITCHEN, table)))
+    [mug] = reply["things"]
+    assert (mug["in"], mug["also_in"]) == ("table", ["kitchen"])

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ros2_memory.analysis.sights import Ints
 from ros2_memory.things.places import Sightings, stays_in
 from tests.support.bags import Msg, header, make, point, quaternion, write_splits
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.unit.things.test_find import BEGIN, NAMED, S, scene
 
@@ -89,6 +92,23 @@ def test_nearly_all_small_moves_are_found_and_none_is_made_up(noise: dict[str, A
         truth = [0] * 20 + [1] * 4
         right += sum(stay.tolist() == truth for stay in stays_of(moved))
     assert right >= 0.99 * 40 * len(LABELS)
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    turn=st.floats(0, 2 * math.pi),
+    off=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
+)
+def test_stays_do_not_depend_on_where_the_map_begins(
+    seed: int, turn: float, off: tuple[float, float]
+) -> None:
+    draw = np.random.default_rng(seed)
+    moved = [(0.0, 0.0)] * 6 + [(draw.uniform(0, 600), 0.0)] * 4
+    seen = sightings(draw, moved, bias_mm=50.0, sides=5)
+    turned = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    other = seen._replace(xy=seen.xy @ turned + np.array(off), side=seen.side @ turned)
+    assert stays_of([seen])[0].tolist() == stays_of([other])[0].tolist()
 
 
 # -- while localisation was poor -----------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import pytest
 
@@ -15,7 +16,6 @@ from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.retention import saved_moments
 from tests.support.bags import McapLayout, Msg, boolean, text
-from tests.support.fakes import failing
 from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
 
@@ -288,9 +288,11 @@ def test_a_full_disk_keeps_the_firing_until_there_is_room(
     robot.begin(T0)
     robot.split(seconds(0, 10, {6}))
     robot.clock.at = T0 + 30 * S
+
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as broken:
-        broken.setattr(saved_moments, "make_moment_folder", failing())
-        broken.setattr(json_files, "write_durably", failing())
+        broken.setattr(saved_moments, "make_moment_folder", full)
+        broken.setattr(json_files, "write_durably", full)
         robot.close_all()
         robot.look()
     assert not robot.moments()
@@ -323,7 +325,9 @@ def test_where_its_state_cannot_be_read_the_budget_deletes_and_age_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = watched(tmp_path, max_bytes=10_000, max_age_h=0.02)
-    monkeypatch.setattr(TRIGGERS, "read", failing(errno.EIO))
+
+    failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+    monkeypatch.setattr(TRIGGERS, "read", failing)
     robot.house = robot.new_house()
     name = robot.begin(T0)
     for begin in range(0, 50, 10):
@@ -361,6 +365,25 @@ def test_messages_that_cannot_be_decoded_are_named(robot: WatchedBags) -> None:
     robot.split([Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, b"")])
     robot.close_all()
     assert "/bumper" in (robot.record().problem or "")
+
+
+def test_a_kill_between_moment_and_state_doubles_nothing(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 30, {6, 9, 20}))
+    robot.clock.at = T0 + 60 * S
+
+    robot.beat(state=RecorderState.STOPPED)
+    with monkeypatch.context() as broken:
+        broken.setattr(TRIGGERS, "write", Mock(side_effect=SystemExit))
+        with pytest.raises(SystemExit):
+            robot.look()
+    assert len(robot.moments()) == 2
+    robot.house = robot.new_house()
+    robot.look()
+    assert robot.spans() == [(1, 12), (15, 23)]
+    assert (robot.record().fired, robot.record().moments) == (3, 2)
 
 
 def test_what_was_published_by_a_clock_that_was_ahead_makes_nothing_a_repeat(
