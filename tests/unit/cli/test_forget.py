@@ -15,14 +15,13 @@ import yaml
 from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.columns.store import CATALOGUE, FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
 from tests.support.housekeepers import embedding, made_moment, own_all
-from tests.unit.cli.conftest import columns_in, left, locked
+from tests.unit.cli.conftest import columns_in, described, left, locked
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -334,15 +333,8 @@ class TestCopies:
 class TestMetadata:
     @pytest.fixture
     def metadata(self, bag_dir: Path) -> Path:
-        """That of the first recording, as its recorder would have left it."""
-        reader, recording = McapReader(), bag_dir / "rec_0"
-        contents = {
-            each.name: Contents(reader.summarize(each), reader.channels(each))
-            for each in sorted(recording.glob("*.mcap"))
-        }
-        path = recording / "metadata.yaml"
-        path.write_text(describing("", contents))
-        return path
+        """That of the first recording."""
+        return described(bag_dir / "rec_0")
 
     def test_it_lists_what_is_left(self, metadata: Path, forget: Forget) -> None:
         shown = forget(0, 0, 15).out

@@ -27,7 +27,6 @@ from rosbags.rosbag2 import Reader
 from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import message_id
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, read_losses
 from ros2_memory.cli.maintenance import forget as cli_forget
@@ -35,7 +34,6 @@ from ros2_memory.columns.store import FILE
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.retention import eraser, repair
 from ros2_memory.storage.mcap.writer import McapWriter
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -48,7 +46,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import made_moment, own_all
-from tests.unit.cli.conftest import columns_in, left, locked
+from tests.unit.cli.conftest import columns_in, described, left, locked
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -89,9 +87,7 @@ def recorded(bag_dir: Path, layout: McapLayout | None = None) -> list[Path]:
     made = [
         write_mcap(bag_dir / "rec_a" / f"rec_a_{n}.mcap", messages(n), layout) for n in range(3)
     ]
-    reader = McapReader()
-    contents = {each.name: Contents(reader.summarize(each), reader.channels(each)) for each in made}
-    (bag_dir / "rec_a" / "metadata.yaml").write_text(describing("", contents))
+    described(bag_dir / "rec_a")
     return [left(each) for each in made]
 
 

@@ -46,9 +46,7 @@ def seconds(first: int, count: int, x: float = 0.0) -> list[Msg]:
 
 
 @pytest.fixture(autouse=True)
-def no_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("MEMORY_DEPLOYMENT", "MEMORY_BAG_DIR", "MEMORY_CONFIG_OVERRIDES"):
-        monkeypatch.delenv(name, raising=False)
+def wide_terminal(no_deployment: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
 
 

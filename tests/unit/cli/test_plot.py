@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 T0 = 1_700_000_000 * NS_PER_S
 S = NS_PER_S
 
+pytestmark = pytest.mark.usefixtures("no_deployment")
+
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -50,12 +52,6 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     second = [odom(begin + n * S // 5, 10.0, n / 5) for n in range(50)]
     write_mcap(folder / "rec" / "rec_1.mcap", second)
     return folder
-
-
-@pytest.fixture(autouse=True)
-def no_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MEMORY_DEPLOYMENT", raising=False)
-    monkeypatch.delenv("MEMORY_BAG_DIR", raising=False)
 
 
 def test_where_nothing_has_poses_it_says_so(tmp_path: Path, exits: Program) -> None:

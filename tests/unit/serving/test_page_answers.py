@@ -196,12 +196,9 @@ def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
     for asked_of in (plain, replace(plain, scanner=stored_columns(plain, tmp_path))):
         signal = "/odom:pose.pose.position.x"
         [found] = shown(asked_of, f"last=1000&signal={signal}")["signals"]
-        assert all(low <= mean <= high for low, mean, high in zip(*bounds(found), strict=True))
+        bounds = zip(found["low"], found["mean"], found["high"], strict=True)
+        assert all(low <= mean <= high for low, mean, high in bounds)
         assert found["mean"] == pytest.approx(positions, abs=1e-4)
-
-
-def bounds(signal: dict[str, Any]) -> tuple[list[float], list[float], list[float]]:
-    return signal["low"], signal["mean"], signal["high"]
 
 
 @pytest.mark.parametrize("signal", ["/odom:no.such.field", "/nowhere:x"])
@@ -288,14 +285,11 @@ def test_a_path_of_many_corners_is_drawn_by_a_bounded_number_of_points(
     assert (path["x"][0], path["x"][-1]) == (0.0, 5.9)
 
 
-def answered(tool: str) -> Answered:
-    return Answered(tool, "ok", 0.25, 2, "id")
-
-
 def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
     log = QuestionLog(3, wall=lambda: BEGIN)
     for number in range(5):
-        log.add(f"tool_{number}", {"n": number}, answered(f"tool_{number}"), "x" * 10_000)
+        tool = f"tool_{number}"
+        log.add(tool, {"n": number}, Answered(tool, "ok", 0.25, 2, "id"), "x" * 10_000)
     kept = log.newest(2)
     assert [each["tool"] for each in kept] == ["tool_4", "tool_3"]
     assert kept[0]["asked"] == round((BEGIN - S // 4) / S, 3)
