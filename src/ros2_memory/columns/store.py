@@ -64,7 +64,6 @@ _ALL_TIME: Final = TimeWindow.everything()
 LONG_NS: Final[Ns] = 2 * Level.TEN_MINUTES.length
 """A bag that lasts longer becomes parts of an hour at once."""
 
-_UNKNOWN: Final = -2
 _FEW: Final = 2048
 """Bags that are looked up one by one; for more of them all stored ones are read."""
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-MB: Final = 1 << 20
 MAX_MB: Final = 200
 SCRIPT: Final = """
 import sys

@@ -9,7 +9,6 @@ import pytest
 
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.view import TimeRange
 from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 
@@ -57,10 +56,6 @@ def cut(folder: Path, messages: Sequence[Msg], draw: Random) -> None:
 
 def whole(answer: Bins, name: str) -> float | None:
     return answer.all[[each[0] for each in answer.columns].index(name)]
-
-
-def everything() -> TimeRange:
-    return TimeRange(BEGIN / S, BEGIN / S + HOURS * 3600)
 
 
 @pytest.fixture(scope="module")

@@ -32,10 +32,6 @@ def count(stream: Stream, at: int) -> int:
     return sum(1 for _ in takewhile(lambda each: each.log_time <= at, TIMELINE.messages(stream)))
 
 
-def in_order(folder: Path) -> list[Path]:
-    return sorted(folder.glob("demo/*.mcap"), key=lambda path: int(path.stem.split("_")[-1]))
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bags")

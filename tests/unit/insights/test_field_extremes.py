@@ -1,22 +1,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.history.context import Call
-from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import fields
 from tests.support.bags import boolean, odom, text, write_mcap
 from tests.support.memories import asked, memory_of
 
-if TYPE_CHECKING:
-    pass
-
 S = 10**9
 BEGIN = 1_784_000_000 * S
-WHOLE = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 100)
 
 
 def test_a_window_with_too_many_messages_to_read_says_so(
