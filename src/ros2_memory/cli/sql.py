@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from decimal import Decimal
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
@@ -11,9 +12,11 @@ from ros2_memory.bootstrap_fleet import open_lake
 from ros2_memory.cli.options import AsJson, Overrides, load_for
 from ros2_memory.cli.output import print_line, print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from ros2_memory.config import DuckdbNode
+    from ros2_memory.core.model import JsonValue
 
 
 def sql(
@@ -43,9 +46,16 @@ def sql(
         writer.writerow(rows.column_names)
         writer.writerows(zip(*rows.to_pydict().values(), strict=True))
         return
-    # Dates, times and bytes are texts there.
-    text = json.dumps(rows.to_pylist(), default=str)
+    text = json.dumps(rows.to_pylist(maps_as_pydicts="lossy"), default=_as_json)
+    answer: JsonValue = json.loads(text)
     if as_json:
-        print_line(text)
+        print_line(to_json_text(answer))
     else:
-        print_reply(json.loads(text))
+        print_reply(answer)
+
+
+def _as_json(value: object) -> float | str:
+    """Returns a value of SQL that JSON has not: a decimal, bytes in hexadecimal, a time."""
+    if isinstance(value, Decimal):
+        return float(value)
+    return value.hex() if isinstance(value, bytes) else str(value)

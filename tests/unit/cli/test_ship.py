@@ -212,6 +212,9 @@ def test_a_select_is_answered_over_the_tables_as_they_are_now(
     lines = exits(0, f"{counted} GROUP BY robot ORDER BY robot' --csv", *of_lake).out.splitlines()
     assert lines[:2] == ["robot,bags,day", f"{first['robot']},{first['bags']},{first['day']}"]
     assert "kitchen" in exits(0, f"{counted} GROUP BY ALL'", *of_lake).out
+    odd = "0.5 a, 1e999::DOUBLE b, MAP{'x': 1} c, '\\x01'::BLOB d, DATE '2026-11-20' e"
+    [row] = json.loads(exits(0, "sql --json", f"SELECT {odd}", *of_lake).out)
+    assert row == {"a": 0.5, "b": None, "c": {"x": 1}, "d": "01", "e": "2026-11-20"}
     refused = exits(2, "sql 'SELECT * FROM chanels'", *of_lake).err
     assert "chanels does not exist" in refused
     assert "the tables are channels, poses" in refused
