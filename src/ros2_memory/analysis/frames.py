@@ -196,8 +196,7 @@ class _History:
 
     def parents_at(self, times: Times) -> Times:
         """Returns which of the parents the child is in at some times, by their numbers."""
-        before, *_ = self._bracket(times)
-        return self._parent[before]
+        return self._parent[self._bracket(times).before]
 
     def newest_parent(self) -> str:
         """Returns the parent where no time is given."""
@@ -227,16 +226,12 @@ class _History:
             " extrapolated; ask for a time in that range",
         )
 
-    def _bracket(self, times: Times) -> tuple[Times, Times, Floats, Mask]:
-        """Returns the rows between which each of some times lies, and how far: 0 is at the former.
-
-        Where nothing is interpolated, both are the row that counts. And whether one does.
-        """
+    def _bracket(self, times: Times) -> _Bracket:
         count = len(self._times)
         # The first static transform holds before it was received, too.
         static = count - 1 + np.maximum(self._since.searchsorted(times, "right"), 1)
         if not count:
-            return static, static, 0.0 * static, static >= 0
+            return _Bracket(static, static, 0.0 * static, static >= 0)
         after = self._times.searchsorted(times, "right")
         before, after = np.maximum(after - 1, 0), np.minimum(after, count - 1)
         start, stop = self._times[before], self._times[after]
@@ -248,7 +243,19 @@ class _History:
         ratio = is_mixed * since / np.maximum(stop - start, 1)
         if len(self._since):
             nearest, valid = np.where(valid, nearest, static), static >= 0
-        return nearest, np.where(is_mixed, after, nearest), ratio, valid
+        return _Bracket(nearest, np.where(is_mixed, after, nearest), ratio, valid)
+
+
+class _Bracket(NamedTuple):
+    """The rows of a history between which each of some times lies; `ratio` 0 is at the former.
+
+    Where nothing is interpolated, both are the row that counts. `valid`: whether one does.
+    """
+
+    before: Times
+    after: Times
+    ratio: Floats
+    valid: Mask
 
 
 class FrameTree:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def sql(
     select: Annotated[
-        str, typer.Argument(metavar="SELECT", help="'SELECT robot, count(*) FROM bags GROUP BY 1'.")
+        str, typer.Argument(metavar="SELECT", help="Such as 'SELECT count(*) FROM bags'.")
     ],
     overrides: Overrides = None,
     *,

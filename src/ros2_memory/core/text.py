@@ -47,7 +47,7 @@ _MOST_KEYS_CHARS: Final = 300
 
 
 def dotted(path: str, name: str) -> str:
-    """Returns the dot-path of what has a name inside of what is at a path."""
+    """Returns the dot-path of a field; `path` is that of the message around it, if any."""
     return f"{path}.{name}" if path else name
 
 

@@ -233,9 +233,17 @@ def farthest_from(
     pose = _farthest_pose(TrackReader(view, frame), track, spans, (x, y))
     if pose is None:
         return None
-    away_m, time, at = pose
-    inside = places_at(view.limits.places, frame, *at)
-    return FarthestPose((x, y), frame, away_m, time, at, inside)
+    inside = places_at(view.limits.places, frame, pose.x, pose.y)
+    return FarthestPose((x, y), frame, pose.away_m, pose.time, (pose.x, pose.y), inside)
+
+
+class _DistantPose(NamedTuple):
+    """A pose (m), its log time (ns), and its distance from the point that is asked about."""
+
+    away_m: float
+    time: Ns
+    x: float
+    y: float
 
 
 def _farthest_pose(
@@ -243,17 +251,17 @@ def _farthest_pose(
     track: RobotTrack,
     spans: Sequence[tuple[Ns, Ns]],
     point: tuple[float, float],
-) -> tuple[float, Ns, tuple[float, float]] | None:
-    """Returns how far (m) the pose in some times that is farthest from a point is, when, and where.
+) -> _DistantPose | None:
+    """Returns the pose in some times that is farthest from a point (m).
 
     Poses are looked up around the places of the track that are farthest away.
     """
     x, y = point
     times, at_x, at_y = _along(track, spans)
     off_m = np.hypot(at_x - x, at_y - y)
-    farthest: tuple[float, Ns, tuple[float, float]] | None = None
+    farthest: _DistantPose | None = None
     for nth in np.argsort(-off_m, kind="stable")[:_MOST_TRIED].tolist():
-        if farthest is not None and off_m[nth] <= farthest[0] - _OFF_TRACK_M:
+        if farthest is not None and off_m[nth] <= farthest.away_m - _OFF_TRACK_M:
             break
         at = int(times[nth])
         first, last = next((first, last) for first, last in spans if first <= at <= last)
@@ -263,8 +271,8 @@ def _farthest_pose(
         for time, pose_x, pose_y in rows:
             away_m = math.hypot(pose_x - x, pose_y - y)
             is_near = away_m <= off_m[nth] + _OFF_TRACK_M  # else the robot jumped there, and back
-            if is_near and (farthest is None or away_m > farthest[0]):
-                farthest = away_m, time, (pose_x, pose_y)
+            if is_near and (farthest is None or away_m > farthest.away_m):
+                farthest = _DistantPose(away_m, time, pose_x, pose_y)
     return farthest
 
 

@@ -59,7 +59,7 @@ def farthest_apart(
     other: tuple[RobotTrack, TimeWindow],
     region: Region | None = None,
 ) -> tuple[FarFromOther | None, FarFromOther | None]:
-    """Returns the point of each path that is farthest from the other one; in no named place.
+    """Returns the point of each path that is farthest from the other one, without named places.
 
     Only the part of each path in its window counts, and in the region, if one is given.
     None where it has no point, or the other way has none at all.
@@ -177,7 +177,7 @@ def _is_known(track: RobotTrack, at: Ints) -> Flags:
 def stood_at(
     this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
 ) -> list[StandstillPlace]:
-    """Returns the places where the robot stood in two windows, and how long in each; in no named.
+    """Returns where the robot stood in two windows, and how long in each, without named places.
 
     A place is where it stood longest within `SAME_STAND_M`.
     """

@@ -170,7 +170,6 @@ class _Loader:
     Args:
         view: has the bags.
         min_score: detections with a lower score do not count.
-
         ahead: what is dated later is left out: a clock was wrong, unless that is asked for.
         until: likewise, of an estimate of a time before.
     """

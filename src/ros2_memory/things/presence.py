@@ -282,9 +282,16 @@ class Evidence(NamedTuple):
         looks, blind = (
             slice(*np.searchsorted(keys, ends).tolist()) for keys in (self.looks, self.blind)
         )
-        of_looks = (_number(self.looks[looks]), self.cell[looks], self.n[looks], self.hits[looks])
-        columns = map(narrowed, (*of_looks, _number(self.blind[blind]), self.times[blind]))
-        return Evidence._make((*columns, self.sees[looks].copy(), self.fair[looks].copy()))
+        return Evidence(
+            narrowed(_number(self.looks[looks])),
+            narrowed(self.cell[looks]),
+            narrowed(self.n[looks]),
+            narrowed(self.hits[looks]),
+            narrowed(_number(self.blind[blind])),
+            narrowed(self.times[blind]),
+            self.sees[looks].copy(),
+            self.fair[looks].copy(),
+        )
 
 
 class Looks(NamedTuple):
