@@ -179,10 +179,9 @@ class Sessions:
         any.
         """
         folder = self.folder(recording)
-        key = (folder, at // _AROUND_NS)
-        if key not in self._lending:
-            self._lending[key] = self._with_lender(self._session_of(folder), at)
-        return self._lending[key]
+        if (folder, at) not in self._lending:
+            self._lending[folder, at] = self._with_lender(self._session_of(folder), at)
+        return self._lending[folder, at]
 
     def recorded_at(self, moment: Ns) -> list[Session] | None:
         """Returns the sessions whose transforms hold at a moment; None if none was recorded."""

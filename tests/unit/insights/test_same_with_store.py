@@ -80,6 +80,8 @@ QUESTIONS: Final[list[tuple[str, dict[str, Any]]]] = [
 @example(kind="things", seed=2, part=0.5, split_s=3.0, questions=THINGS)
 # A score of 0.73605, which a column has to some digits.
 @example(kind="things", seed=255582709, part=0.3, split_s=3.0, questions=[("recap", {})] * 6)
+# Of one recording's poses 2 s apart, the transforms of another place the later alone.
+@example(kind="odd", seed=101, part=0.3, split_s=3.0, questions=[THINGS[-1], THINGS[-2]] * 3)
 def test_every_question_is_answered_as_without_a_store(
     kind: Literal["odd", "moving map", "things"],
     seed: int,
