@@ -3,8 +3,7 @@
 A few drawn robots are shipped. Of their rows those of many robots are made: each lacks a tenth of
 the bags, drawn for it, and its places and metres have noise of its own. The server is started over
 these alone. Once it has stored all columns, it is asked by a real client: each question first and
-again, then by several clients. At last `ros2-memory sql` answers the statements of
-docs/how-to/lake.md.
+again, then by several clients. Another server is asked the statements of docs/how-to/lake.md.
 """
 
 from __future__ import annotations
@@ -72,11 +71,8 @@ def main() -> None:
         shutil.rmtree(folder, ignore_errors=True)
         bags = _make(folder, rows, robots, seed)
         facts = [json.loads((each / "world.json").read_bytes()) for each in folders]
-        asyncio.run(_measured(folder, questions(facts), (robots, bags), given))
-        for select in re.findall(r"```sql\n(.*?);\n```", _PAGE.read_text("utf-8"), re.DOTALL):
-            ran = timing.selected(folder, select)
-            table = re.findall(r"FROM (\w+)", select)[-1]
-            print(f"  sql from {table}: {ran.seconds:.2f} s, {ran.peak_mb:.0f} MB")
+        for asks in (questions(facts), statements()):
+            asyncio.run(_measured(folder, asks, (robots, bags), given))
 
 
 def _shipped(world: Path, bags: int, folder: Path) -> Tables:
@@ -166,6 +162,16 @@ def questions(facts: Sequence[Mapping[str, JsonValue]]) -> Asks:
     }
 
 
+def statements() -> Asks:
+    """Returns the statements of the page about lakes, by their tables, as `questions`."""
+    page = re.findall(r"```sql\n(.*?);\n```", _PAGE.read_text("utf-8"), re.DOTALL)
+    tables = [re.findall(r"FROM (\w+)", select)[-1] for select in page]
+    return {
+        f"select from {table}": ("query_lake", {"select": select})
+        for table, select in zip(tables, page, strict=True)
+    }
+
+
 class _Heard(NamedTuple):
     """What a client got: after how long (s), and which robots are missing in it, and why."""
 
@@ -178,7 +184,7 @@ async def _measured(
 ) -> None:
     """Prints what a server takes over a lake of so many robots and bags."""
     nowhere = folder / "robots" / "r000"
-    nowhere.mkdir(parents=True)
+    nowhere.mkdir(parents=True, exist_ok=True)
     os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
     overrides = [
         "deployment=fleet",

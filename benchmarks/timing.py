@@ -132,11 +132,6 @@ def shipped(place: Path) -> Ran:
     return done
 
 
-def selected(place: Path, select: str) -> Ran:
-    """Answers a select over a lake, in a process of its own."""
-    return _command(place, "sql", "--json", select, f"lake.warehouse='{place / 'lake'}'")
-
-
 def _command(place: Path, *words: str) -> Ran:
     program = [sys.executable, "-m", "ros2_memory.cli", *words]
     environment = os.environ | {"XDG_CACHE_HOME": str(place / "store"), "TZ": "UTC"}

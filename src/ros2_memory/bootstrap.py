@@ -709,9 +709,12 @@ def build_dispatcher(
         writing=server.write_tools and not isinstance(settings.recorder, NullRecorderNode),
     )
     if fleet is not None:
+        from ros2_memory.fleet.select import select_tools
         from ros2_memory.fleet.tools import fleet_tools
 
         tools = fleet_tools(tools, fleet, server.max_reply_chars)
+        if server.tools == "all":
+            tools = (*tools, *select_tools(fleet, server.max_reply_chars))
     return Dispatcher(
         memory,
         tools,

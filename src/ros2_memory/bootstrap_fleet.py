@@ -138,7 +138,8 @@ def build_fleet(settings: Settings) -> Fleet | None:
     lake = None if engine is None else open_lake(settings, engine)
     robots = [_build_robot(settings, name, shared, lake) for name in settings.fleet.robots]
     join = None if lake is None else partial(_robots_of, lake, settings, shared)
-    fleet = Fleet(robots, WallClock(), shared_map=settings.fleet.shared_map, join=join)
+    shared_map = settings.fleet.shared_map
+    fleet = Fleet(robots, WallClock(), shared_map=shared_map, join=join, tables=lake)
     fleet.add_shipped()
     if lake is not None and not lake.days("bags"):
         log.warning(

@@ -1,9 +1,7 @@
 """`ros2-memory sql`: a select over the tables of a lake."""
 
 import csv
-import json
 import sys
-from decimal import Decimal
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
@@ -30,8 +28,8 @@ def sql(
 ) -> None:
     """Answer a SELECT over the tables of a lake, as they are now.
 
-    DuckDB answers it in this process, within lake.engine.memory_mb, and reads the files of the
-    tables that it names. docs/reference/lake.md has their columns. Needs lake.warehouse, and
+    DuckDB answers it in a process of its own, within lake.engine.memory_mb, and reads the files of
+    the tables that it names. docs/reference/lake.md has their columns. Needs lake.warehouse, and
     ros2-memory[lake].
     """
     if as_csv and as_json:
@@ -40,22 +38,14 @@ def sql(
     lake = open_lake(settings, cast("DuckdbNode", settings.lake.engine))
     if not lake.days("bags"):
         raise InvalidArgumentsError(f"{settings.lake.warehouse}: there is no lake, or no bag in it")
-    rows = lake.query(select)
+    found = lake.query(select)
     if as_csv:
         writer = csv.writer(sys.stdout, lineterminator="\n")
-        writer.writerow(rows.column_names)
-        writer.writerows(zip(*rows.to_pydict().values(), strict=True))
+        writer.writerow(found.columns)
+        writer.writerows(found.rows)
         return
-    text = json.dumps(rows.to_pylist(maps_as_pydicts="lossy"), default=_as_json)
-    answer: JsonValue = json.loads(text)
+    answer: list[JsonValue] = [dict(zip(found.columns, row, strict=True)) for row in found.rows]
     if as_json:
         print_line(to_json_text(answer))
     else:
         print_reply(answer)
-
-
-def _as_json(value: object) -> float | str:
-    """Returns a value of SQL that JSON has not: a decimal, bytes in hexadecimal, a time."""
-    if isinstance(value, Decimal):
-        return float(value)
-    return value.hex() if isinstance(value, bytes) else str(value)

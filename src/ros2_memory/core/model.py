@@ -275,3 +275,18 @@ class StampedTransform:
     log_time: Ns
     transform: Transform
     static: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Selected:
+    """The rows that a statement of SQL found.
+
+    Attributes:
+        columns: their names.
+        rows: each a list of values as JSON; times, which it has not, are texts.
+        is_cut: whether there are more rows.
+    """
+
+    columns: list[str]
+    rows: list[list[JsonValue]]
+    is_cut: bool = False

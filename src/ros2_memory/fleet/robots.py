@@ -8,7 +8,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
 from ros2_memory.core.errors import (
     BusyError,
@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
     RefusedError,
 )
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import Selected, TimeWindow
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
 from ros2_memory.history.context import Call, Memory, Stages
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.timebase import Deadline
 
 T = TypeVar("T")
 
@@ -199,6 +200,27 @@ def _ask_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tup
         raise NoDataError(error.reason, detail, error.notes) from error
 
 
+class LakeTables(Protocol):
+    """The tables of a lake, over which a statement is answered; see `lake.engine.Lake`."""
+
+    def columns(self) -> Mapping[str, Collection[str]]:
+        """Returns the columns of each table."""
+
+    def shipped_until(self, robots: Collection[str] | None) -> Mapping[str, Ns]:
+        """Returns the log time of the newest message that is there, of each robot, or of some."""
+
+    def query(
+        self,
+        sql: str,
+        robots: Collection[str] | None,
+        *,
+        most_rows: int | None,
+        most_chars: int | None,
+        deadline: Deadline | None,
+    ) -> Selected:
+        """Returns the rows of a SELECT."""
+
+
 class Fleet:
     """The robots that one server answers for.
 
@@ -208,6 +230,7 @@ class Fleet:
         shared_map: whether coordinates mean the same place for all of them.
         join: returns the robots that a lake has besides those of some names, where there is one.
             It looks there, unless it did so a moment ago.
+        tables: those of the lake, where there is one.
 
     Attributes:
         robots: all of them, by their names.
@@ -220,9 +243,11 @@ class Fleet:
         *,
         shared_map: bool = False,
         join: Callable[[Collection[str]], Iterable[Robot]] | None = None,
+        tables: LakeTables | None = None,
     ) -> None:
         self.robots: Mapping[str, Robot] = {robot.name: robot for robot in robots}
         self.clock, self.shared_map, self.join = clock, shared_map, join
+        self.tables = tables
         self._lock = threading.Lock()
 
     def add_shipped(self) -> Sequence[Robot]:
@@ -260,6 +285,16 @@ class Fleet:
             if robot.name == name:
                 return robot
         raise InvalidArgumentsError(f"there is no robot {abbreviate(name)}; {there_are(allowed)}")
+
+    def chosen(self, named: object, call: Call) -> list[Robot]:
+        """Returns the robot of a name, several (a, b), or where it is None all that are allowed.
+
+        Raises as `named`.
+        """
+        if named is None:
+            return self.allowed(call)
+        names = named.split(",") if isinstance(named, str) else [named]
+        return [*dict.fromkeys([self.named(name, call) for name in names])]
 
 
 def there_are(robots: Iterable[Robot]) -> str:

@@ -192,14 +192,11 @@ class _FleetQuestion:
         Raises:
             EpisodicError: there is none.
         """
-        names = named.split(",") if isinstance(named, str) else [named]
-        robots = self.fleet.allowed(call)
-        if named is not None:
-            robots = [*dict.fromkeys([self.fleet.named(name, call) for name in names])]
+        robots = self.fleet.chosen(named, call)
         tool, given = self.tool.name, self.given
         is_table = tool in TABLE_FOR_ALL and given.get("by") is not None
         is_of_all = (tool in ANSWER_FOR_ALL or is_table) and given.get("between") is None
-        if is_of_all and (named is None or len(names) > 1):
+        if is_of_all and (named is None or "," in str(named)):
             return self._of_all(robots, call)
         if len(robots) == 1:
             return self._of_one(robots[0], call)

@@ -7,6 +7,7 @@ catalogue itself. It loads no extension.
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections import defaultdict
@@ -16,33 +17,29 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import duckdb
 import pyarrow as pa
-import pyarrow.dataset as ds
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
 
-from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
+from ros2_memory.core.errors import BusyError, RefusedError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.lake.select import SETTINGS, Select, TableFiles
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.lake.warehouse import Partitions
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
+    from ros2_memory.core.model import Selected
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.warehouse import Days, LakeFile
 
-_SETTINGS: Final = {
-    "autoinstall_known_extensions": "false",
-    "autoload_known_extensions": "false",
-    "python_enable_replacements": "false",
-}
-_LOCAL: Final = (
-    " UNION ALL BY NAME"
-    " SELECT * FROM read_parquet([{}], union_by_name = true, hive_partitioning = false)"
-)
+_AT_ONCE: Final = 2
+"""Statements that are answered at once: each may take `memory_mb`."""
 _MESSAGE_BYTES: Final = 16 << 20
 _CHANNEL_BYTES: Final = 8 << 20
 
@@ -73,16 +70,19 @@ class Lake:
         memory_mb: int = 1024,
         threads: int | None = None,
     ) -> None:
-        settings = {**_SETTINGS, "memory_limit": f"{memory_mb}MiB"}
+        settings = {**SETTINGS, "memory_limit": f"{memory_mb}MiB"}
         if threads:
             settings["threads"] = str(threads)
         self._database = duckdb.connect(config={**settings})
+        self._memory_mb, self._threads = memory_mb, threads
+        self._turns = threading.BoundedSemaphore(_AT_ONCE)
         self._catalog, self._translated = catalog, translated
         self.messages = ByteLru[bytes](_MESSAGE_BYTES)
         self.channels = ByteLru[object](_CHANNEL_BYTES)
         self._lock = threading.Lock()
         self._looked_at = -math.inf
         self._tables: dict[str, IcebergTable] = {}
+        self._columns: dict[str, Mapping[str, str]] = {}
         self._partitions: defaultdict[str, Partitions] = defaultdict(Partitions)
 
     def close(self) -> None:
@@ -126,50 +126,83 @@ class Lake:
         """
         # A cursor of its own, which alone knows the table.
         with _reported(), self._database.cursor() as cursor:
-            rows = self._rows_of(name, files, cursor)
+            rows = self._files_of(name, files).rows(name, cursor)
             bound = {**(parameters or {})}
             return cursor.sql(f"WITH {name} AS ({rows}) {sql}", params=bound).to_arrow_table()
 
-    def query(self, sql: str) -> pa.Table:
-        """Returns the rows of a select over the tables as they are now, each by its name.
+    def query(
+        self,
+        sql: str,
+        robots: Collection[str] | None = None,
+        *,
+        most_rows: int | None = None,
+        most_chars: int | None = None,
+        deadline: Deadline | None = None,
+    ) -> Selected:
+        """Returns the rows of a SELECT, which anybody may have written, over the tables as of now.
+
+        Those of all robots, or of some. `select.Select` has the limits.
 
         Raises:
-            InvalidArgumentsError: DuckDB refuses it; the sentence has its reason.
+            BusyError: its time was over before others were answered.
+            InvalidArgumentsError: it is no SELECT over the tables; the sentence has the reason.
+            QueryTimeoutError: its time was over.
+            RefusedError: the lake cannot be read, or it needs more memory.
+        """
+        deadline = deadline or Deadline.never()
+        self.refresh()
+        tables = {
+            name: self._files_of(name, self._files_for(robots, name) if is_named else ())
+            for name in TABLES
+            for is_named in [re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
+        }
+        select = Select(sql, self._memory_mb, self._threads, most_rows, most_chars)
+        if not self._turns.acquire(timeout=min(deadline.left_s(), threading.TIMEOUT_MAX)):
+            raise BusyError("other statements were not answered in time; ask again, or fewer")
+        try:
+            return select.run(tables, deadline)
+        finally:
+            self._turns.release()
+
+    def columns(self) -> Mapping[str, Collection[str]]:
+        """Returns the columns of each table."""
+        return {name: table.columns.keys() for name, table in TABLES.items()}
+
+    def shipped_until(self, robots: Collection[str] | None = None) -> Mapping[str, Ns]:
+        """Returns the log time of the newest message that is there, of each robot, or of some.
+
+        Raises:
             RefusedError: the lake cannot be read.
         """
-        self.refresh()
-        with _reported(), self._database.cursor() as cursor:
-            try:
-                for name in TABLES.keys() & cursor.get_table_names(sql):
-                    files = chain.from_iterable(days.values() for days in self.days(name).values())
-                    rows = self._rows_of(name, chain.from_iterable(files), cursor)
-                    cursor.execute(f"CREATE TEMP VIEW {name} AS {rows}")
-                return cursor.sql(sql).to_arrow_table()
-            except (duckdb.ProgrammingError, duckdb.DataError) as error:
-                tables = f"the tables are {', '.join(TABLES)}"
-                raise InvalidArgumentsError(f"{error}; {tables}") from error
+        sql = "SELECT robot, max(end_ns) AS newest FROM bags GROUP BY robot ORDER BY robot"
+        rows = self.select(sql, "bags", self._files_for(robots, "bags")).to_pylist()
+        return {row["robot"]: row["newest"] for row in rows}
 
-    def _rows_of(
-        self, name: str, files: Iterable[LakeFile], cursor: duckdb.DuckDBPyConnection
-    ) -> str:
-        """Returns the select of all rows in some files of a table, for one cursor."""
+    def _files_for(self, robots: Collection[str] | None, name: str) -> Iterator[LakeFile]:
+        """Yields the files of a table that have rows of some robots; None: of any."""
+        for robot, days in self.days(name).items():
+            if robots is None or robot in robots:
+                yield from chain.from_iterable(days.values())
+
+    def _files_of(self, name: str, files: Iterable[LakeFile]) -> TableFiles:
+        """Returns some files of a table."""
+        places = [PyArrowFileIO.parse_location(file.location) for file in files]
+        paths = [path for *_, path in places]
+        if {scheme for scheme, *_ in places} <= {"file"}:
+            return TableFiles(self._columns_of(name), paths)
         with self._looking():
             table = self._loaded_table(name)
         properties = {} if table is None else dict(table.io.properties)
-        places = [PyArrowFileIO.parse_location(file.location) for file in files]
-        paths = [path for *_, path in places]
-        rows: pa.Table | ds.Dataset = TABLES[name].arrow_schema.empty_table()
-        local = ""
-        if not {scheme for scheme, *_ in places} <= {"file"}:
-            store = PyArrowFileIO(properties).fs_by_scheme(*places[0][:2])
-            rows = ds.dataset(paths, rows.schema, format="parquet", filesystem=store)
-        elif paths:
-            # DuckDB reads local files itself, within its limits.
-            local = _LOCAL.format(
-                ", ".join("'{}'".format(path.replace("'", "''")) for path in paths)
-            )
-        cursor.register(f"{name}_in_store", rows)
-        return f"SELECT * FROM {name}_in_store{local}"  # noqa: S608 - texts of ours
+        return TableFiles(self._columns_of(name), paths, (*places[0][:2], properties))
+
+    def _columns_of(self, name: str) -> Mapping[str, str]:
+        """Returns the type that DuckDB has for each column of a table."""
+        if name not in self._columns:
+            with self._database.cursor() as cursor:
+                cursor.register("rows", TABLES[name].arrow_schema.empty_table())
+                described = cursor.execute("DESCRIBE rows").fetchall()
+            self._columns[name] = {column: kind for column, kind, *_ in described}
+        return self._columns[name]
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

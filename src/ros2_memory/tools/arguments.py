@@ -632,6 +632,24 @@ class MomentArguments(Arguments):
     name: Annotated[_Name, Field(alias="moment")]
 
 
+class SelectArguments(Arguments):
+    """A statement over the tables of a lake, and the robots that it is about."""
+
+    select: Annotated[
+        str,
+        Field(
+            strict=True,
+            max_length=20_000,
+            description="One SELECT.",
+            examples=["SELECT robot, sum(distance_m) FROM bags GROUP BY robot"],
+        ),
+    ]
+    robot: Annotated[
+        str | None, Field(strict=True, description="Its name, or several (a, b); without it, all.")
+    ] = None
+    limit: Annotated[int, Field(strict=True, ge=1, le=1000, description="Rows.")] = 100
+
+
 class VisitsArguments(Arguments):
     """A place in the plane."""
 
