@@ -137,7 +137,7 @@ class Select:
             RefusedError: a file cannot be read, or it needs more memory.
         """
         request = json.dumps({"select": asdict(self), "tables": _as_dicts(tables)})
-        command = [sys.executable, "-m", __name__]
+        command = [sys.executable, "-P", "-m", __name__]
         process = subprocess.Popen(  # noqa: S603 - this program
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -158,9 +158,10 @@ class Select:
             finally:
                 process.kill()
         if process.returncode:
-            # Code of C that gets no memory aborts.
             log.warning("lake_select_failed", reason=f"exit code {process.returncode}")
-            raise RefusedError(_too_much(self.memory_mb))
+            # Code of C that gets no memory is ended by a signal.
+            is_killed = process.returncode < 0
+            raise RefusedError(_too_much(self.memory_mb) if is_killed else f"it failed; {_LOGGED}")
         answer = json.loads(text)
         if "error" not in answer:
             return Selected(**answer)
@@ -183,31 +184,42 @@ class Select:
                 connection.execute("SET enable_external_access = false")
                 connection.execute("SET lock_configuration = true")
                 return self._taken(connection.sql(self.sql))
-            except (duckdb.OutOfMemoryException, MemoryError) as error:
-                raise RefusedError(_too_much(self.memory_mb)) from error
-            except duckdb.Error as error:
-                is_asked = isinstance(error, duckdb.ProgrammingError | duckdb.DataError)
-                if is_asked and not any(path in str(error) for path in paths):
-                    # What follows is advice on DuckDB.
-                    reason, *_ = str(error).split("\n\n")
-                    raise InvalidArgumentsError(f"{reason}; {_there_are(tables)}") from error
-                kind = type(error).__name__
-                raise RefusedError(f"the lake cannot be read ({kind}); {_LOGGED}") from error
+            except (duckdb.Error, MemoryError, OverflowError, TypeError, ValueError) as error:
+                raise self._explained(error, tables) from error
+
+    def _explained(self, error: Exception, tables: Mapping[str, TableFiles]) -> EpisodicError:
+        """Returns what to say of an error: what was asked is wrong, or it cannot be answered."""
+        if isinstance(error, duckdb.OutOfMemoryException | MemoryError):
+            return RefusedError(_too_much(self.memory_mb))
+        is_engines = isinstance(error, duckdb.Error)
+        is_asked = not is_engines or isinstance(error, duckdb.ProgrammingError | duckdb.DataError)
+        if not is_asked or any(path in str(error) for of in tables.values() for path in of.paths):
+            return RefusedError(f"the lake cannot be read ({type(error).__name__}); {_LOGGED}")
+        # What follows is advice on DuckDB.
+        reason, *_ = str(error).split("\n\n")
+        if not is_engines:
+            return InvalidArgumentsError(f"a value has no JSON ({reason}): cast it to VARCHAR")
+        return InvalidArgumentsError(f"{reason}; {_there_are(tables)}")
 
     def _taken(self, found: duckdb.DuckDBPyRelation) -> Selected:
         """Returns the rows that there is room for."""
         reader = found.to_arrow_reader(_BATCH_ROWS)
         rows: list[list[JsonValue]] = []
         chars = 0
-        batches = (batch.to_pylist(maps_as_pydicts="lossy") for batch in reader)
-        for row in chain.from_iterable(batches):
-            text = json.dumps([*row.values()], default=_as_json)
+        # By position: two columns may have one name.
+        for row in chain.from_iterable(map(_rows_in, reader)):
+            text = json.dumps(row, default=_as_json)
             chars += len(text) + 1
             is_over = self.most_chars is not None and chars > self.most_chars
             if is_over or len(rows) == self.most_rows:
                 return Selected(reader.schema.names, rows, is_cut=True)
             rows.append(json.loads(text))
         return Selected(reader.schema.names, rows)
+
+
+def _rows_in(batch: pa.RecordBatch) -> Iterator[tuple[object, ...]]:
+    columns = (column.to_pylist(maps_as_pydicts="lossy") for column in batch.columns)
+    return zip(*columns, strict=True)
 
 
 def check_select(sql: str, tables: Collection[str], connection: duckdb.DuckDBPyConnection) -> None:

@@ -103,6 +103,11 @@ def test_values_that_json_has_not_are_texts_and_longer_texts_are_marked(fleet: F
     values = [1.5, None, "2026-11-28", "6162", {"k": 2}, [1, None], "go to the kitchen now"]
     assert answer["rows"] == [values]
     assert answer["quoted"] == ["rows.text"]
+    twice = asked(fleet, "SELECT 1 AS n, 2 AS n")
+    assert (twice["fields"], twice["rows"]) == (["n", "n"], [[1, 2]])
+    late = asked(fleet, "SELECT DATE '5877641-06-23'")
+    assert late["error"] == "invalid_arguments"
+    assert "cast it to VARCHAR" in late["detail"]
 
 
 def test_files_in_a_store_are_read_as_those_of_this_machine(folder: Path) -> None:
