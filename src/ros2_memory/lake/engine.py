@@ -151,11 +151,11 @@ class Lake:
         """
         deadline = deadline or Deadline.never()
         self.refresh()
-        tables = {
-            name: self._files_of(name, self._files_for(robots, name) if is_named else ())
-            for name in TABLES
-            for is_named in [re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
-        }
+        tables: dict[str, TableFiles] = {}
+        for name in TABLES:
+            is_named = re.search(rf"\b{name}\b", sql, re.IGNORECASE)
+            files = self._files_for(robots, name) if is_named else ()
+            tables[name] = self._files_of(name, files, by_arrow=True)
         select = Select(sql, self._memory_mb, self._threads, most_rows, most_chars)
         if not self._turns.acquire(timeout=min(deadline.left_s(), threading.TIMEOUT_MAX)):
             raise BusyError("other statements were not answered in time; ask again, or fewer")
@@ -184,12 +184,17 @@ class Lake:
             if robots is None or robot in robots:
                 yield from chain.from_iterable(days.values())
 
-    def _files_of(self, name: str, files: Iterable[LakeFile]) -> TableFiles:
-        """Returns some files of a table."""
+    def _files_of(
+        self, name: str, files: Iterable[LakeFile], *, by_arrow: bool = False
+    ) -> TableFiles:
+        """Returns some files of a table. DuckDB reads local ones itself, within its limits.
+
+        `by_arrow`: Arrow reads them, so that DuckDB needs to open none.
+        """
         places = [PyArrowFileIO.parse_location(file.location) for file in files]
         paths = [path for *_, path in places]
         if {scheme for scheme, *_ in places} <= {"file"}:
-            return TableFiles(self._columns_of(name), paths)
+            return TableFiles(self._columns_of(name), paths, ("file", "", {}) if by_arrow else None)
         with self._looking():
             table = self._loaded_table(name)
         properties = {} if table is None else dict(table.io.properties)

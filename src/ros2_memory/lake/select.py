@@ -2,17 +2,19 @@
 
 The statement may be anybody's. Inside of a server `repeat('x', 1e9)` would take memory that DuckDB
 does not count, and not end when it is interrupted. This process has a limit of its address space,
-no disk to spill to, and ends when its time is up. It may open the files that it is given, and no
-others; whoever asks may read all of these.
+no disk to write to, and ends when its time is up. DuckDB may open no file there: Arrow reads those
+that the process is given, all of which whoever asks may read.
 
-What a statement names is taken from its parse tree: tables of the lake, its own common table
-expressions, and functions that make rows of numbers or lists.
+What a statement does is taken from its parse tree: it reads tables of the lake, its own common
+table expressions, and functions that make rows of numbers or lists.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import resource
+import signal
 import subprocess
 import sys
 from dataclasses import asdict, dataclass
@@ -30,7 +32,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import Selected
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import abbreviate, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -49,18 +51,43 @@ SETTINGS: Final = {
 """DuckDB loads no extension, and takes no variable of Python for a table."""
 _PROGRAM_MB: Final = 1024
 """Address space that Python, Arrow and the stacks of threads take beside DuckDB's memory."""
+_ALLOCATORS: Final = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2"}
+"""By default those of Arrow and of C reserve 2 GB of addresses for its threads."""
 _LOOKED_AGAIN_S: Final = 0.1
+_LONGEST_S: Final = 86_400.0
+"""How long a statement may take for which nobody set a time."""
 _BATCH_ROWS: Final = 256
+_VIEWS_OF_ENGINE: Final = (
+    "SELECT view_name FROM duckdb_views() WHERE internal AND schema_name <> 'information_schema'"
+)
+"""Views that a name without a schema finds."""
+_MOST_REASON_CHARS: Final = 500
 _TABLE_FUNCTIONS: Final = frozenset({"unnest", "range", "generate_series"})
-_OTHERS: Final = frozenset({"PIVOT", "COLUMN_DATA", "DELIM_GET", "BOUND_TABLE_REF"})
-"""Kinds of nodes that name what else there is."""
-_OF_THE_ENGINE: Final = ("current_setting", "pg_")
-"""Functions that begin so tell of this process, not of the lake."""
+_OF_THE_ENGINE: Final = (
+    *("current_setting", "getvariable", "pg_", "duckdb_", "has_", "in_search_path"),
+    *("json_serialize", "json_deserialize", "json_execute", "nextval", "currval", "setval"),
+    *("sleep_ms", "write_log", "txid_", "current_query", "current_transaction", "current_conn"),
+)
+"""Functions that begin so are about this process, not about the lake."""
+_NODES: Final = frozenset(
+    {
+        *("SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE", "SHOW_REF"),
+        *("BASE_TABLE", "TABLE_FUNCTION", "SUBQUERY", "JOIN", "EXPRESSION_LIST", "EMPTY"),
+        *("ORDER_MODIFIER", "LIMIT_MODIFIER", "LIMIT_PERCENT_MODIFIER", "DISTINCT_MODIFIER"),
+        *("ORDER_DEFAULT", "ASCENDING", "DESCENDING"),
+    }
+)
+"""Kinds of nodes, besides expressions, that a SELECT has: others write, or read something else."""
 
 _ERRORS: Final[Mapping[str, type[EpisodicError]]] = {
     error.code: error for error in (InvalidArgumentsError, RefusedError)
 }
 _LOGGED: Final = "the server's log has the reason"
+
+_OF_TEXT: Final = (duckdb.ParserException, duckdb.BinderException, duckdb.CatalogException)
+"""Errors about the text of a statement; others may be about a value."""
+_OF_VALUES: Final = (OverflowError, RecursionError, TypeError, ValueError)
+"""Errors about values that Python or JSON has not."""
 
 Node: TypeAlias = "dict[str, JsonValue]"
 """A node of a parse tree."""
@@ -75,7 +102,8 @@ class TableFiles:
     Attributes:
         columns: the type that DuckDB has for each; a file that lacks one has nulls there.
         paths: of the files.
-        store: where they are unless on this machine: scheme, host, and settings of the store.
+        store: by what Arrow reads them (scheme, host, and settings of the store); DuckDB itself
+            where it is None.
     """
 
     columns: Mapping[str, str]
@@ -89,24 +117,26 @@ class TableFiles:
         if not self.paths:
             return select
         if self.store is None:
-            # DuckDB reads local files itself, within its limits.
             quoted = ", ".join("'{}'".format(path.replace("'", "''")) for path in self.paths)
             of_files = f"read_parquet([{quoted}], union_by_name = true, hive_partitioning = false)"
         else:
-            of_files = f"{name}_in_store"
+            of_files = f"{name}_by_arrow"
             schema = connection.sql(select).to_arrow_table().schema
-            connection.register(of_files, _in_store(self.paths, schema, *self.store))
+            connection.register(of_files, _dataset(self.paths, schema, *self.store))
         return f"{select} UNION ALL BY NAME SELECT * FROM {of_files}"  # noqa: S608 - texts of ours
 
 
-def _in_store(
+def _dataset(
     paths: Sequence[str], schema: pa.Schema, scheme: str, host: str, properties: Mapping[str, str]
 ) -> ds.Dataset:
-    # A second to import, which a lake on this machine does not need.
-    from pyarrow import dataset  # noqa: PLC0415
-    from pyiceberg.io.pyarrow import PyArrowFileIO  # noqa: PLC0415
+    # A server with a lake has imported all of this; this process mostly needs half of it.
+    from pyarrow import dataset, fs  # noqa: PLC0415
 
-    store = PyArrowFileIO({**properties}).fs_by_scheme(scheme, host)
+    store = fs.LocalFileSystem()
+    if scheme != "file":
+        from pyiceberg.io.pyarrow import PyArrowFileIO  # noqa: PLC0415
+
+        store = PyArrowFileIO({**properties}).fs_by_scheme(scheme, host)
     return dataset.dataset([*paths], schema, format="parquet", filesystem=store)
 
 
@@ -136,10 +166,16 @@ class Select:
             QueryTimeoutError: its time was over.
             RefusedError: a file cannot be read, or it needs more memory.
         """
-        request = json.dumps({"select": asdict(self), "tables": _as_dicts(tables)})
+        left_s = min(deadline.left_s(), _LONGEST_S)
+        parts = {"select": asdict(self), "tables": _as_dicts(tables), "left_s": left_s}
+        request = json.dumps(parts)
         command = [sys.executable, "-P", "-m", __name__]
         process = subprocess.Popen(  # noqa: S603 - this program
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **_ALLOCATORS},
         )
         given: str | None = request
         with process:
@@ -174,38 +210,40 @@ class Select:
         settings = {**SETTINGS, "memory_limit": f"{self.memory_mb}MiB", "temp_directory": ""}
         if self.threads:
             settings["threads"] = str(self.threads)
-        paths = [path for files in tables.values() if not files.store for path in files.paths]
         with duckdb.connect(config={**settings}) as connection:
             try:
                 check_select(self.sql, tables, connection)
                 for name, files in tables.items():
                     connection.execute(f"CREATE TEMP VIEW {name} AS {files.rows(name, connection)}")
-                connection.execute(f"SET allowed_paths = {paths}")
                 connection.execute("SET enable_external_access = false")
                 connection.execute("SET lock_configuration = true")
                 return self._taken(connection.sql(self.sql))
-            except (duckdb.Error, MemoryError, OverflowError, TypeError, ValueError) as error:
+            except (duckdb.Error, OSError, *_OF_VALUES, MemoryError) as error:
                 raise self._explained(error, tables) from error
 
     def _explained(self, error: Exception, tables: Mapping[str, TableFiles]) -> EpisodicError:
         """Returns what to say of an error: what was asked is wrong, or it cannot be answered."""
         if isinstance(error, duckdb.OutOfMemoryException | MemoryError):
             return RefusedError(_too_much(self.memory_mb))
-        is_engines = isinstance(error, duckdb.Error)
-        is_asked = not is_engines or isinstance(error, duckdb.ProgrammingError | duckdb.DataError)
-        if not is_asked or any(path in str(error) for of in tables.values() for path in of.paths):
+        paths = (path for files in tables.values() for path in files.paths)
+        is_asked = isinstance(error, (duckdb.ProgrammingError, duckdb.DataError, *_OF_VALUES))
+        if not is_asked or any(path in str(error) for path in paths):
             return RefusedError(f"the lake cannot be read ({type(error).__name__}); {_LOGGED}")
-        # What follows is advice on DuckDB.
-        reason, *_ = str(error).split("\n\n")
-        if not is_engines:
-            return InvalidArgumentsError(f"a value has no JSON ({reason}): cast it to VARCHAR")
-        return InvalidArgumentsError(f"{reason}; {_there_are(tables)}")
+        if isinstance(error, _OF_TEXT):
+            # What follows is advice on DuckDB.
+            reason, *_ = str(error).split("\n\n")
+            return InvalidArgumentsError(f"{_short(reason)}; {_there_are(tables)}")
+        # The sentence may repeat a recorded text.
+        do = "cast it to VARCHAR, use TRY_CAST, or leave its row out"
+        return InvalidArgumentsError(f"a value cannot be converted ({type(error).__name__}): {do}")
 
     def _taken(self, found: duckdb.DuckDBPyRelation) -> Selected:
         """Returns the rows that there is room for."""
         reader = found.to_arrow_reader(_BATCH_ROWS)
         rows: list[list[JsonValue]] = []
-        chars = 0
+        chars = sum(map(len, reader.schema.names))
+        if self.most_chars is not None and chars > self.most_chars:
+            raise InvalidArgumentsError("the names of the columns are longer than a reply may be")
         # By position: two columns may have one name.
         for row in chain.from_iterable(map(_rows_in, reader)):
             text = json.dumps(row, default=_as_json)
@@ -231,12 +269,12 @@ def check_select(sql: str, tables: Collection[str], connection: duckdb.DuckDBPyC
     parsed = connection.execute("SELECT json_serialize_sql(?)", [sql]).fetchone()
     tree = json.loads(parsed[0]) if parsed else {}
     if tree.get("error"):
-        raise InvalidArgumentsError(f"{tree['error_message']}; {_there_are(tables)}")
+        raise InvalidArgumentsError(f"{_short(tree['error_message'])}; {_there_are(tables)}")
     if len(tree["statements"]) != 1:
         raise InvalidArgumentsError(f"one SELECT is answered; {_there_are(tables)}")
     nodes = [*_nodes(tree["statements"])]
     own = {str(name).lower() for node in nodes for name in _expressions_of(node)}
-    of_engine = connection.execute("SELECT view_name FROM duckdb_views() WHERE internal")
+    of_engine = connection.execute(_VIEWS_OF_ENGINE)
     # Outside of where it is defined, such a name would be that of DuckDB's own view.
     own.difference_update(name for (name,) in of_engine.fetchall())
     if refused := next(filter(None, (_refused(node, {*tables, *own}) for node in nodes)), None):
@@ -262,11 +300,12 @@ def _expressions_of(node: Node) -> Iterator[JsonValue]:
 
 
 def _refused(node: Node, names: Collection[str]) -> str | None:
-    """Returns what a node names that is no table of the lake, as a clause; None if it may stand."""
+    """Returns what a node does that is not reading a lake, as a clause; None if it may stand."""
     kind, function = node.get("type"), str(node.get("function_name", "")).lower()
     if function.startswith(_OF_THE_ENGINE):
-        return f"{function} is not offered"
-    if "class" in node:  # an expression
+        return f"{abbreviate(function)} is not offered"
+    # An expression has a class, a literal the type of its value.
+    if "class" in node or not isinstance(kind, str) or kind.endswith("_TYPE_INFO"):
         return None
     if kind == "BASE_TABLE":
         path = [str(node[key]) for key in ("catalog_name", "schema_name") if node.get(key)]
@@ -277,9 +316,8 @@ def _refused(node: Node, names: Collection[str]) -> str | None:
         called = node["function"]
         name = str(called["function_name"]).lower() if isinstance(called, dict) else ""
         return None if name in _TABLE_FUNCTIONS else f"{abbreviate(name)} is not offered"
-    if kind in _OTHERS or (kind == "SHOW_REF" and node.get("table_name")):
-        return f"{kind} is not offered"
-    return None
+    lists_tables = kind == "SHOW_REF" and not node.get("query")
+    return f"{kind} is not offered" if lists_tables or kind not in _NODES else None
 
 
 def _there_are(tables: Collection[str]) -> str:
@@ -297,10 +335,15 @@ def _as_dicts(tables: Mapping[str, TableFiles]) -> dict[str, JsonValue]:
     return {name: asdict(files) for name, files in tables.items()}
 
 
+def _short(reason: str) -> str:
+    return shortened(reason, _MOST_REASON_CHARS)
+
+
 def _as_json(value: object) -> float | str:
     """Returns a value of SQL that JSON has not: a decimal, bytes in hexadecimal, a time."""
     if isinstance(value, Decimal):
-        return float(value)
+        # A sum of integers is one, which a float would round.
+        return int(value) if value == value.to_integral_value() else float(value)
     return value.hex() if isinstance(value, bytes) else str(value)
 
 
@@ -310,12 +353,20 @@ def main() -> None:
     select = Select(**request["select"])
     tables = {name: TableFiles(**files) for name, files in request["tables"].items()}
     space = (select.memory_mb + _PROGRAM_MB) << 20
-    resource.setrlimit(resource.RLIMIT_AS, (space, space))
+    for limit, most in (
+        (resource.RLIMIT_AS, space),
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        resource.setrlimit(limit, (most, most))
+    # Should the one who asks be killed.
+    signal.setitimer(signal.ITIMER_REAL, max(request["left_s"], 0.0) + 1.0)
     try:
         answer = asdict(select.rows(tables))
     except EpisodicError as error:
         # A path is for the log alone.
         cause = str(error.__cause__ or "") if isinstance(error, RefusedError) else ""
+        cause = _short(cause)
         answer = {"error": error.code, "reason": str(error), "cause": cause}
     json.dump(answer, sys.stdout)
 
