@@ -316,8 +316,9 @@ def test_where_no_pose_topic_is_clear_it_is_chosen_and_the_address_keeps_it(
             assert (x, y) == pytest.approx(end, abs=0.02)
         assert "east and north of 48.123457, 11.765432" in chromium.text("#map-key")
         show(chromium, server, chromium.run("return location.hash"))
-        assert chromium.run("return state.view.path.y.at(-1)") == pytest.approx(11.01, abs=0.02)
         chromium.awaits("return document.getElementById('poses').value === '/fix'")
+        chromium.awaits("return Boolean(state.view.path) && state.view.isWhole")
+        assert chromium.run("return state.view.path.y.at(-1)") == pytest.approx(11.01, abs=0.02)
 
 
 def test_what_the_server_had_no_time_for_is_kept_and_asked_for_again(page: Browser) -> None:
