@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +32,7 @@ from tests.support.memories import memory_of
 
 HALL, ATTIC, UNSHIPPED = "hall", "attic", "cellar"
 MOST_CHARS = 24_000
+ENDLESS = "WITH RECURSIVE t AS (SELECT 1 AS i UNION ALL SELECT i + 1 FROM t) SELECT max(i) FROM t"
 
 
 @pytest.fixture(scope="module")
@@ -211,12 +217,22 @@ def test_memory_that_duckdb_does_not_count_and_time_without_end_are_bounded(flee
         answer = asked(fleet, greedy)
         assert answer["error"] == "refused"
         assert "more than 256 MiB" in answer["detail"]
-    endless = (
-        "WITH RECURSIVE t AS (SELECT 1 AS i UNION ALL SELECT i + 1 FROM t) SELECT max(i) FROM t"
-    )
-    answer = asked(fleet, endless, Call(Deadline.after(1.0)))
+    answer = asked(fleet, ENDLESS, Call(Deadline.after(1.0)))
     assert answer["error"] == "timeout"
     assert asked(fleet, BAGS)["rows"] == [[ATTIC, 2], [HALL, 3]]
+
+
+def test_its_process_ends_by_itself_should_the_server_be_killed() -> None:
+    request = {"select": asdict(Select(ENDLESS, 256, 1)), "tables": {}, "left_s": 0.0}
+    left_alone = subprocess.run(
+        [sys.executable, "-P", "-m", "ros2_memory.lake.select"],
+        input=json.dumps(request),
+        text=True,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert left_alone.returncode == -signal.SIGALRM
 
 
 def test_a_file_that_is_damaged_is_reported_without_its_path(tmp_path: Path) -> None:
