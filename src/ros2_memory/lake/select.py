@@ -177,20 +177,9 @@ class Select:
             text=True,
             env={**os.environ, **_ALLOCATORS},
         )
-        given: str | None = request
         with process:
             try:
-                while True:
-                    try:
-                        text, _ = process.communicate(given, timeout=_LOOKED_AGAIN_S)
-                        break
-                    except subprocess.TimeoutExpired:
-                        given = None
-                    if deadline.expired():
-                        raise QueryTimeoutError(
-                            f"the select needs more than {deadline.budget_s:.3g} s: ask about "
-                            "fewer robots, days or columns"
-                        )
+                text = _printed(process, request, deadline)
             finally:
                 process.kill()
         if process.returncode:
@@ -253,6 +242,20 @@ class Select:
                 return Selected(reader.schema.names, rows, is_cut=True)
             rows.append(json.loads(text))
         return Selected(reader.schema.names, rows)
+
+
+def _printed(process: subprocess.Popen[str], request: str, deadline: Deadline) -> str:
+    """Returns what a process prints about a request; raises QueryTimeoutError."""
+    given: str | None = request
+    while not deadline.expired():
+        try:
+            text, _ = process.communicate(given, timeout=_LOOKED_AGAIN_S)
+        except subprocess.TimeoutExpired:
+            given = None
+        else:
+            return text
+    do = "ask about fewer robots, days or columns"
+    raise QueryTimeoutError(f"the select needs more than {deadline.budget_s:.3g} s: {do}")
 
 
 def _rows_in(batch: pa.RecordBatch) -> Iterator[tuple[object, ...]]:
