@@ -1,6 +1,6 @@
 """The tool that answers one SELECT about many robots, grouped where their rows lie: in a lake.
 
-The other tools ask robot after robot. This one takes as much memory for two hundred as for one.
+The other tools ask robot after robot; this one asks the lake once.
 """
 
 from __future__ import annotations
