@@ -44,6 +44,8 @@ def sql(
         writer.writerow(found.columns)
         writer.writerows(found.rows)
         return
+    if len(set(found.columns)) < len(found.columns):
+        raise InvalidArgumentsError("two columns have one name: give one another with AS, or --csv")
     answer: list[JsonValue] = [dict(zip(found.columns, row, strict=True)) for row in found.rows]
     if as_json:
         print_line(to_json_text(answer))

@@ -82,7 +82,7 @@ class Lake:
         self._lock = threading.Lock()
         self._looked_at = -math.inf
         self._tables: dict[str, IcebergTable] = {}
-        self._columns: dict[str, Mapping[str, str]] = {}
+        self._types: dict[str, Mapping[str, str]] = {}
         self._partitions: defaultdict[str, Partitions] = defaultdict(Partitions)
 
     def close(self) -> None:
@@ -157,7 +157,8 @@ class Lake:
             files = self._files_for(robots, name) if is_named else ()
             tables[name] = self._files_of(name, files, by_arrow=True)
         select = Select(sql, self._memory_mb, self._threads, most_rows, most_chars)
-        if not self._turns.acquire(timeout=min(deadline.left_s(), threading.TIMEOUT_MAX)):
+        left_s = max(0.0, min(deadline.left_s(), threading.TIMEOUT_MAX))
+        if not self._turns.acquire(timeout=left_s):
             raise BusyError("other statements were not answered in time; ask again, or fewer")
         try:
             return select.run(tables, deadline)
@@ -194,20 +195,20 @@ class Lake:
         places = [PyArrowFileIO.parse_location(file.location) for file in files]
         paths = [path for *_, path in places]
         if {scheme for scheme, *_ in places} <= {"file"}:
-            return TableFiles(self._columns_of(name), paths, ("file", "", {}) if by_arrow else None)
+            return TableFiles(self._types_of(name), paths, ("file", "", {}) if by_arrow else None)
         with self._looking():
             table = self._loaded_table(name)
         properties = {} if table is None else dict(table.io.properties)
-        return TableFiles(self._columns_of(name), paths, (*places[0][:2], properties))
+        return TableFiles(self._types_of(name), paths, (*places[0][:2], properties))
 
-    def _columns_of(self, name: str) -> Mapping[str, str]:
+    def _types_of(self, name: str) -> Mapping[str, str]:
         """Returns the type that DuckDB has for each column of a table."""
-        if name not in self._columns:
+        if name not in self._types:
             with self._database.cursor() as cursor:
                 cursor.register("rows", TABLES[name].arrow_schema.empty_table())
                 described = cursor.execute("DESCRIBE rows").fetchall()
-            self._columns[name] = {column: kind for column, kind, *_ in described}
-        return self._columns[name]
+            self._types[name] = {column: kind for column, kind, *_ in described}
+        return self._types[name]
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

@@ -2,8 +2,8 @@
 
 The statement may be anybody's. Inside of a server `repeat('x', 1e9)` would take memory that DuckDB
 does not count, and not end when it is interrupted. This process has a limit of its address space,
-no disk to write to, and ends when its time is up. DuckDB may open no file there: Arrow reads those
-that the process is given, all of which whoever asks may read.
+no disk to write to, and ends when its time is up. DuckDB may open no file there: Arrow reads the
+files of the robots that the client may ask about.
 
 What a statement does is taken from its parse tree: it reads tables of the lake, its own common
 table expressions, and functions that make rows of numbers or lists.

@@ -215,6 +215,8 @@ def test_a_select_is_answered_over_the_tables_as_they_are_now(
     odd = "0.5 a, 1e999::DOUBLE b, MAP{'x': 1} c, '\\x01'::BLOB d, DATE '2026-11-20' e"
     [row] = json.loads(exits(0, "sql --json", f"SELECT {odd}", *of_lake).out)
     assert row == {"a": 0.5, "b": None, "c": {"x": 1}, "d": "01", "e": "2026-11-20"}
+    assert "two columns have one name" in exits(2, "sql 'SELECT 1 AS a, 2 AS a'", *of_lake).err
+    assert exits(0, "sql --csv 'SELECT 1 AS a, 2 AS a'", *of_lake).out == "a,a\n1,2\n"
     refused = exits(2, "sql 'SELECT * FROM chanels'", *of_lake).err
     assert 'there is no table "chanels"' in refused
     assert "the tables are channels, poses" in refused

@@ -219,6 +219,7 @@ def test_memory_that_duckdb_does_not_count_and_time_without_end_are_bounded(flee
         assert "more than 256 MiB" in answer["detail"]
     answer = asked(fleet, ENDLESS, Call(Deadline.after(1.0)))
     assert answer["error"] == "timeout"
+    assert asked(fleet, BAGS, Call(Deadline.after(-1.0)))["error"] == "timeout"
     assert asked(fleet, BAGS)["rows"] == [[ATTIC, 2], [HALL, 3]]
 
 
