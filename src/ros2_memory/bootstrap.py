@@ -34,7 +34,7 @@ from ros2_memory.config import (
     load_rules,
 )
 from ros2_memory.core import directories
-from ros2_memory.core.errors import BagError, ConfigError, InvalidArgumentsError
+from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, Observer, Telemetry
@@ -548,21 +548,6 @@ def _cached(name: bytes) -> tuple[Path, ...]:
     return (folder / FILE,) if cache.is_absolute() else ()
 
 
-def delete_catalogues(settings: Settings) -> None:
-    """Deletes the catalogues that versions before the store of columns kept in its folders.
-
-    Raises:
-        BagError: one of them cannot be deleted.
-    """
-    from ros2_memory.columns.forget import delete_catalogue
-    from ros2_memory.columns.store import CATALOGUE
-
-    for path in column_paths(settings):
-        # One of all recordings, and one for each that answered alone.
-        for file in (path.with_name(CATALOGUE), *path.parent.glob(f"*-{CATALOGUE}")):
-            delete_catalogue(file)
-
-
 def _definitions_of(settings: Settings) -> list[tuple[str, int, int]]:
     """Returns what tells the configured message definitions apart: paths, sizes and mtimes."""
     return [
@@ -599,20 +584,11 @@ def _hash_of(value: object) -> str:
     return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16]
 
 
-def build_backfill(settings: Settings, memory: Memory, *, are_files: bool = True) -> Backfill:
-    """Returns what fills the store of columns of a memory, if it has one.
-
-    Deletes the catalogues of earlier versions, whose place the store takes. `are_files`: whether
-    the bags are files, and not those of a lake.
-    """
+def build_backfill(settings: Settings, memory: Memory) -> Backfill:
+    """Returns what fills the store of columns of a memory, if it has one."""
     from ros2_memory.columns.fill import Filling, StoreLimits
     from ros2_memory.serving.backfill import Backfill
 
-    try:
-        if are_files:
-            delete_catalogues(settings)
-    except BagError as error:
-        log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
     scanner, store = memory.scanner, settings.store
     if scanner.store is None:
         return Backfill(memory, None)
@@ -624,7 +600,6 @@ def build_backfill(settings: Settings, memory: Memory, *, are_files: bool = True
             memory.index.bag_dir,
             memory.clock,
             StoreLimits(store.max_share, round(store.max_gb * GB)),
-            are_files=are_files,
             large=memory.large,
         ),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import os
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -26,13 +27,14 @@ from ros2_memory.bootstrap import (
 from ros2_memory.config import DuckdbNode, NullRecorderNode, Settings, is_robot_name
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.memo import Memo
 from ros2_memory.core.timebase import WallClock
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
     from ros2_memory.fleet.robots import Fleet, Robot
-    from ros2_memory.history.context import Memory, QuerySettings
+    from ros2_memory.history.context import Memory
     from ros2_memory.lake.engine import Lake
     from ros2_memory.lake.shipper import RobotBags
     from ros2_memory.lake.warehouse import LakeLocation
@@ -174,44 +176,42 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     if not settings.fleet.shared_map and own.data.places_file == settings.data.places_file:
         # `data.places_file` is about some other map.
         limits = replace(limits, places=(), places_file="")
-    bag_dir = settings.fleet.robots.get(name)
-    shipped = None if lake is None else _build_shipped(own, name, shared, lake, limits)
-    if bag_dir is None and shipped is not None:
-        return Robot(name, Path(name), shipped, shipped, lambda: False)
-    bag_dir = own.recording.bag_dir
-    mounted = replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
-    return Robot(name, bag_dir, mounted, shipped, bag_dir.is_dir)
+    memory = replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
+    if lake is None:
+        return Robot(name, own.recording.bag_dir, memory)
+    if name in settings.fleet.robots:
+        with_lake = _with_lake(memory, lake, own, name, shared)
+        return Robot(name, own.recording.bag_dir, with_lake, memory, in_lake=True)
+    return Robot(name, Path(name), _with_lake(memory, lake, own, name, shared), in_lake=True)
 
 
-def _build_shipped(
-    own: Settings, name: str, shared: SharedParts, lake: Lake, limits: QuerySettings
-) -> Memory:
-    """Returns the memory of a robot's bags in a lake; its columns are made again from these."""
+def _with_lake(memory: Memory, lake: Lake, own: Settings, name: str, shared: SharedParts) -> Memory:
+    """Returns the memory of a robot's bags in a lake, and of its own that are not there.
+
+    Its columns are in a store of their own.
+    """
     from ros2_memory.columns.scanner import Scanner
-    from ros2_memory.history.context import Memory
+    from ros2_memory.fleet.joined import JoinedIndex, JoinedReader
     from ros2_memory.lake.memory import LakeIndex, LakeReader
 
-    index = LakeIndex(lake, name, WallClock())
+    index = LakeIndex(lake, name, memory.index.bag_dir, memory.clock)
     store, reading = build_columns(own, shared.reader, name), reading_of(own, shared.schemas)
-    return Memory(
-        index,
-        LakeReader(index, shared.reader, shared.large),
-        shared.extractor,
-        index.clock,
-        # Nothing is recorded there, and nothing deleted.
-        replace(limits, kept=None, recording="", screened=False),
-        Scanner(store, index.bag_dir, reading, shared.large, shared.caches),
-        large=shared.large,
+    return replace(
+        memory,
+        index=JoinedIndex(index, memory.index),
+        reader=JoinedReader(LakeReader(index, shared.reader, shared.large), memory.reader),
+        scanner=Scanner(store, index.bag_dir, reading, shared.large, shared.caches),
+        memo=Memo(),
     )
 
 
 def robot_settings(settings: Settings, name: str) -> Settings:
     """Returns the settings of one robot of a fleet, as if a server had it alone.
 
-    Of a robot that only a lake knows they name no bag directory of its own.
+    Of a robot that only a lake knows they name a bag directory that cannot be.
     """
     fleet, data = settings.fleet, settings.data
-    bag_dir = fleet.robots.get(name, settings.recording.bag_dir)
+    bag_dir = fleet.robots.get(name, Path(os.devnull) / name)
     if fleet.places is not None:
         places_file = Path(fleet.places.replace("*", name))
         if places_file.is_file():

@@ -229,18 +229,17 @@ def _parts_of_fleet(
     backfills: dict[str, Backfill] = {}
     for name in settings.fleet.robots:  # of others there is no bag here
         robot = fleet.robots[name]
-        robot_memory = robot.memory
-        backfill = build_backfill(robot_settings(settings, name), robot_memory)
-        reports[name] = Health(robot_memory, package_version(), backfill)
-        backfill.helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
+        backfill = build_backfill(robot_settings(settings, name), robot.memory)
+        reports[name] = Health(robot.own or robot.memory, package_version(), backfill)
+        if not robot.in_lake:  # of bags in a lake no child process knows
+            backfill.helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
         backfills[name] = backfill
-    shipped: dict[str, Backfill] = {}
 
     def all_backfills() -> list[Backfill]:
-        for robot in [*fleet.robots.values()]:  # more robots may have joined
-            if robot.lake is not None and robot.name not in shipped:
-                shipped[robot.name] = build_backfill(settings, robot.lake, are_files=False)
-        return [*backfills.values(), *shipped.values()]
+        for name, robot in [*fleet.robots.items()]:  # more robots may have joined
+            if name not in backfills:
+                backfills[name] = build_backfill(settings, robot.memory)
+        return [*backfills.values()]
 
     async def background() -> None:
         """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
@@ -314,11 +313,11 @@ async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_L
         while True:
             limiter.total_tokens += 2 * len(robots)
             for robot in robots:
-                shipped = robot.lake
-                if robot.memory is not shipped:
-                    tasks.start_soon(keep_fresh, robot.memory, every_s, limiter)
-                if shipped is not None:
-                    tasks.start_soon(keep_fresh, shipped, lake_s, limiter)
+                in_bag_dir = robot.own if robot.in_lake else robot.memory
+                if in_bag_dir is not None:
+                    tasks.start_soon(keep_fresh, in_bag_dir, every_s, limiter)
+                if robot.in_lake:
+                    tasks.start_soon(keep_fresh, robot.memory, lake_s, limiter)
             if fleet.join is None:
                 return
             await anyio.sleep(lake_s)

@@ -158,12 +158,14 @@ def lake_robots(
     days: int = 31,
     most_bags: int = MOST_BAGS,
     now: int = NOW,
+    bag_dirs: Path = Path("/"),
 ) -> dict[str, Memory]:
     """The robots of a lake; with a folder for `stores` each has one."""
     clock, decoder, large = FixedClock(now), McapReader(), LargeReads()
 
     def memory(name: str) -> Memory:
-        index = LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags)
+        own = bag_dirs / name
+        index = LakeIndex(lake, name, own, clock, refresh_s=0, days=days, most_bags=most_bags)
         path = [] if stores is None else [stores / name / FILE]
         store = ColumnStore(path, decoder.definition) if path else None
         scanner = Scanner(store, index.bag_dir, "", large)
@@ -182,7 +184,7 @@ def lake_robot(folder: Path, **how: Any) -> Memory:
 def store_columns(memory: Memory) -> Filling:
     """Fills the store of a lake's robot, as a server does; returns what filled it."""
     bag_dir, limits = memory.index.bag_dir, StoreLimits(max_share=1.0)
-    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, limits, are_files=False)
+    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, limits)
     timeline = memory.index.snapshot().timeline
     for batch in filling.batches(timeline):
         assert filling.fill(batch, timeline) == len(batch.bags)

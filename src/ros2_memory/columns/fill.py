@@ -94,7 +94,6 @@ class Filling:
         bag_dir: the bag directory.
         clock: says now.
         limits: how much the store may take.
-        are_files: whether bags are files, which change; those of a lake do not.
         large: the turn to hold much of a bag, which is passed on after each group of tables.
     """
 
@@ -106,7 +105,6 @@ class Filling:
         clock: Clock,
         limits: StoreLimits,
         *,
-        are_files: bool = True,
         large: LargeReads | None = None,
     ) -> None:
         self._large = large or LargeReads()
@@ -118,7 +116,6 @@ class Filling:
         self._bag_dir = bag_dir
         self._clock = clock
         self._limits = limits
-        self._are_files = are_files
         self._refused: dict[BagKey, Ns] = {}
         self._trimmed: dict[BagKey, Ns] = {}
         self._shared: tuple[Timeline, frozenset[str]] | None = None
@@ -226,9 +223,7 @@ class Filling:
         if not present:
             return
         absent = (path for path in self.store.paths() if path not in present)
-        gone = [
-            path for path in absent if not (self._are_files and (self._bag_dir / path).exists())
-        ]
+        gone = [path for path in absent if not (self._bag_dir / path).exists()]
         if gone:
             self.store.delete(gone)
         self.store.give_back()
@@ -261,7 +256,7 @@ class Filling:
         Each rotation writes that of a recording with many bags again, and it concerns one or two of
         these. All messages of the bag count now; if it was stored with as many, all did then.
         """
-        if not self._are_files or not bag.sidecar_ns:
+        if not bag.sidecar_ns or not self._reader.is_file(bag.path):
             return False
         if sure_handover(bag.recording).handover.rule(bag.path.name):
             return False
@@ -361,7 +356,9 @@ class Filling:
         return max(round(self._limits.max_share * size), self._limits.least_bytes_per_s * length)
 
     def _may_be_stored(self, bag: BagFile) -> bool:
-        return not self._are_files or is_settled(bag, self._bag_dir, self._clock.now())
+        return not self._reader.is_file(bag.path) or is_settled(
+            bag, self._bag_dir, self._clock.now()
+        )
 
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""

@@ -13,7 +13,7 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.columns.database import files_of, is_busy
+from ros2_memory.columns.database import is_busy
 from ros2_memory.columns.pack import FORMAT
 from ros2_memory.columns.schema import PRAGMAS
 from ros2_memory.columns.writing import delete_bags
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 PATIENCE_S: Final = 10.0
 """How long other programs may use the file before it is given up to empty its log."""
 _PAUSE_S: Final = 0.05
-_CATALOGUE_TABLES: Final = frozenset({"bags", "configs", "held", "shapes"})
 
 
 def forget(
@@ -62,41 +61,6 @@ def forget(
     except (OSError, sqlite3.Error, ValueError) as error:
         reason = f"the columns may still contain deleted data ({error}); delete the file"
         raise BagError(str(file), f"{file.name}: {reason}") from error
-
-
-def delete_catalogue(file: Path) -> None:
-    """Deletes a catalogue of digests, what SQLite kept beside it, and those that were set aside.
-
-    A database with other tables stays: a lake's own catalogue may have the same name.
-
-    Raises:
-        BagError: it is there, and cannot be deleted.
-    """
-    if file.parent.is_symlink():
-        return
-    try:
-        if file.is_file() and not file.is_symlink() and _is_catalogue(file):
-            for path in files_of(file):
-                path.unlink(missing_ok=True)
-        for leftover in leftovers(file):
-            if _is_catalogue(leftover):
-                leftover.unlink(missing_ok=True)
-    except (OSError, sqlite3.OperationalError) as error:
-        reason = f"it may still contain deleted data ({error}); delete the file"
-        raise BagError(str(file), f"{file.name} of an earlier version: {reason}") from error
-
-
-def _is_catalogue(file: Path) -> bool:
-    """Returns whether a file is a catalogue of digests, by its tables, or a damaged database."""
-    address = f"{file.absolute().as_uri()}?mode=rw"
-    try:
-        with closing(sqlite3.connect(address, uri=True, timeout=PATIENCE_S)) as base:
-            names = base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-            return _CATALOGUE_TABLES.issubset(name for (name,) in names)
-    except sqlite3.OperationalError:
-        raise
-    except sqlite3.DatabaseError:  # only catalogues had these names in these folders
-        return True
 
 
 def leftovers(file: Path) -> list[Path]:

@@ -58,8 +58,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
 
 FILE: Final = "columns.sqlite"
-CATALOGUE: Final = "catalogue.sqlite"
-"""The file of digests that lay in its place in versions before it."""
 _ALL_TIME: Final = TimeWindow.everything()
 LONG_NS: Final[Ns] = 2 * Level.TEN_MINUTES.length
 """A bag that lasts longer becomes parts of an hour at once."""

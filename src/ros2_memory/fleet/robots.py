@@ -16,13 +16,11 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     LakeError,
     NoDataError,
-    NoDataReason,
     NotInLakeError,
     QueryTimeoutError,
     RefusedError,
 )
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import Selected, TimeWindow
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
 from ros2_memory.history.context import Call, Memory, Stages
@@ -31,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.model import Selected
     from ros2_memory.core.timebase import Deadline
 
 T = TypeVar("T")
@@ -42,7 +41,6 @@ _OF_ONE: Final = 0.4
 """The part of the time of a call that one robot of several may take."""
 _OF_ALL: Final = 0.9
 """The part that all may take together, or one alone; the rest is for merging the answers."""
-_UNKNOWN: Final = (NoDataReason.TOPIC_NOT_RECORDED, NoDataReason.EMPTY_MEMORY)
 _GRACE: Final = 0.05
 """How much later than its limit a robot counts as stuck: a disk that hangs heeds no limit."""
 
@@ -64,12 +62,14 @@ class FromLake(NamedTuple):
     """What a reply has to report of an answer from a lake.
 
     Attributes:
-        latest: the log time of the newest message that was shipped; None if there is none.
+        latest: the log time of the newest message there; None if there is none.
         older: up to which log time (inclusive) there is more, which was not looked at; None if not.
+        is_alone: whether nothing but what was shipped could answer.
     """
 
     latest: Ns | None
     older: Ns | None = None
+    is_alone: bool = True
 
     def since(self, begin: Ns) -> FromLake:
         """Returns the report for an answer that needs nothing before a log time."""
@@ -93,16 +93,16 @@ class Robot:
     Attributes:
         name: as replies and arguments have it; never a path.
         bag_dir: the bag directory, which need not exist.
-        memory: over its own bags; that of the lake where only the lake has some.
-        lake: its memory over what was shipped to a lake.
-        is_mounted: returns whether there are bags besides those of the lake; it may hang.
+        memory: over its bags, and over what a lake has of it, where there is a lake.
+        own: over its bags alone; None where it has no bag directory, or there is no lake.
+        in_lake: whether `memory` is over a lake, too.
     """
 
     name: str
     bag_dir: Path
     memory: Memory
-    lake: Memory | None = None
-    is_mounted: Callable[[], bool] = lambda: True
+    own: Memory | None = None
+    in_lake: bool = False
 
     def asked(
         self,
@@ -110,94 +110,58 @@ class Robot:
         call: Call,
         since: Callable[[Ns], Ns | None] = lambda _: MIN_NS,
     ) -> tuple[T, FromLake | None]:
-        """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
+        """Returns what `ask` finds in the memory, and what to report with it if that is a lake's.
 
-        The lake answers where it has more of the time `since` (of now) than the robot's own bags,
-        and these do otherwise, or where it is None; where one has no answer, the other does.
+        Where the lake cannot be read, the robot's own bags answer if they reach back to the time
+        `since` (of now) that the question is about; also where the lake has only the times of the
+        messages that it needs.
 
         Raises:
-            NoDataError: none of the two has an answer; it is that of the first one that knows the
-                topic.
-            NotInLakeError: it needs messages that the lake does not have, nor the robot.
+            EpisodicError: there is no answer.
         """
-        lake = self.lake
-        if lake is None:
+        if not self.in_lake:
             return ask(self.memory, call), None
-
-        def answer(*, of_lake: bool) -> tuple[T, FromLake | None]:
-            return _ask_lake(lake, ask, call) if of_lake else (ask(self.memory, call), None)
-
-        is_mounted = self.is_mounted()
-        own = self.memory.index.snapshot() if is_mounted else None
-        if own is None or not (own.bags or own.problem is not None):
-            # A folder that is there says best why nothing is, where nothing was shipped either.
-            return answer(of_lake=not is_mounted or lake.index.snapshot().latest is not None)
-        is_lakes = _lacks(self.memory, lake, since)
+        call.older = MAX_NS
         try:
-            return answer(of_lake=is_lakes)
-        except (NoDataError, NotInLakeError) as error:
+            return ask(self.memory, call), self._from_lake(call)
+        except NoDataError as error:
+            detail = "; ".join((error.detail, *self._from_lake(call).notes))
+            raise NoDataError(error.reason, detail, error.notes) from error
+        except (NotInLakeError, RefusedError, LakeError) as failure:
+            is_whole = isinstance(failure, NotInLakeError)
+            if self.own is None or not (is_whole or _reaches_back(self.own, since)):
+                raise
             try:
-                return answer(of_lake=not is_lakes)
-            except NoDataError as other:
-                if isinstance(error, NoDataError) and error.reason in _UNKNOWN:
-                    raise (error if other.reason in _UNKNOWN else other) from None
-                raise error from None
-            except (RefusedError, LakeError, QueryTimeoutError) as failure:
-                if is_lakes or not isinstance(error, NoDataError):
-                    raise
+                return ask(self.own, call), None
+            except NoDataError as error:
+                if is_whole:
+                    raise failure from None
                 notes = (*error.notes, f"the lake has no answer either: {failure}")
                 raise NoDataError(error.reason, error.detail, notes) from failure
+
+    def _from_lake(self, call: Call) -> FromLake:
+        """Returns what to report of an answer that a call got."""
+        published = self.memory.index.published
+        latest = None if published is None else published.latest
+        own = None if self.own is None else self.own.index.published
+        is_alone = own is None or own.problem is not None or not own.bags
+        return FromLake(latest, None if call.older == MAX_NS else call.older, is_alone)
 
     def latest_known(self) -> Ns:
         """Returns the log time of its newest data as of the last scan; the least before the first.
 
         Nothing is scanned for it.
         """
-        published = [memory.index.published for memory in (self.memory, self.lake) if memory]
-        known = [snapshot.latest for snapshot in published if snapshot is not None]
-        return next(filter(None, known), MIN_NS)
-
-
-def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
-    """Returns whether a lake has more of a time than a robot's own bags have.
-
-    What is newer than the lake does not count. Retention may delete any bag, or parts of it.
-
-    Raises:
-        EpisodicError: the lake cannot be read, and these bags do not reach back so far.
-    """
-    on_robot = own.index.snapshot()
-    begin = since(own.now(own.clock.now(), on_robot.latest))
-    if begin is None:
-        return False
-    try:
-        in_lake = lake.index.snapshot()
-    except (RefusedError, LakeError):
-        if on_robot.earliest is None or begin < on_robot.earliest:
-            raise
-        return False
-    if in_lake.older is not None and begin <= in_lake.older:
-        return True
-    window = TimeWindow(begin, MIN_NS if in_lake.latest is None else in_lake.latest + 1)
-    # By their beginnings: bags that were never shipped do not stand for those that are gone.
-    sizes = dict(sorted((bag.start, bag.size) for bag in on_robot.timeline.overlapping(window)))
-    return any(bag.size > sizes.get(bag.start, 0) for bag in in_lake.timeline.overlapping(window))
-
-
-def _ask_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
-    """Returns what `ask` finds in a lake, with what to report; raises what it raises."""
-    call.older = MAX_NS
-
-    def report() -> FromLake:
-        published = lake.index.published
+        published = self.memory.index.published
         latest = None if published is None else published.latest
-        return FromLake(latest, None if call.older == MAX_NS else call.older)
+        return MIN_NS if latest is None else latest
 
-    try:
-        return ask(lake, call), report()
-    except NoDataError as error:
-        detail = "; ".join((error.detail, *report().notes))
-        raise NoDataError(error.reason, detail, error.notes) from error
+
+def _reaches_back(own: Memory, since: Callable[[Ns], Ns | None]) -> bool:
+    """Returns whether a robot's own bags begin before the time that a question is about."""
+    snapshot = own.index.snapshot()
+    begin = since(own.now(own.clock.now(), snapshot.latest))
+    return begin is None or (snapshot.earliest is not None and begin >= snapshot.earliest)
 
 
 class LakeTables(Protocol):

@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 from ros2_memory import results
 from ros2_memory.core import errors
@@ -48,8 +48,10 @@ from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings
 from ros2_memory.tools.replies import ROBOT_NAME, as_json
 from ros2_memory.tools.reply_size import to_json_text
 
+T = TypeVar("T")
+
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.tools.declaration import Question, Tool
@@ -125,6 +127,8 @@ _AHEAD_NS: Final[Ns] = 60_000 * NS_PER_MS
 _TIMES: Final = ("start", "with_start", "timestamp", "timestamps", "around")
 _LENGTHS: Final = ("last_s", "seconds", "seconds_ago")
 """Arguments that say from when a question is: a time, or seconds before now."""
+_OF_RECORDER: Final = frozenset({"memory_status"})
+"""Tools about a bag directory and its recorder."""
 _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
 """Tools about the bags that a robot has, which say themselves that its directory is missing."""
 
@@ -213,9 +217,9 @@ class _FleetQuestion:
         """
 
         def ask(_: Robot, own: Call) -> OfRobot:
-            answer, from_lake = robot.asked(partial(_answer, self.question), own, self._since)
+            answer, from_lake = self._asked(robot, partial(_answer, self.question), own)
             lake = self._reported(answer, from_lake)
-            notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
+            notes = () if lake is None else (*shipped_to({robot.name: lake}), *lake.notes)
             return OfRobot(robot.name, robot.bag_dir, answer, notes, own.now)
 
         answer_or_error = self.fan_out.ask([robot], ask, call)[robot.name]
@@ -273,8 +277,16 @@ class _FleetQuestion:
                 value = {"now": unix_rounded_up(own.now), **value}
             return RobotReply(robot.name, value, latest, is_ahead), answer
 
-        (reply, answer), lake = robot.asked(ask, call, self._since)
+        (reply, answer), lake = self._asked(robot, ask, call)
         return replace(reply, lake=self._reported(answer, lake))
+
+    def _asked(
+        self, robot: Robot, ask: Callable[[Memory, Call], T], call: Call
+    ) -> tuple[T, FromLake | None]:
+        """Returns what `Robot.asked` does; what a recorder does now is not in a lake."""
+        if self.tool.name in _OF_RECORDER and robot.own is not None:
+            return ask(robot.own, call), None
+        return robot.asked(ask, call, self._since)
 
     def _since(self, now: Ns) -> Ns | None:
         """Returns from when the question is; None where it is about the bags that there are."""
@@ -538,7 +550,7 @@ def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicErro
     of_lake = {reply.name: reply.lake for reply in replies if reply.lake is not None}
     notes = _sentences(failed, "no answer of ")
     notes += _sentences((name, note) for name, lake in of_lake.items() for note in lake.notes)
-    notes += shipped_to({name: lake.latest for name, lake in of_lake.items()})
+    notes += shipped_to(of_lake)
     if ahead := [reply.name for reply in replies if reply.is_ahead]:
         notes.append(
             f"{listed(ahead, at_most=_MOST_NAMED)}: dated in the future by a clock that ran ahead, "
@@ -547,8 +559,9 @@ def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicErro
     return notes
 
 
-def shipped_to(latest: Mapping[str, Ns | None]) -> list[str]:
-    """Returns the note on answers from a lake: up to when each robot's bags were shipped."""
+def shipped_to(of_lake: Mapping[str, FromLake]) -> list[str]:
+    """Returns the note on answers from a lake alone: up to when each robot's bags were shipped."""
+    latest = {name: lake.latest for name, lake in of_lake.items() if lake.is_alone}
     order = sorted(latest.items(), key=lambda shipped: shipped[1] or 0)
     times = [(name, "no time" if at is None else iso_local(at) or str(at)) for name, at in order]
     parts = [f"{name} up to {time}" for name, time in times[:_MOST_NAMED]]

@@ -10,7 +10,6 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
 from operator import itemgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, cast
 from zlib import crc32
 
@@ -26,6 +25,7 @@ from ros2_memory.storage.cache import shared
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     import pyarrow as pa
 
@@ -131,28 +131,24 @@ class LakeIndex:
     Attributes:
         lake: the lake.
         robot: its name there.
+        bag_dir: where the bags are on the robot, or a path that no directory need have.
         clock: the wall clock.
         refresh_s: how old (s) the index may be: at most one commit of a table is made meanwhile.
         days: how many days are looked at together, at least: the newest; more of few bags.
         most_bags: so many bags at most, where that is more days.
-        bag_dir: names no directory that there is.
     """
 
     lake: Lake
     robot: str
+    bag_dir: Path
     clock: Clock
     _: KW_ONLY
     refresh_s: float = 60.0
     days: int = 31
     most_bags: int = MOST_BAGS
-    bag_dir: Path = field(init=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
     _windows: dict[date, _Window] = field(default_factory=dict, init=False)
     _snapshot: Snapshot | None = field(default=None, init=False)
-
-    def __post_init__(self) -> None:
-        """Names the directory."""
-        self.bag_dir = Path("/") / self.robot
 
     @property
     def published(self) -> Snapshot | None:
@@ -205,10 +201,17 @@ class LakeIndex:
         Raises:
             BagVanishedError: it is not in the lake any more.
         """
-        for window in self._windows.values():
-            if bag := window.bags.get(str(path)):
-                return bag
+        if bag := self._known(path):
+            return bag
         raise BagVanishedError(str(path), _GONE)
+
+    def has(self, path: Path) -> bool:
+        """Returns whether a bag of a snapshot has a path."""
+        return self._known(path) is not None
+
+    def _known(self, path: Path) -> LakeBag | None:
+        bags = (window.bags.get(str(path)) for window in self._windows.values())
+        return next(filter(None, bags), None)
 
     def _window(self, until: date, fewest: int) -> _Window:
         """Returns the newest days up to one; only those are read of which a file is new."""
@@ -297,9 +300,8 @@ class LakeReader(BagReader):
     large: LargeReads
 
     def reads(self, path: Path) -> bool:
-        """Returns True: all files of the index are of the lake."""
-        del path
-        return True
+        """Returns whether a bag of the index has this path."""
+        return self.index.has(path)
 
     def closing(self, path: Path) -> Closing:
         """Returns that the bag is closed: others are not shipped."""
@@ -360,6 +362,11 @@ class LakeReader(BagReader):
         """Returns the topics whose payloads were not shipped: their messages are large."""
         heads = self._heads_of(self.index.bag(path))
         return {head.channel.topic for head in heads if not head.has_payloads}
+
+    def is_file(self, path: Path) -> bool:
+        """Returns False."""
+        del path
+        return False
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the channels of which the bag has messages."""

@@ -320,6 +320,10 @@ class BagReader(ABC):
         """Returns the topics of which the bag has log and publish times (ns), and no payloads."""
         return frozenset()
 
+    def is_file(self, path: Path) -> bool:  # noqa: ARG002 - a lake needs it
+        """Returns whether the bag is a file, which may change; those of a lake do not."""
+        return True
+
     @abstractmethod
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that is declared in the file, with or without messages.

@@ -9,10 +9,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sqlite3
 import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +26,6 @@ from ros2_memory.bag_dir.moment_file import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.columns.database import open_file
-from ros2_memory.columns.forget import delete_catalogue
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
@@ -349,17 +347,6 @@ class TestDeletions:
                 assert "symbolic link" in str(refused)
                 link.unlink()
             assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
-
-    def test_a_catalogue_behind_a_link_is_not_deleted(self, bags: Path, outside: Path) -> None:
-        with closing(sqlite3.connect(outside / "catalogue.sqlite")) as base:
-            for name in ("bags", "configs", "held", "shapes"):
-                base.execute(f"CREATE TABLE {name} (content TEXT)")
-        with untouched(outside):
-            (bags / ".episodic").symlink_to(outside)
-            delete_catalogue(bags / ".episodic" / "catalogue.sqlite")
-            (bags / "own").mkdir()
-            (bags / "own" / "catalogue.sqlite").symlink_to(outside / "catalogue.sqlite")
-            delete_catalogue(bags / "own" / "catalogue.sqlite")
 
 
 class TestWhatTheRecorderKeepsBesideBags:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sqlite3
-from contextlib import closing
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,7 +13,7 @@ import yaml
 from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.columns.store import CATALOGUE, FILE
+from ros2_memory.columns.store import FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
@@ -143,25 +141,6 @@ def test_of_whole_bags_no_byte_is_left_nor_of_those_that_retention_deleted(
     assert b"secret2" not in unpacked(store) + all_bytes(bag_dir / OWN_FOLDER)
     exits(0, "index")
     assert b"secret3" in unpacked(store)
-
-
-def test_a_catalogue_of_an_earlier_version_goes_and_no_other_database(
-    bag_dir: Path, forget: Forget
-) -> None:
-    folder, beside = bag_dir / OWN_FOLDER, bag_dir / CATALOGUE
-    folder.mkdir(exist_ok=True)
-    old, lakes = folder / CATALOGUE, folder / f"lake-{CATALOGUE}"
-    for path in (old, old.with_name(f"{CATALOGUE}.aside"), beside):
-        with closing(sqlite3.connect(path)) as base:
-            for name in ("bags", "configs", "held", "shapes"):
-                base.execute(f"CREATE TABLE {name} (content TEXT)")
-            base.execute("INSERT INTO bags VALUES ('secret1')")
-            base.commit()
-    with closing(sqlite3.connect(lakes)) as base:
-        base.execute("CREATE TABLE iceberg_tables (content TEXT)")
-    forget(0, 20, 35)
-    assert sorted(path.name for path in folder.glob("*catalogue*")) == [lakes.name]
-    assert beside.is_file()
 
 
 def unpacked(store: Path) -> bytes:

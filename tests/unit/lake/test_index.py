@@ -243,7 +243,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
 
 @pytest.fixture
 def robot(memory: Memory) -> Robot:
-    return Robot("hall", Path("/hall"), memory, lake=memory)
+    return Robot("hall", Path("/hall"), memory, in_lake=True)
 
 
 def asked(of: Robot, tool: str, label: str, topic: str = SEEN, **more: object) -> Any:

@@ -13,7 +13,7 @@ import pytest
 from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.core.timebase import iso_local
-from ros2_memory.fleet.robots import Fleet, Robot
+from ros2_memory.fleet.robots import Fleet
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.shipper import Shipped
 from tests.support.bags import text, write_mcap
@@ -48,15 +48,6 @@ class World(NamedTuple):
     lake: Fleet
     shipped: Shipped
     folder: Path
-
-    def both(self) -> Fleet:
-        """The fleet of a server with a lake."""
-        robots = [
-            Robot(name, Path("/") / name, robot.memory, lake=of_lake)
-            for name, robot in self.mounted.robots.items()
-            for of_lake in [self.lake.robots[name].memory]
-        ]
-        return Fleet(robots, self.mounted.clock, shared_map=True)
 
 
 @pytest.fixture(scope="module")
@@ -128,8 +119,8 @@ def test_every_question_is_answered_by_a_lake_as_by_the_bags_or_refused(world: W
 
 def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     asked: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "x"}
-    unmounted = [replace(robot, is_mounted=lambda: False) for robot in world.both().robots.values()]
-    *_, note = reply(Fleet(unmounted, world.lake.clock), "find_last_match", asked)["notes"]
+    robots = [replace(robot, in_lake=True) for robot in world.lake.robots.values()]
+    *_, note = reply(Fleet(robots, world.lake.clock), "find_last_match", asked)["notes"]
     latest = {
         name: robot.memory.index.snapshot().latest for name, robot in world.lake.robots.items()
     }
@@ -138,7 +129,9 @@ def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     assert sorted(note.partition(": ")[2].split(", ")) == times
     # What a robot does now is not asked of a lake.
     status = reply(world.mounted, "memory_status", {})
-    assert reply(world.both(), "memory_status", {}) == status
+    mounted = world.mounted.robots
+    robots = [replace(robot, own=mounted[robot.name].memory) for robot in robots]
+    assert reply(Fleet(robots, world.lake.clock, shared_map=True), "memory_status", {}) == status
 
 
 def answers_of_the_page(folder: Path) -> list[list[tuple[Any, ...]]]:

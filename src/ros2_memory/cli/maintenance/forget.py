@@ -38,7 +38,7 @@ from ros2_memory.bag_dir.state_files import (
     append_deleted,
     deleted_of,
 )
-from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues
+from ros2_memory.bootstrap import build_reader, column_paths
 from ros2_memory.cli.options import (
     BOUNDED,
     STAYS,
@@ -491,7 +491,6 @@ class _Forget:
             BagError: some of it may still be there.
         """
         if not self._dry_run:
-            delete_catalogues(self._settings)
             names = [*files]
             for path in column_paths(self._settings):
                 forget_columns(path, self._bag_dir, names)

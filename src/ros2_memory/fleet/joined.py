@@ -1,0 +1,185 @@
+"""The bags of a robot and those that only a lake has, as one memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.core.memo import Key
+from ros2_memory.core.model import SetAside
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import SnapshotSource
+    from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.index.timeline import Timeline
+
+_JOINED: Final[Key[dict[Timeline, tuple[Timeline, tuple[SetAside, ...]]]]] = Key()
+_NAME_IN_USE: Final = "the lake has another bag of this name: rename its folder"
+
+
+@dataclass(slots=True, eq=False)
+class JoinedIndex:
+    """What a lake has of a robot, and what the robot's bag directory has besides.
+
+    A bag of both is that of the lake: what was made of it stays true when retention deletes it.
+    Where the bag directory is missing, or cannot be read, what was shipped answers.
+
+    Attributes:
+        shipped: the bags in the lake, by the paths that they had in the bag directory.
+        own: the bag directory.
+        bag_dir: its path.
+    """
+
+    shipped: SnapshotSource
+    own: SnapshotSource
+    bag_dir: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Takes the path from the index of the bag directory."""
+        self.bag_dir = self.own.bag_dir
+
+    @property
+    def published(self) -> Snapshot | None:
+        """The last result, however old; None before the lake was looked into."""
+        shipped, own = self.shipped.published, self.own.published
+        return shipped if shipped is None or own is None else joined(shipped, own, MAX_NS)
+
+    def snapshot(self, reach: Ns | None = None) -> Snapshot:
+        """Returns a current snapshot; of some days up to `reach` where these are not the newest.
+
+        Raises:
+            RefusedError: the lake cannot be read.
+        """
+        shipped, newest = self.shipped.snapshot(reach), self.shipped.published
+        is_newest = newest is None or shipped.timeline is newest.timeline
+        until = MAX_NS if is_newest else shipped.timeline.latest
+        return joined(shipped, self.own.snapshot(reach), until)
+
+    def refresh(self) -> Snapshot:
+        """Looks into the lake, and scans the bag directory, now."""
+        return joined(self.shipped.refresh(), self.own.refresh(), MAX_NS)
+
+    def heartbeat(self) -> Heartbeat | None:
+        """Returns the last heartbeat of the bag directory's recorder."""
+        return self.own.heartbeat()
+
+    def joined_with(self, recording: Path) -> tuple[str, ...]:
+        """Returns what handovers join with a recording, now or when it was shipped."""
+        return self.own.joined_with(recording) or self.shipped.joined_with(recording)
+
+
+def joined(shipped: Snapshot, own: Snapshot, until: Ns) -> Snapshot:
+    """Returns the bags of a lake, and a robot's own ones that begin up to a time and are not there.
+
+    A bag is known by its first message. Own ones of days of which those of the lake are not shown
+    (`Snapshot.older`) are left out, too; one whose path is that of another bag is set aside.
+    """
+    if own.problem is not None:
+        return shipped if shipped.timeline.segments else own
+    made = shipped.timeline.memo.of(_JOINED, dict)
+    known = made.get(own.timeline)
+    if known is None:
+        known = _made(shipped, own.timeline, until)
+        made.clear()
+        made[own.timeline] = known
+    timeline, unnamed = known
+    silent = (own.silent_topics | shipped.silent_topics).difference(timeline.topics())
+    return replace(
+        own,
+        timeline=timeline,
+        unread=(*own.unread, *unnamed),
+        silent_topics=silent,
+        older=shipped.older,
+    )
+
+
+def _made(shipped: Snapshot, own: Timeline, until: Ns) -> tuple[Timeline, tuple[SetAside, ...]]:
+    after = MIN_NS if shipped.older is None else shipped.older
+    bags: list[BagFile] = []
+    for segment in own.segments:
+        starts = segment.bags.starts
+        is_own = (starts > after) & (starts <= until) & ~np.isin(starts, shipped.timeline.starts)
+        bags += segment.bags.at(np.flatnonzero(is_own))
+    names_in_use = {bag.file for bag in shipped.timeline.named({bag.file for bag in bags})}
+    unnamed = (SetAside(bag.path, _NAME_IN_USE) for bag in bags if bag.file in names_in_use)
+    named = (bag for bag in bags if bag.file not in names_in_use)
+    return shipped.timeline.changed((), named), tuple(unnamed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JoinedReader(BagReader):
+    """An adapter of `BagReader`: reads the bags of a `JoinedIndex`.
+
+    Attributes:
+        shipped: reads those of the lake.
+        own: reads all others, and decodes.
+    """
+
+    shipped: BagReader
+    own: BagReader
+
+    def _of(self, path: Path) -> BagReader:
+        return self.shipped if self.shipped.reads(path) else self.own
+
+    def reads(self, path: Path) -> bool:
+        """Returns whether one of them reads such a file."""
+        return self._of(path).reads(path)
+
+    def closing(self, path: Path) -> Closing:
+        """Returns whether the writer has finished the file."""
+        return self._of(path).closing(path)
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Returns the summary of a bag."""
+        return self._of(path).summarize(path)
+
+    def records(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
+    ) -> Iterator[Record]:
+        """Yields the messages of a bag."""
+        return self._of(path).records(path, topics, window, newest_first=newest_first)
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """Returns the newest message of a bag in a window."""
+        return self._of(path).newest(path, topic, window)
+
+    def batches(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
+    ) -> Iterator[Batch]:
+        """Yields the messages of a bag, many at once."""
+        return self._of(path).batches(path, topics, window, bare=bare)
+
+    def times_alone(self, path: Path) -> Collection[str]:
+        """Returns the topics of which a bag has times, and no payloads."""
+        return self._of(path).times_alone(path)
+
+    def is_file(self, path: Path) -> bool:
+        """Returns whether a bag is a file: whether it is the robot's own."""
+        return self._of(path).is_file(path)
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Returns the channels of a bag."""
+        return self._of(path).channels(path)
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Returns why no message of this channel can be decoded; None if its type is known."""
+        return self.own.undecodable(channel)
+
+    def decode(self, record: Record) -> object:
+        """Decodes a message."""
+        return self.own.decode(record)
+
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns the fields of a channel's messages."""
+        return self.own.definition(channel)
