@@ -169,6 +169,7 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     Raises:
         ConfigError: the file of its places is refused.
     """
+    from ros2_memory.fleet.joined import JoinedIndex, JoinedReader
     from ros2_memory.fleet.robots import Robot
 
     own = robot_settings(settings, name)
@@ -179,30 +180,27 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     memory = replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
     if lake is None:
         return Robot(name, own.recording.bag_dir, memory)
-    if name in settings.fleet.robots:
-        with_lake = _with_lake(memory, lake, own, name, shared)
-        return Robot(name, own.recording.bag_dir, with_lake, memory, in_lake=True)
-    return Robot(name, Path(name), _with_lake(memory, lake, own, name, shared), in_lake=True)
+    shipped = _shipped(memory, lake, own, name, shared)
+    if name not in settings.fleet.robots:
+        return Robot(name, Path(name), shipped, in_lake=True)
+    both = replace(
+        shipped,
+        index=JoinedIndex(shipped.index, memory.index),
+        reader=JoinedReader(shipped.reader, memory.reader),
+    )
+    return Robot(name, own.recording.bag_dir, both, memory, in_lake=True)
 
 
-def _with_lake(memory: Memory, lake: Lake, own: Settings, name: str, shared: SharedParts) -> Memory:
-    """Returns the memory of a robot's bags in a lake, and of its own that are not there.
-
-    Its columns are in a store of their own.
-    """
+def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: SharedParts) -> Memory:
+    """Returns the memory of a robot's bags in a lake; its columns are in a store of their own."""
     from ros2_memory.columns.scanner import Scanner
-    from ros2_memory.fleet.joined import JoinedIndex, JoinedReader
     from ros2_memory.lake.memory import LakeIndex, LakeReader
 
     index = LakeIndex(lake, name, memory.index.bag_dir, memory.clock)
+    reader = LakeReader(index, shared.reader, shared.large)
     store, reading = build_columns(own, shared.reader, name), reading_of(own, shared.schemas)
-    return replace(
-        memory,
-        index=JoinedIndex(index, memory.index),
-        reader=JoinedReader(LakeReader(index, shared.reader, shared.large), memory.reader),
-        scanner=Scanner(store, index.bag_dir, reading, shared.large, shared.caches),
-        memo=Memo(),
-    )
+    scanner = Scanner(store, index.bag_dir, reading, shared.large, shared.caches)
+    return replace(memory, index=index, reader=reader, scanner=scanner, memo=Memo())
 
 
 def robot_settings(settings: Settings, name: str) -> Settings:
