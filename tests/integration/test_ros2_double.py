@@ -11,7 +11,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import pytest
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
 
+from ros2_memory.recorder.process.command import storage_config
 from tests.integration.ros_recordings import (
     Recording,
     in_file,
@@ -88,7 +91,7 @@ def session(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 def drive_once(folder: Path, real: RealRecorder | None) -> Session:
     storage, qos = folder / "storage.yaml", folder / "qos.yaml"
-    storage.write_text("chunkSize: 16384\ncompression: Zstd\n")
+    storage.write_text(storage_config(16384))
     qos.write_text(
         "/tf_static: {history: keep_all, reliability: reliable, durability: transient_local}\n"
     )
@@ -125,6 +128,15 @@ def halted(recording: Recording) -> Iterator[None]:
     recording.await_said("Recording...")
     recording.process.send_signal(signal.SIGSTOP)
     yield
+
+
+def test_chunks_have_a_crc_only_where_the_configuration_asks_for_it(session: Session) -> None:
+    for recording, has_crc in ((session.small, True), (session.default, False)):
+        for split in recording.splits():
+            with split.open("rb") as stream:
+                records = [*StreamReader(stream, emit_chunks=True).records]
+            crcs = [record.uncompressed_crc for record in records if isinstance(record, Chunk)]
+            assert {crc != 0 for crc in crcs} == {has_crc}
 
 
 def test_a_clean_end_exits_with_0(session: Session) -> None:

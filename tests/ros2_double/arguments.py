@@ -130,6 +130,11 @@ def _yaml(file: Path | None) -> dict[str, Any]:
 
 def _layout(given: dict[str, Any]) -> Layout:
     compression = given.get("compression", "None")
-    if given.keys() - {"chunkSize", "compression"} or compression not in {"None", "Zstd"}:
+    known = {"chunkSize", "compression", "noChunkCRC"}
+    if given.keys() - known or compression not in {"None", "Zstd"}:
         raise RefusedError(f"the double does not write MCAP by {given}")
-    return Layout(given.get("chunkSize", Layout.chunk_bytes), compression == "Zstd")
+    chunk_bytes, has_crc = (
+        given.get("chunkSize", Layout.chunk_bytes),
+        not given.get("noChunkCRC", True),
+    )
+    return Layout(chunk_bytes, compression == "Zstd", has_crc)

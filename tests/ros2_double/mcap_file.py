@@ -54,6 +54,7 @@ class Layout:
 
     chunk_bytes: int = 768 * 1024  # before compression
     is_compressed: bool = False
+    has_crc: bool = False
 
 
 class _BlockFile:
@@ -170,7 +171,8 @@ class McapFile:
                 compression, data = "zstd", packed
         times = [time for entries in self._index.values() for time, _ in entries]
         begin, end = min(times), max(times)
-        start, length = self._put(Chunk(compression, data, end, begin, 0, len(content)))
+        crc = zlib.crc32(content) if self._layout.has_crc else 0
+        start, length = self._put(Chunk(compression, data, end, begin, crc, len(content)))
         offsets = {
             channel: self._put(MessageIndex(channel, entries))[0]
             for channel, entries in self._index.items()

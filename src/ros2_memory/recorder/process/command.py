@@ -109,6 +109,8 @@ def storage_config(chunk_bytes: int) -> str:
     """Returns YAML for `--storage-config-file`: zstd, in chunks of so many uncompressed bytes.
 
     A chunk that is not full yet is lost with the process, so the size bounds the loss (README of
-    the ROS package rosbag2_storage_mcap).
+    the ROS package rosbag2_storage_mcap). By default rosbag2 writes no CRC of a chunk, and a bit
+    that flips on the disk would be a wrong value that nothing shows.
     """
-    return yaml.safe_dump({"chunkSize": chunk_bytes, "compression": "Zstd"}, sort_keys=True)
+    how = {"chunkSize": chunk_bytes, "compression": "Zstd", "noChunkCRC": False}
+    return yaml.safe_dump(how, sort_keys=True)
