@@ -19,7 +19,7 @@ from itertools import chain, starmap
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import abbreviate, caseless
 from ros2_memory.messages.conversions import Summary
 from ros2_memory.messages.detections import detections_of, looks_like_json, without_low_scores
 
@@ -84,7 +84,7 @@ class Contains:
     @cached_property
     def others(self) -> tuple[str, ...]:
         """The casefolded words that must not be there."""
-        words = (_text_of(self.needle) or "").casefold().split() if self.whole else []
+        words = caseless(_text_of(self.needle) or "").split() if self.whole else []
         return tuple(word[1:] for word in words if word[0] == "-" and len(word) > 1)
 
     @cached_property
@@ -92,8 +92,8 @@ class Contains:
         """The needle as casefolded text; None where no text can contain it."""
         text = _text_of(self.needle)
         if text is None or not self.others:
-            return None if text is None else text.casefold()
-        return " ".join(word for word in text.casefold().split() if word[0] != "-")
+            return None if text is None else caseless(text)
+        return " ".join(word for word in caseless(text).split() if word[0] != "-")
 
     @cached_property
     def boolean(self) -> bool | None:
@@ -116,7 +116,7 @@ class Contains:
         """Returns whether a leaf is a string that has the needle, or the boolean that it means."""
         if not isinstance(leaf, str):
             return isinstance(leaf, bool) and leaf is self.boolean
-        folded = leaf.casefold()
+        folded = caseless(leaf)
         if not self.whole:
             return self.folded is not None and self.folded in folded
         if not self.folded or not _has_words(folded, self.folded):
@@ -145,7 +145,7 @@ class Equals:
     @cached_property
     def folded(self) -> str | None:
         """The casefolded text that is equal; None where no text is."""
-        return self.value.casefold() if isinstance(self.value, str) else None
+        return caseless(self.value) if isinstance(self.value, str) else None
 
     @cached_property
     def boolean(self) -> bool | None:
@@ -173,10 +173,10 @@ class Equals:
             return any(leaf == number for number in numbers)
         if not isinstance(leaf, str) or self.folded is None:
             return False
-        folded = leaf.casefold()
+        folded = caseless(leaf)
         return folded == self.folded or (
             self.folded in folded
-            and any(label.casefold() == self.folded for label in _labels_in_json(leaf))
+            and any(caseless(label) == self.folded for label in _labels_in_json(leaf))
         )
 
 
@@ -570,7 +570,7 @@ def _meaning(value: Scalar) -> bool | int | float | None:
     """Returns a boolean or number as it is, or the one that a string spells, if any."""
     if not isinstance(value, str):
         return value
-    word = value.strip().casefold()
+    word = caseless(value.strip())
     if word in {"true", "false"}:
         return word == "true"
     if _WHOLE.fullmatch(word):

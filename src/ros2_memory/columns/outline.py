@@ -13,6 +13,7 @@ import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.table import IN_PART, Numbers, Table, Texts, letters_of, words_of
+from ros2_memory.core.text import caseless
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -65,7 +66,7 @@ class Letters(NamedTuple):
         """Returns the letters of texts; None where they are too many."""
         number_of: dict[frozenset[str], int] = {}
         spelling = [
-            number_of.setdefault(frozenset(words_of(text.casefold())), len(number_of))
+            number_of.setdefault(frozenset(words_of(caseless(text))), len(number_of))
             for text in texts.words
         ]
         words = sorted(frozenset().union(*number_of))

@@ -51,6 +51,7 @@ import zstandard
 from ros2_memory.columns.steps import EXACT, MOST_RELATIVE, Step
 from ros2_memory.columns.table import IN_PART, Column, Numbers, Texts, Zone, letters_of
 from ros2_memory.core.large_reads import LARGE_BYTES
+from ros2_memory.core.text import caseless
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -59,7 +60,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
-FORMAT: Final = 30
+FORMAT: Final = 31
 """Version of the file. Raise it with every change of its tables, of their bytes, and of the rules
 by which fragments are made: only those of sights have a version of their own."""
 MOST_WORDS_BYTES: Final = 4_096
@@ -394,10 +395,10 @@ def folded(words: Collection[str]) -> str | None:
     JSON with numbers is another text each time, and has few names.
     """
     if sum(map(len, words)) + len(words) <= MOST_WORDS_BYTES:
-        whole = "\n".join(dict.fromkeys(word.casefold() for word in words))
+        whole = "\n".join(dict.fromkeys(caseless(word) for word in words))
         if _is_small(whole):
             return whole
-    names = {name for word in words for name in letters_of(word.casefold())}
+    names = {name for word in words for name in letters_of(caseless(word))}
     in_part = "\n".join([IN_PART, *sorted(names)])
     return in_part if _is_small(in_part) else None
 

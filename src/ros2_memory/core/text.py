@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
 from dataclasses import dataclass
 from fnmatch import translate
 from itertools import islice
@@ -44,6 +45,12 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")
 _MOST_KEYS: Final = 12
 _MOST_KEYS_CHARS: Final = 300
 """Of more places, or longer ones, a reply lists its own keys above them."""
+
+
+def caseless(text: str) -> str:
+    """Returns a text as it is compared: without regard to case, and to how accents are written."""
+    folded = text.casefold()
+    return folded if folded.isascii() else unicodedata.normalize("NFC", folded)
 
 
 def dotted(path: str, name: str) -> str:

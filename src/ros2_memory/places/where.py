@@ -21,7 +21,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
 from ros2_memory.core.spans import Spans, lies_inside, united, without
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import abbreviate, caseless
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
@@ -215,7 +215,7 @@ def places_setting(limits: QuerySettings) -> str:
 
 def _place_named(limits: QuerySettings, name: str) -> Place | None:
     def folded(words: str) -> str:
-        return " ".join(words.split()).casefold()
+        return caseless(" ".join(words.split()))
 
     same = (named for named in limits.places if folded(named.name) == folded(name))
     return next(same, None)

@@ -40,7 +40,7 @@ from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
+from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, caseless, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_since
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.recorder.thinning import (
@@ -159,7 +159,7 @@ class MemoryDays:
         self._extractor = extractor
         self.keeps = limits is not None
         self._limits = limits or MemoryLimits()
-        self._people = _PEOPLE.union(map(str.casefold, self._limits.people))
+        self._people = _PEOPLE.union(map(caseless, self._limits.people))
         self._static_topics = frozenset(static_topics)
         self._minutes: set[Path] = set()
         self._monotonic = monotonic
@@ -450,7 +450,7 @@ class MemoryDays:
 
     def _is_of_people(self, name: str) -> bool:
         """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
-        return not self._people.isdisjoint(map(str.casefold, _WORD.findall(name)))
+        return not self._people.isdisjoint(map(caseless, _WORD.findall(name)))
 
     def _write_day(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
         """Writes a day anew, with more messages, which are those of some bags that stay.

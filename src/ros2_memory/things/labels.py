@@ -7,11 +7,10 @@ declared by the owner.
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
+from ros2_memory.core.text import MAX_LABEL_CHARS, caseless, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -68,7 +67,7 @@ _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
 def plain(label: str) -> str:
     """Returns a label in lower case with single spaces, its accents as parts of their letters."""
-    return unicodedata.normalize("NFC", _SPACING.sub(" ", label).strip().casefold())
+    return caseless(_SPACING.sub(" ", label).strip())
 
 
 def singular(label: str) -> str:

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from itertools import count
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
@@ -151,6 +152,15 @@ def test_a_number_equals_what_a_float32_field_stores_of_it(held: float, nudge: f
     stored = float(np.float32(asked))
     is_meant = stored != 0 and not 2**24 <= abs(asked) < 2**53
     assert Condition(Equals(asked)).matches(stored) is (is_meant or stored == asked)
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_how_accents_are_written_makes_no_difference(form: Literal["NFC", "NFD"]) -> None:
+    held = unicodedata.normalize(form, "Päckchen")
+    for asked in ("päckchen", unicodedata.normalize("NFD", "PÄCKCHEN")):
+        for test in (Equals(asked), Contains(asked), Contains(asked, whole=True)):
+            assert Condition(test).matches([held])
+    assert not Condition(Contains("packchen")).matches([held])
 
 
 @given(asked_scalars)
