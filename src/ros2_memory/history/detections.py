@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
@@ -108,8 +109,7 @@ class DetectionRows:
         for stored in messages_of(self._view, rows):
             message = self._view.bags.decode(stored)
             if message is not None:
-                frame = extractor.frame(message)
-                stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
+                frame, stamp = extractor.frame(message), _stamp_of(message)
                 detections = [
                     detection if detection.frame_id else detection._replace(frame_id=frame)
                     for detection in detections_of(extractor.exact(message, stored.type))
@@ -126,14 +126,28 @@ class DetectionRows:
         )
 
 
+def seen_at(view: View, stored: StoredMessage) -> Ns:
+    """Returns when what a message detects was seen, as `Detected.times` has it."""
+    stamp = _stamp_of(view.bags.decode(stored))
+    if stamp is None:
+        return stored.time
+    return int(_seen_at(np.array([stored.time]), np.array([stamp]))[0])
+
+
+def _stamp_of(message: object) -> Ns | None:
+    return nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
+
+
+def _seen_at(log_times: IntArray, stamps: IntArray) -> IntArray:
+    # A stamp of another clock cannot be compared with those of transforms.
+    latency = log_times - stamps
+    is_of_this_clock = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
+    return np.where(is_of_this_clock, stamps, log_times)
+
+
 def _with_times(
     log_times: IntArray, stamps: IntArray | None, detections: Detections, frames: Texts
 ) -> Detected:
-    times = log_times
-    if stamps is not None:
-        # A stamp of another clock cannot be compared with those of transforms.
-        latency = log_times - stamps
-        is_of_this_clock = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
-        times = np.where(is_of_this_clock, stamps, log_times)
+    times = log_times if stamps is None else _seen_at(log_times, stamps)
     places = METRES.nearest(detections.places)
     return Detected(log_times, times, detections._replace(places=places), frames)

@@ -26,6 +26,7 @@ from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
+from ros2_memory.history.detections import seen_at
 from ros2_memory.history.held_values import held_at, held_until, is_latched
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
@@ -508,10 +509,10 @@ def _place_of_detection(
     """Returns where the thing of a message was: in one of some frames, or the message's own."""
     if thing is None or thing.place is None:
         return None
-    seen = Pose(thing.place, None, thing.frame_id)
+    seen, time = Pose(thing.place, None, thing.frame_id), seen_at(view, message)
     position, frame = thing.place, thing.frame_id
     for target in targets:
-        placed = pose_in(view, seen, target, message.time, message.bag.recording)
+        placed = pose_in(view, seen, target, time, message.bag.recording)
         if placed is not None:
             position, frame = placed.position, target
             break

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 import random
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -159,6 +160,26 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
     write_mcap(tmp_path / "bag.mcap", [*placed, *poses, *far])
     answer = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "cup")
     assert any("no transform leads to map" in note for note in answer.notes)
+
+
+def test_the_place_of_a_sighting_is_where_the_thing_was_at_the_stamp_of_its_message(
+    tmp_path: Path,
+) -> None:
+    """A detector that takes two seconds, on a robot that turns 45 degrees in each."""
+    turning = []
+    for tenth in range(200):
+        at = BEGIN + tenth * S // 10
+        turn = transform(at, "map", "base_link", (1.0, 2.0, 0.0), math.pi / 40 * tenth)
+        turning.append(tf(at, turn))
+    shown = BEGIN + 10 * S  # as the robot looks along y of the map
+    seen = replace(detections(shown, ["cup"], at=(3.0, 0.0, 0.0)), log_time=shown + 2 * S)
+    write_mcap(tmp_path / "bag.mcap", [*turning, seen])
+    memory = memory_of(tmp_path)
+    [row] = asked(
+        memory, tmp_path, "find_matches", topic=OBJECTS, condition_type="contains", value="cup"
+    )["sightings"]
+    place = {name: round(row["place"][name], 2) for name in ("x", "y")}
+    assert (place, row["place"]["frame_id"]) == ({"x": 1.0, "y": 5.0}, "map")
 
 
 def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Path) -> None:
