@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from itertools import chain, islice
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from ros2_memory.analysis.frames import TF_CACHE_NS
+from ros2_memory.analysis.frames import joined_edges
 from ros2_memory.analysis.motion.trajectory import (
     SLICE_NS,
     PathSlice,
@@ -19,10 +19,12 @@ from ros2_memory.analysis.motion.trajectory import (
     joined_slices,
     path_slice,
 )
-from ros2_memory.analysis.poses import Poses, joined_poses
+from ros2_memory.analysis.poses import NO_POSES, FrameCodes, Poses, joined_poses
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
 from ros2_memory.columns.kinds import PATHS
+from ros2_memory.columns.poses import rounded
 from ros2_memory.columns.scan import STRETCH_NS
+from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -41,12 +43,14 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
-from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
+from ros2_memory.history.poses import PoseReader, PoseRows
 from ros2_memory.history.robots import parallel_or_twice
-from ros2_memory.history.scan import blocks, in_time, joined_back, open_scan, remembered
+from ros2_memory.history.scan import blocks, in_time, joined_back, open_scan, remembered, scan
 from ros2_memory.history.sessions import decoded_transforms
 from ros2_memory.history.transforms import (
+    edges_of_rows,
     frames_of,
+    frames_over,
     transform_at,
 )
 
@@ -54,18 +58,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.frames import Edges, FrameTree
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.storage.base import IntArray
 
 T = TypeVar("T", bound="Sized")
 
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _BODIES: Final = ("base_footprint", "base_link")
-_MOST_BAGS_OF_BODY: Final = 128
-"""Bags of which transforms are read for a path."""
+_READ_NS: Final[Ns] = 3600 * NS_PER_S
+"""Of so long transforms are read at once."""
 _STEP_NS: Final[Ns] = NS_PER_S // 20
 """Poses by transforms are no closer than this."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
@@ -157,11 +163,8 @@ def slices_by_poses(
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     if topic in view.limits.tf_topics:
-        poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
-        if len(poses):
-            first, last = int(poses.times[0]), int(poses.times[-1])
-            for pose_slice in pose_slices([PoseRows(first, last, lambda: poses)], beside):
-                yield pose_slice.start, make(pose_slice)
+        for pose_slice in pose_slices(rows_of_body(view, window), beside):
+            yield pose_slice.start, make(pose_slice)
         return
     twice = () if view.call.stored else parallel_or_twice(view, topic, window)
     # What is stored follows from whole parts: also from those that the window cuts.
@@ -462,51 +465,74 @@ def newest_of_body(
     return None
 
 
-def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
-    """Returns the poses of the robot's body by transforms, in order; none without such a body.
+def rows_of_body(view: View, window: TimeWindow) -> Iterator[PoseRows]:
+    """Yields the poses of the robot's body by transforms, the newest first; none without a body.
 
-    In the frame of its odometry. At most twenty a second: all are looked up for each question.
-
-    Raises:
-        InvalidArgumentsError: there are too many bags for that.
-        QueryTimeoutError: the call's time runs out.
+    In the frame of its odometry, at most twenty a second. They are read as they are asked for, an
+    hour at a time, and each may then raise QueryTimeoutError.
     """
     body = robot_body(view)
-    if body is None:
-        return []
+    hours: set[int] = set()
+    for topic in () if body is None else view.moving_topics:
+        firsts, lasts = ((times // _READ_NS).tolist() for times in view.bounds(topic, window))
+        for first, last in zip(firsts, lasts, strict=True):
+            hours.update(range(first, last + 1))
+    for hour in sorted(hours, reverse=True):
+        piece = TimeWindow(hour * _READ_NS, (hour + 1) * _READ_NS).intersect(window)
+        if body is not None and not piece.empty:
+            read = partial(_poses_of_body, view, piece, body)
+            yield PoseRows(piece.start, piece.stop - 1, read)
+
+
+def _poses_of_body(view: View, window: TimeWindow, body: Body) -> Poses:
+    """Returns the poses of the body in a window, by the transforms of all sessions."""
     bags = view.stream.overlapping_bags(view.moving_topics, window)
-    if len(bags) > _MOST_BAGS_OF_BODY:
-        raise InvalidArgumentsError(
-            f"by transforms, a path is read from {_MOST_BAGS_OF_BODY} bags at most: these are "
-            f"{len(bags)}; ask about a shorter window"
-        )
-    poses: dict[Ns, Pose] = {}
-    for session in dict.fromkeys(view.sessions.of(span.bag.recording) for span in bags):
-        poses.update(_poses_of_body_in(view, window, session, body))
-        view.bags.check_deadline()
-    return sorted(poses.items())
+    sessions = dict.fromkeys(view.sessions.of(span.bag.recording) for span in bags)
+    poses = joined_poses([_poses_by_session(view, window, each, body) for each in sessions])
+    return poses.rows(_apart(poses.times))
 
 
-def _poses_of_body_in(
-    view: View, window: TimeWindow, session: Session, body: Body
-) -> Iterator[tuple[Ns, Pose]]:
-    """Yields the poses of the body by one session's transforms, each with its log time (ns)."""
-    moving = view.sessions.moving(session, window.widened(TF_CACHE_NS))
-    frames = frames_of(view, view.sessions.static(session), moving, body.odometry)
-    of_body = [
-        transform
-        for transform in moving
-        if transform.child.lstrip("/") == body.child and window.contains(transform.log_time)
-    ]
-    by_stamp = frames.clock == "stamp"
-    moments = [transform.stamp if by_stamp else transform.log_time for transform in of_body]
-    placed = frames.poses(body.child, np.array(moments, np.int64))
+def _poses_by_session(view: View, window: TimeWindow, session: Session, body: Body) -> Poses:
+    scanned = chain.from_iterable(scan(view, topic, window) for topic in view.moving_topics)
+    edges = joined_edges([edges_of_rows(view, rows, session) for rows in scanned])
+    poses = placed_body(
+        edges, body.child, frames_over(view, session, window, body.odometry), window
+    )
+    return replace(poses, positions=rounded(poses.positions, METRES))
+
+
+def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow) -> Poses:
+    """Returns where a body was in the target of frames whenever its transform was received.
+
+    Where no transform leads to the target there is none, as before the first one of the map, or in
+    a gap of these.
+    """
+    of_body = [edge for (_, name), edge in edges.items() if name == child]
+    if not of_body:
+        return NO_POSES
+    times = np.concatenate([edge.log_times for edge in of_body])
+    stamps = np.concatenate([edge.stamps for edge in of_body])
+    order = np.argsort(times, kind="stable")
+    first, end = np.searchsorted(times[order], (window.start, window.stop)).tolist()
+    order = order[first:end]
+    placed = frames.poses(child, (stamps if frames.clock == "stamp" else times)[order])
     if placed is None:
-        return
-    last = MIN_NS
-    # None is before the first transform of the map, or in its gap.
-    for nth in np.flatnonzero(placed.valid).tolist():
-        time = of_body[nth].log_time
+        return NO_POSES
+    poses = Poses(
+        times[order],
+        np.stack(placed.translation, axis=1),
+        np.stack(placed.rotation, axis=1),
+        FrameCodes(np.zeros(order.size, np.uint32), (frames.target,)),
+        np.full(order.size, np.nan),
+    )
+    return poses.rows(np.flatnonzero(placed.valid))
+
+
+def _apart(times: IntArray) -> IntArray:
+    """Returns the positions of those ascending times that are `_STEP_NS` apart, or more."""
+    last, positions = MIN_NS, list[int]()
+    for position, time in enumerate(times.tolist()):
         if time - last >= _STEP_NS:
-            last, there = time, placed.at(nth)
-            yield time, Pose(there.translation, there.rotation, body.odometry)
+            last = time
+            positions.append(position)
+    return np.array(positions, np.int64)

@@ -18,7 +18,6 @@ import numpy as np
 
 from ros2_memory.analysis.frames import (
     TF_CACHE_NS,
-    Edges,
     Floats,
     FrameTree,
     Mask,
@@ -50,10 +49,10 @@ from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import (
-    Body,
     body_by_transforms,
     frame_of_newest_pose,
     note_left_out,
+    placed_body,
 )
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.robots import recordings_apart
@@ -421,7 +420,9 @@ class TrackReader:
                 placed.append(_placed_poses(of_span, frames, self._frame_id))
             else:
                 edges = edges_of_rows(self._view, rows, lent.session)
-                placed.append(_placed_body(edges, self._body, frames, lent.span))
+                of_body = placed_body(edges, self._body.child, frames, lent.span)
+                x, y, _ = of_body.positions.T
+                placed.append(Placed(of_body.times, x, y, headings(of_body.turns), 0))
         return _in_time_order(placed)
 
 
@@ -486,29 +487,6 @@ def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed
     kept = np.flatnonzero(valid)
     left_out = len(poses) - len(kept)
     return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
-
-
-def _placed_body(edges: Edges, body: Body, frames: FrameTree, span: TimeWindow) -> Placed:
-    """Returns the robot's body in the target of frames, whenever its transform was received."""
-    of_body = [edge for (_, child), edge in edges.items() if child == body.child]
-    if not of_body:
-        return NOWHERE
-    times = np.concatenate([edge.log_times for edge in of_body])
-    stamps = np.concatenate([edge.stamps for edge in of_body])
-    order = np.argsort(times, kind="stable")
-    order = order[_positions_in(times[order], span)]
-    in_target = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
-    if in_target is None:
-        return NOWHERE
-    x, y, _ = in_target.translation
-    valid = in_target.valid
-    return Placed(
-        times[order][valid],
-        x[valid],
-        y[valid],
-        headings(np.stack(in_target.rotation, axis=1))[valid],
-        0,
-    )
 
 
 def _positions_in(times: Times, window: TimeWindow) -> Times:
