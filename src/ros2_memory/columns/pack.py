@@ -155,7 +155,7 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     is_rounded = form == "rounded"
     lowest = int(_ordered(np.array([least], dtype), rounded=is_rounded)[0])
     whole = _whole_numbers(arrangement, count, lowest, data)
-    return _from_ordered(whole, dtype, rounded=is_rounded).astype(dtype, copy=False)
+    return _from_ordered(whole, dtype, rounded=is_rounded)
 
 
 class _Codecs(threading.local):
@@ -236,7 +236,8 @@ def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
             return _Whole(f"{name} /{per_unit}", float(errors.max()), zone, whole)
     if step.relative:
         whole = _ordered(column, rounded=True)
-        errors = np.abs(_from_ordered(whole, column.dtype, rounded=True) - values)
+        back = _from_ordered(whole, column.dtype, rounded=True)
+        errors = np.abs(back.astype(np.float64, copy=False) - values)
         if _are_small(errors, values):
             return _Whole(f"{name} rounded", float(errors.max()), zone, whole - whole.min())
     return _exactly(column, zone)  # tiny numbers have no bits to spare
@@ -284,13 +285,16 @@ def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
     return bits ^ ((bits >> 63) & magnitude)
 
 
-def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, rounded: bool) -> Floats:
+def _from_ordered(
+    whole: IntArray, dtype: np.dtype[np.generic[object]], *, rounded: bool
+) -> Numbers:
+    """Returns the floats of which `_ordered` made integers."""
     integer, magnitude, dropped = _BITS[dtype.itemsize]
     if rounded:
         bits = (whole ^ ((whole >> 63) & (magnitude >> dropped))) << dropped
     else:
         bits = whole ^ ((whole >> 63) & magnitude)
-    return bits.astype(integer, copy=False).view(dtype).astype(np.float64, copy=False)
+    return bits.astype(integer, copy=False).view(dtype)
 
 
 # Whole numbers
