@@ -180,8 +180,7 @@ class MergedStream:
             next((copy for copy in copies if copy.identity == stored.identity), None)
 
     def _is_repeated(self, stored: StoredMessage) -> bool:
-        record = stored.record
-        if not record.may_be_repeated:
+        if not stored.record.may_be_repeated:
             return False
         self._find_first_copies(stored)
         own = stored.time, stored.bag.recording

@@ -18,7 +18,7 @@ _log = get_logger(__name__)
 
 _INFORM = frozenset({LineKind.READY, LineKind.SUBSCRIBED, LineKind.STOPPED})
 _ADVICE = {
-    LineKind.QOS_REFUSED: ("messages of this publisher are not recorded: its QoS does not fit"),
+    LineKind.QOS_REFUSED: "messages of this publisher are not recorded: its QoS does not fit",
     LineKind.UNKNOWN_TYPE: (
         "the topic is not recorded, nor are others of its type, which ros2 bag record does not "
         "name: name the workspace that defines the type in recorder.setup_files"
@@ -114,16 +114,21 @@ class EventLog:
                 topic = {} if line.topic is None else {"topic": line.topic}
                 self.info(line.kind.value, recording=recording, **topic)
             elif line.kind in _ADVICE:
-                about = f"{line.topic}: " if line.topic else ""
-                sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
-                lasts = line.topic is not None and line.kind in _LASTING
-                # Each new recorder says it again, which is no newer fault than why it was started.
-                is_known = lasts and (line.kind, line.topic) in self._of_topics
-                report = self.remark if is_known else self.warn
-                report(line.kind.value, sentence, recording=recording)
-                if lasts and len(self._of_topics) < _MOST_TOPICS:
-                    self._of_topics.add((line.kind, line.topic or ""))
+                self._advise(recording, line)
             elif line.kind is LineKind.ERROR:
                 self.fail("recorder_error", line.text, recording=recording)
             else:
                 self.warn("recorder_warning", line.text, recording=recording)
+
+    def _advise(self, recording: str, line: Line) -> None:
+        """Logs what to do about a line; of a topic that stays unrecorded once as a fault."""
+        about = f"{line.topic}: " if line.topic else ""
+        report = self.warn
+        if line.topic is not None and line.kind in _LASTING:
+            # Each new recorder says it again, which is no newer fault than why it was started.
+            if (line.kind, line.topic) in self._of_topics:
+                report = self.remark
+            elif len(self._of_topics) < _MOST_TOPICS:
+                self._of_topics.add((line.kind, line.topic))
+        sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
+        report(line.kind.value, sentence, recording=recording)
