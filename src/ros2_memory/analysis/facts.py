@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import joined_codes, merged_times
+from ros2_memory.core.arrays import joined_codes, merged_times, numbered
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.arrays import Flags, Floats, Ints
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.timebase import Ns
 
 LOG: Final = "rcl_interfaces/msg/Log"
@@ -211,7 +212,7 @@ def _goals(value: JsonValue) -> Iterator[Fact]:
             yield Word(GOAL, "".join(f"{part:02x}" for part in parts)), status
 
 
-def _entries(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
+def _entries(value: JsonValue, key: str) -> Iterator[JsonObject]:
     listed = value.get(key) if isinstance(value, dict) else None
     for entry in listed if isinstance(listed, list) else ():
         if isinstance(entry, dict):
@@ -267,13 +268,9 @@ class Facts(NamedTuple):
     @classmethod
     def of(cls, facts: Sequence[tuple[int, Fact]]) -> Facts:
         """Returns facts, each given with its row."""
-        code_of: dict[Word, int] = {}
-        return cls(
-            np.array([row for row, _ in facts], np.int64),
-            np.array([code_of.setdefault(word, len(code_of)) for _, (word, _) in facts], np.int64),
-            np.array([value for _, (_, value) in facts], np.float64),
-            tuple(code_of),
-        )
+        words, codes = numbered(word for _, (word, _) in facts)
+        values = np.array([value for _, (_, value) in facts], np.float64)
+        return cls(np.array([row for row, _ in facts], np.int64), codes, values, words)
 
     def of_kinds(self, kinds: Collection[str]) -> Facts:
         """Returns those of some kinds."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.table import IN_PART, Numbers, Table, Texts, letters_of, words_of
+from ros2_memory.core.arrays import numbered
 from ros2_memory.core.text import caseless
 
 if TYPE_CHECKING:
@@ -64,20 +65,12 @@ class Letters(NamedTuple):
     @classmethod
     def of(cls, texts: Texts) -> Letters | None:
         """Returns the letters of texts; None where they are too many."""
-        number_of: dict[frozenset[str], int] = {}
-        spelling = [
-            number_of.setdefault(frozenset(words_of(caseless(text))), len(number_of))
-            for text in texts.words
-        ]
-        words = sorted(frozenset().union(*number_of))
+        spellings, nth = numbered(frozenset(words_of(caseless(text))) for text in texts.words)
+        words = sorted(frozenset().union(*spellings))
         if len(words) > _MOST_LETTERS:
             return None
-        has_word = np.array(
-            [[word in spelled for spelled in number_of] for word in words], np.bool_
-        )
-        rows = has_word.reshape(len(words), len(number_of))[
-            :, np.array(spelling, np.int64)[texts.codes]
-        ]
+        has_word = [[word in spelling for spelling in spellings] for word in words]
+        rows = np.array(has_word, np.bool_).reshape(len(words), len(spellings))[:, nth[texts.codes]]
         return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
 
     def may_have(self, text: str) -> Mask:

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.arrays import in_ranges
+from ros2_memory.core.arrays import in_ranges, numbered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -151,9 +151,8 @@ class Texts:
     @classmethod
     def of(cls, values: Sequence[str]) -> Texts:
         """Returns the column of these strings."""
-        code_of: dict[str, int] = {}
-        codes = [code_of.setdefault(value, len(code_of)) for value in values]
-        return cls(np.array(codes, np.uint32), tuple(code_of))
+        words, codes = numbered(values)
+        return cls(codes.astype(np.uint32), words)
 
     def __len__(self) -> int:
         """Returns the number of rows."""

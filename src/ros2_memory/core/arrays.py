@@ -21,7 +21,7 @@ Ints: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool_]
 Which: TypeAlias = "Ints | Flags | slice[None, None, None]"
 
-Codes: TypeAlias = "Ints | NDArray[np.uint32]"
+Codes: TypeAlias = "Ints | NDArray[np.uint32] | NDArray[np.uint16]"
 
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
@@ -98,6 +98,13 @@ def stacked(tables: Sequence[T]) -> T:
     names = [column.name for column in fields(first)]
     columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
     return replace(first, **columns)
+
+
+def numbered(values: Iterable[Word]) -> tuple[tuple[Word, ...], Ints]:
+    """Returns the different values, in the order of their first, and which of them each one is."""
+    code_of: dict[Word, int] = {}
+    codes = [code_of.setdefault(value, len(code_of)) for value in values]
+    return tuple(code_of), np.array(codes, np.int64)
 
 
 def joined_codes(parts: Iterable[tuple[Codes, Sequence[Word]]]) -> tuple[Ints, tuple[Word, ...]]:

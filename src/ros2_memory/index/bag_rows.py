@@ -9,16 +9,17 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import accumulate, chain
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, overload
 
 import numpy as np
 
+from ros2_memory.core.arrays import numbered
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState, folder_path
 from ros2_memory.index.split_order import split_names_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 _ALL: Final = slice(None)
 _STATES: Final = tuple(BagState)
 _Places: TypeAlias = "NDArray[np.uint16]"
-
-T = TypeVar("T", bound="Hashable")
 
 
 class Summaries(NamedTuple):
@@ -61,9 +60,10 @@ class BagRows:
         files, sizes, mtimes, states, summaries, starts, ends, sidecars = zip(*bags, strict=True)
         self.names = split_names_of(files)
         folders = (stem.series.rpartition("/")[0] for stem in self.names.stems)
-        self.folders, folder_of = _numbered(folders)
-        self.folder_of: _Places = folder_of[self.names.positions]
-        kinds, self._kind_of = _numbered((id(known.schema), len(known.data)) for known in summaries)
+        self.folders, folder_of = numbered(folders)
+        self.folder_of: _Places = folder_of.astype(np.uint16)[self.names.positions]
+        kinds, kind_of = numbered((id(known.schema), len(known.data)) for known in summaries)
+        self._kind_of: _Places = kind_of.astype(np.uint16)
         self._place_of = np.empty_like(self._kind_of)
         self.summaries: list[Summaries] = []
         for kind in range(len(kinds)):
@@ -192,10 +192,3 @@ class Bags(Sequence[BagFile]):
     def _row(self, nth: int) -> tuple[BagRows, int]:
         part = bisect_right(self._edges, nth) - 1
         return self._parts[part], nth - self._edges[part]
-
-
-def _numbered(values: Iterable[T]) -> tuple[list[T], _Places]:
-    """Returns the different values, in their order, and for each one which of these it is."""
-    number_of: dict[T, int] = {}
-    numbers = [number_of.setdefault(value, len(number_of)) for value in values]
-    return [*number_of], np.array(numbers, np.uint16)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
+from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
@@ -164,12 +165,8 @@ class Timeline:
     @property
     def folder_numbers(self) -> NDArray[np.int64]:
         """For each of all bags a number; those of one folder have the same."""
-        number_of: dict[str, int] = {}
-        numbers = [np.empty(0, np.int64)]
-        for bags in (segment.bags for segment in self.segments):
-            numbered = [number_of.setdefault(name, len(number_of)) for name in bags.folders]
-            numbers.append(np.array(numbered)[bags.folder_of])
-        return np.concatenate(numbers)
+        bags = (segment.bags for segment in self.segments)
+        return joined_codes((part.folder_of, part.folders) for part in bags)[0]
 
     @cached_property
     def recorded_segments(self) -> tuple[Segment, ...]:

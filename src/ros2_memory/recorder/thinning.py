@@ -33,6 +33,7 @@ from ros2_memory.bag_dir.state_files import Thinned
 from ros2_memory.columns.plan import fields_at, is_time
 from ros2_memory.columns.steps import Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
+from ros2_memory.core.arrays import numbered
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import NAMES_IN_MESSAGES
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -347,9 +348,8 @@ class TopicThinning:
         rows: list[tuple[object, ...]] = [()] * times.size
         for owner, *values in zip(inner.owners.tolist(), *states, strict=True):
             rows[owner] = (*rows[owner], *values)
-        codes = {value: code for code, value in enumerate(dict.fromkeys(rows))}
-        numbered = np.array([codes[value] for value in rows])
-        self._stays += self._changed(path, numbered, rows, times)
+        _, codes = numbered(rows)
+        self._stays += self._changed(path, codes, rows, times)
 
     def _add_frames(
         self, inner: Elements, times: IntArray, named: Sequence[dict[Name, Scored]]

@@ -29,7 +29,15 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.core.arrays import Columns, Groups, begins_of, distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import (
+    Columns,
+    Groups,
+    begins_of,
+    distinct_rows,
+    in_ranges,
+    narrowed,
+    numbered,
+)
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.places import (
@@ -474,7 +482,7 @@ def _lowest_bin(min_score: float) -> int:
 
 def _groups(observed: _Observations, keys: Sequence[str]) -> list[_Group]:
     """Returns the labels in each epoch that have detections that count."""
-    distinct, key_of_label = _numbered(keys)
+    distinct, key_of_label = numbered(keys)
     spots, unplaced = observed.sights.spots, observed.sights.unplaced
     width = len(distinct) + 1
     epoch = observed.sights.epochs[spots[:, Spot.SLICE]]
@@ -487,12 +495,6 @@ def _groups(observed: _Observations, keys: Sequence[str]) -> list[_Group]:
         rows = np.flatnonzero(group_of == number)
         groups.append(_Group(distinct[key], group_epoch, rows, without_place))
     return groups
-
-
-def _numbered(keys: Sequence[str]) -> tuple[list[str], Ints]:
-    """Returns the distinct keys, and the number of that of each label among them."""
-    distinct = [*dict.fromkeys(keys)]
-    return distinct, np.array([distinct.index(key) for key in keys], np.int64)
 
 
 def _find_places(groups: Sequence[_Group], observed: _Observations) -> None:
@@ -661,7 +663,7 @@ def _hosts(
     """
     beside_spots = (observed.sights.beside[:, name] for name in Beside)
     table, beside = _StayTable.of(stays), Tally.of(len(observed.counts), *beside_spots)
-    names, key_of_label = _numbered(keys)
+    names, key_of_label = numbered(keys)
     key = np.array([names.index(group.key) for group, _ in stays], np.int64)
     # The spots of all stays, as numbers in order, and how often these and those before count.
     sizes = [len(stay.spots) for _, stay in stays]
