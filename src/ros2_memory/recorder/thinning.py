@@ -319,8 +319,9 @@ class TopicThinning:
             self._changes[path, slot].append((values, before[inside], after[inside]))
 
     def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
-        for slot in np.unique(times // EXTREMES_NS).tolist():
-            rows = np.flatnonzero((times // EXTREMES_NS == slot) & np.isfinite(numbers))
+        slots, is_finite = times // EXTREMES_NS, np.isfinite(numbers)
+        for slot in np.unique(slots).tolist():
+            rows = np.flatnonzero((slots == slot) & is_finite)
             samples = [
                 *self._extremes.get((path, slot), ()),
                 *zip(numbers[rows].tolist(), times[rows].tolist(), strict=True),
@@ -360,10 +361,11 @@ class TopicThinning:
             return
         for row, frame in zip(inner.owners.tolist(), column.values(), strict=True):
             named[row][frame, 0] = _UNSCORED
+        poses = _poses(inner.columns)
         for code, frame in enumerate(column.words):
             rows = np.flatnonzero(column.codes == code)
-            poses = {path: points[rows] for path, points in _poses(inner.columns).items()}
-            self._add_moves(frame, times[inner.owners[rows]], poses)
+            own = {path: points[rows] for path, points in poses.items()}
+            self._add_moves(frame, times[inner.owners[rows]], own)
 
 
 def is_sampled(table: Table) -> bool:
