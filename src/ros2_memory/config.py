@@ -61,7 +61,7 @@ from ros2_memory.things.labels import singular
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
 
 _T = TypeVar("_T")
 
@@ -714,9 +714,9 @@ def is_deployment_chosen(overrides: Sequence[str]) -> bool:
     return "MEMORY_CONFIG_DIR" in given or any(override.key in GROUPS for override in parsed)
 
 
-def plain_values(settings: Settings) -> dict[str, JsonValue]:
+def plain_values(settings: Settings) -> JsonObject:
     """Returns the configuration as JSON values, under the names that the files have."""
-    values: dict[str, JsonValue] = to_jsonable_python(settings, by_alias=True)
+    values: JsonObject = to_jsonable_python(settings, by_alias=True)
     return values
 
 

@@ -155,7 +155,7 @@ def with_shorter_lists(reply: JsonObject, names: Iterable[str]) -> JsonObject:
 
 
 def _print_object(console: Console, value: Mapping[str, JsonValue], now: float | None) -> None:
-    lists: dict[str, list[dict[str, JsonValue]]] = {}
+    lists: dict[str, list[JsonObject]] = {}
     lines = Table.grid(padding=(0, 2))
     lines.add_column(style="bold", no_wrap=True)
     lines.add_column(overflow="fold")
@@ -179,7 +179,7 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
         _print_rows(console, rows)
 
 
-def _objects(values: Sequence[JsonValue]) -> list[dict[str, JsonValue]]:
+def _objects(values: Sequence[JsonValue]) -> list[JsonObject]:
     """Returns the values where all are objects; else none."""
     rows = [row for row in values if isinstance(row, dict)]
     return rows if len(rows) == len(values) else []
@@ -304,9 +304,9 @@ def _all_keys(rows: Sequence[Mapping[str, JsonValue]]) -> list[str]:
     return list(dict.fromkeys(key for row in rows for key in row))
 
 
-def _flattened(value: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+def _flattened(value: Mapping[str, JsonValue]) -> JsonObject:
     """Returns an object whose small objects are keys with dots; positions stay objects."""
-    flat: dict[str, JsonValue] = {}
+    flat: JsonObject = {}
     for key, inner in value.items():
         if (
             not isinstance(inner, dict)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
 
 NEAR_M: Final = 0.5
 """The radius of a place: the server's default `data.position_tolerance_m`."""
@@ -65,7 +66,7 @@ class CallContext:
 
 
 Judge: TypeAlias = "Callable[[JsonValue, CallContext], str]"
-Expected: TypeAlias = "Callable[[float], dict[str, JsonValue]]"
+Expected: TypeAlias = "Callable[[float], JsonObject]"
 """What a reply has of the robot at a time t."""
 
 
@@ -216,26 +217,26 @@ def _metres(value: float) -> str:
     return f"{round(value, 2) + 0.0:.2f} m"  # nothing is -0.00 m
 
 
-def _position(t: float) -> dict[str, JsonValue]:
+def _position(t: float) -> JsonObject:
     x, y, _ = robot.pose(t)
     return {"x": x, "y": y, "z": 0.0}
 
 
-def _at_position(t: float) -> dict[str, JsonValue]:
+def _at_position(t: float) -> JsonObject:
     return {"value": {"position": _position(t)}}
 
 
-def _pose(t: float) -> dict[str, JsonValue]:
+def _pose(t: float) -> JsonObject:
     yaw = math.degrees(robot.pose(t).yaw)
     return {"frame_id": "odom", **_position(t), "yaw_deg": yaw}
 
 
-def _twist(t: float) -> dict[str, JsonValue]:
+def _twist(t: float) -> JsonObject:
     forward, turning = robot.twist(t)
     return {"linear": {"x": forward}, "angular": {"z": turning}}
 
 
-def _objects(t: float) -> dict[str, JsonValue]:
+def _objects(t: float) -> JsonObject:
     return {"value": {"detections": [{"label": thing.label} for thing in robot.seen(t)]}}
 
 

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
 
-_FOR_EVER: Final[dict[str, JsonValue]] = {"sec": 9223372036, "nsec": 854775807}
+_FOR_EVER: Final[JsonObject] = {"sec": 9223372036, "nsec": 854775807}
 _STOP_WITHIN_S: Final = 10.0
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue, Vector3
+    from ros2_memory.core.reply import JsonObject
 
 SCORES: Final = ("score", "confidence", "probability")
 NOT_LABELLED: Final = frozenset({"stride"})
@@ -127,7 +128,7 @@ def _walked(
 
 
 def _walked_object(
-    value: dict[str, JsonValue],
+    value: JsonObject,
     frame: str,
     depth: int,
     least: float | None,
@@ -143,7 +144,7 @@ def _walked_object(
     if best is not None and best_label is not None:
         detections.append(_placed((best, value), frame, best_label, _score(_hypothesis(best))))
         return value if least is None else _without_hypotheses(value, best, least)
-    fields: dict[str, JsonValue] = {}
+    fields: JsonObject = {}
     for name, inner in value.items():
         if name in LISTS_OF_LABELS and isinstance(inner, list):
             detections += [
@@ -159,9 +160,7 @@ def looks_like_json(text: str) -> bool:
     return text.lstrip()[:1] in _JSON
 
 
-def _without_hypotheses(
-    value: dict[str, JsonValue], best: dict[str, JsonValue], least: float
-) -> JsonValue:
+def _without_hypotheses(value: JsonObject, best: JsonObject, least: float) -> JsonValue:
     if _is_below(_hypothesis(best), least):
         return None
     results = value["results"]
@@ -172,11 +171,11 @@ def _without_hypotheses(
     return {**value, "results": kept} if None in kept else value
 
 
-def _is_below(value: dict[str, JsonValue], least: float | None) -> bool:
+def _is_below(value: JsonObject, least: float | None) -> bool:
     return least is not None and (score := _score(value)) is not None and score < least
 
 
-def _label(value: dict[str, JsonValue]) -> str | None:
+def _label(value: JsonObject) -> str | None:
     whole = None
     for name in naming(value):
         label = value.get(name)
@@ -187,7 +186,7 @@ def _label(value: dict[str, JsonValue]) -> str | None:
     return whole
 
 
-def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
+def _best_result(results: JsonValue) -> JsonObject | None:
     """Returns the hypothesis of the highest score; the first of several."""
     if not isinstance(results, list):
         return None
@@ -195,17 +194,17 @@ def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
     return max(objects, key=_rank, default=None)
 
 
-def _rank(result: dict[str, JsonValue]) -> float:
+def _rank(result: JsonObject) -> float:
     score = _score(_hypothesis(result))
     return -math.inf if score is None else score
 
 
-def _hypothesis(result: dict[str, JsonValue]) -> dict[str, JsonValue]:
+def _hypothesis(result: JsonObject) -> JsonObject:
     hypothesis = result.get("hypothesis")
     return hypothesis if isinstance(hypothesis, dict) else result
 
 
-def _score(value: dict[str, JsonValue]) -> float | None:
+def _score(value: JsonObject) -> float | None:
     for name in SCORES:
         score = number(value.get(name))
         if score is not None and not math.isnan(score):
@@ -213,14 +212,14 @@ def _score(value: dict[str, JsonValue]) -> float | None:
     return None
 
 
-def _frame(value: dict[str, JsonValue]) -> str:
+def _frame(value: JsonObject) -> str:
     header = value.get("header")
     frame = header.get("frame_id") if isinstance(header, dict) else value.get("frame_id")
     return frame if isinstance(frame, str) else ""
 
 
 def _placed(
-    objects: Sequence[dict[str, JsonValue]], outer: str, label: str, score: float | None
+    objects: Sequence[JsonObject], outer: str, label: str, score: float | None
 ) -> Detection:
     """Returns a detection at the first valid point of some objects in a frame.
 

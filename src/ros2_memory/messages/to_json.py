@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
 
 T = TypeVar("T")
 
@@ -237,7 +238,7 @@ class ExactJson:
             x, y, z = vector
             metric = self.write.metric
             return {"x": metric(x), "y": metric(y), "z": metric(z)}
-        fields: dict[str, JsonValue] = {}
+        fields: JsonObject = {}
         for name, attribute, summarize in shape.fields:
             inner: object = getattr(node, attribute, ABSENT)
             if summarize is not None:

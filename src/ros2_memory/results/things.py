@@ -19,6 +19,7 @@ from ros2_memory.core.reply import (
     TOTAL,
     YAW,
     Absent,
+    JsonObject,
     Keys,
     Scope,
     Unit,
@@ -118,7 +119,7 @@ class StillThere:
     looks: int = 0
 
     @property
-    def by_state(self) -> dict[str, JsonValue]:
+    def by_state(self) -> JsonObject:
         """The time under its state."""
         return {self.state: moment(self.at)}
 
@@ -479,7 +480,7 @@ class Comparison(AnswerWithNotes):
         return [(name, point) for name, point in points if point is not None]
 
     @property
-    def frames(self) -> dict[str, JsonValue]:
+    def frames(self) -> JsonObject:
         """The frames that places are in, where there are any; that of the path if it is another."""
         frames: list[str | None] = [self.frame_id or None] * self.things.is_any
         frames += [self.way_frame_id] * bool(self.stood or self.farthest_apart)

@@ -21,6 +21,7 @@ from ros2_memory.core.reply import (
     TOTAL,
     XYZ,
     Absent,
+    JsonObject,
     LocalTimes,
     Scope,
     Unit,
@@ -172,7 +173,7 @@ class TopicRange(AnswerWithNotes):
     def _names(self) -> Collection[str]:
         return dict.fromkeys(name for row in self._cells() for name in row).keys()
 
-    def _cells(self) -> list[dict[str, JsonValue]]:
+    def _cells(self) -> list[JsonObject]:
         return [
             dict(_parts("", sample.value) if isinstance(sample.value, dict) else ())
             for sample in self.samples

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping
 
     from ros2_memory.columns.fill import Progress
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.declaration import Tool
 
@@ -231,7 +231,7 @@ class EpisodicServer(MCPServer[object]):
         )
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
-    def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
+    def _resource_call(self, uri: str) -> tuple[str, JsonObject]:
         """Returns the tool of a resource, and its arguments."""
         for prefix, (_, tool, argument) in self._templates.items():
             if uri.startswith(prefix) and uri != prefix:
