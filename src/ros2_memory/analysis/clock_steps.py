@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span, ns_from_unix, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -70,7 +70,7 @@ class Elapsed:
         """Returns how much time passed from one moment to another."""
         return stop - start - self.skipped_between(start, stop)
 
-    def among(self, spans: Iterable[tuple[Ns, Ns]]) -> Ns:
+    def among(self, spans: Iterable[Span]) -> Ns:
         """Returns how much time passed in spans, all together."""
         return sum(self.between(start, stop) for start, stop in spans)
 
@@ -79,7 +79,7 @@ class Elapsed:
         return sum(max(0, min(stop, end) - max(start, begin)) for begin, end in self.skipped)
 
 
-def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> Ns | None:
+def delay_change(hole: Span, log_times: IntArray, stamps: IntArray) -> Ns | None:
     """Returns by how much the delays of a topic's messages, from stamp to log time, changed.
 
     None where that is not plain: of few messages, of delays that go up and down, or where the
@@ -107,7 +107,7 @@ def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> 
     return after - before
 
 
-def step_by_delays(hole: tuple[Ns, Ns], changes: Sequence[Ns]) -> ClockStep | None:
+def step_by_delays(hole: Span, changes: Sequence[Ns]) -> ClockStep | None:
     """Returns the step that a hole is, by `delay_change` of several topics; None if it is none."""
     if len(changes) < _AGREEING or max(changes) - min(changes) > ALIKE_NS:
         return None
@@ -115,7 +115,7 @@ def step_by_delays(hole: tuple[Ns, Ns], changes: Sequence[Ns]) -> ClockStep | No
     return ClockStep(last_before, by) if by >= SHORTEST_BY_STAMPS_NS else None
 
 
-def step_over(hole: tuple[Ns, Ns], before: Poses, after: Poses) -> ClockStep | None:
+def step_over(hole: Span, before: Poses, after: Poses) -> ClockStep | None:
     """Returns the step that a hole is; None where it may be a pause of the recording.
 
     Args:

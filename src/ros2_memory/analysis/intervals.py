@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.core.arrays import joined_codes
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -152,7 +152,7 @@ class IntervalTable(NamedTuple):
         best = _unpacked(self.rows)["best"]
         return self._select((best == _NO_SCORE) | (best >= _stored_scores(np.array([least]))))
 
-    def during(self, spans: Iterable[tuple[Ns, Ns]]) -> IntervalTable:
+    def during(self, spans: Iterable[Span]) -> IntervalTable:
         """Returns the intervals some of which is in one of these times (inclusive)."""
         rows = _unpacked(self.rows)
         chosen = np.zeros(rows.size, np.bool_)

@@ -23,11 +23,11 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from itertools import accumulate
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.pauses import SHORTEST_SILENCE_NS, SILENT_PERIODS
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -40,9 +40,6 @@ UNUSUAL: Final = 10
 LONGEST_OFF_NS: Final[Ns] = 7 * 86_400 * NS_PER_S
 _TOGETHER: Final = 3
 """The robot is on where one in so many of the topics is heard."""
-
-Span: TypeAlias = "tuple[Ns, Ns]"
-"""Log times, both inclusive."""
 
 
 class Spacing(NamedTuple):

@@ -55,7 +55,7 @@ from ros2_memory.bag_dir.layout import (
     utc_day,
 )
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -248,7 +248,7 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
 @until_changed(DELETED_FILE)
 def _deleted_by_recording(bag_dir: Path) -> Mapping[str, Deleted]:
     files: dict[str, dict[str, None]] = {}
-    spans: dict[str, list[tuple[Ns, Ns]]] = {}
+    spans: dict[str, list[Span]] = {}
     for row in DELETED.rows(bag_dir):
         files.setdefault(row.recording, {}).update(dict.fromkeys(row.files))
         spans.setdefault(row.recording, []).extend(row.spans)
@@ -265,7 +265,7 @@ def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
     return _deleted_by_recording(bag_dir) or {}
 
 
-def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
+def deleted_spans(bag_dir: Path) -> Sequence[Span]:
     """Returns the log times (half-open) of all that was deleted, sorted and apart."""
     spans = (span for row in read_deleted(bag_dir).values() for span in row.spans)
     return tuple(united(spans, _TOUCHING_NS))
@@ -522,7 +522,7 @@ class Erasure:
         spans = united((window.start, window.stop) for window in windows if not window.empty)
         return cls(tuple(sorted(topics)), tuple(spans), tuple(sorted(latched)))
 
-    def window_of(self, topic: str, log_time: Ns, publish_time: Ns) -> tuple[Ns, Ns] | None:
+    def window_of(self, topic: str, log_time: Ns, publish_time: Ns) -> Span | None:
         """Returns the window by which a message goes; None where it stays."""
         if topic not in self.topics:
             return None

@@ -33,7 +33,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataRe
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import counted, listed, shortened
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Span, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import recording_gaps
 from ros2_memory.history.no_data import resolve_topic
@@ -388,5 +388,5 @@ def topic_rows(asked: Asked) -> Rows:
     return rows
 
 
-def _unix(span: tuple[Ns, Ns]) -> Seconds:
+def _unix(span: Span) -> Seconds:
     return unix_from_ns(span[0]), unix_from_ns(span[1])

@@ -26,7 +26,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Span
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.stored_message import StoredMessage
@@ -115,7 +115,7 @@ class _Reads:
 
     def __init__(self, reader: BagReader) -> None:
         self._reader = reader
-        self._calls: list[dict[str, tuple[Ns, Ns]]] = []
+        self._calls: list[dict[str, Span]] = []
 
     def __getattr__(self, name: str) -> object:
         read = getattr(self._reader, name)
@@ -130,7 +130,7 @@ class _Reads:
 
     def _noting(self, read: _Read, *given: object, **options: object) -> object:
         """Returns what the reader returns, a message or several, noted when it is their turn."""
-        call: dict[str, tuple[Ns, Ns]] = {}
+        call: dict[str, Span] = {}
         self._calls.append(call)
 
         def noted(part: Record | Batch) -> Record | Batch:
@@ -149,7 +149,7 @@ class _Reads:
 
 def _parts(view: View) -> list[tuple[Path, TimeWindow]]:
     """Returns the recordings, each from when to when there is no gap."""
-    reach: dict[Path, tuple[Ns, Ns]] = {}
+    reach: dict[Path, Span] = {}
     for bag in view.timeline.recorded:
         start, stop = reach.get(bag.recording, (MAX_NS, MIN_NS))
         reach[bag.recording] = min(start, bag.start), max(stop, bag.end + 1)

@@ -20,7 +20,7 @@ from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, Span, ms_from_ns
 from ros2_memory.index.scan import Stamp, settled
 from ros2_memory.index.segment import in_time
 
@@ -119,7 +119,7 @@ class Filling:
         self._refused: dict[BagKey, Ns] = {}
         self._trimmed: dict[BagKey, Ns] = {}
         self._shared: tuple[Timeline, frozenset[str]] | None = None
-        self._merged: list[tuple[Ns, Ns]] = []
+        self._merged: list[Span] = []
         self._whole_parts: list[tuple[list[int], list[BagFile]]] = []
 
     def waiting(self, timeline: Timeline) -> list[BagFile]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.core.timebase import Span
     from ros2_memory.storage.base import IntArray
 
     Mask = NDArray[np.bool_]
@@ -45,8 +45,8 @@ class Totals(NamedTuple):
 
     size: int
     total: float
-    least: tuple[Ns, Ns]
-    greatest: tuple[Ns, Ns]
+    least: Span
+    greatest: Span
 
 
 class Letters(NamedTuple):

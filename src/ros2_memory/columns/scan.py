@@ -32,7 +32,7 @@ from ros2_memory.columns.writing import DELAY, PUBLISH_TIME
 from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.segment import in_time
 from ros2_memory.storage.base import REPEATED_NS, IntArray
 
@@ -93,12 +93,12 @@ class ScanRequest:
     window: TimeWindow
     timeline: Timeline
     decode: Decode
-    shared: Sequence[tuple[Ns, Ns]] = ()
+    shared: Sequence[Span] = ()
     repeats_latched: bool = False
     may_match: Callable[[PartZones], bool | Mask] | None = None
     may_not_match: bool = False
     may_be_empty: bool = False
-    within: Sequence[tuple[Ns, Ns]] | None = None
+    within: Sequence[Span] | None = None
     stored: bool = False
     check: Callable[[Ns], None] = lambda _: None
 
@@ -447,7 +447,7 @@ class Scan:
 
     # Copies
 
-    def _holding_copies(self) -> list[tuple[Ns, Ns]]:
+    def _holding_copies(self) -> list[Span]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
         starts, stops = np.array(self._shared, np.int64).T
         begins, ends = np.searchsorted(self._latest, starts), np.searchsorted(self._firsts, stops)

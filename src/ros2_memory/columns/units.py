@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.core.timebase import Ns, Span
 
 
 class GoneError(BusyError):
@@ -192,7 +192,7 @@ class Rows:
         return self.unit.last
 
     @property
-    def span(self) -> tuple[Ns, Ns]:
+    def span(self) -> Span:
         """Log times (ns) of the first and the last row, inclusive."""
         if self.index is None:
             return self.unit.first, self.unit.last

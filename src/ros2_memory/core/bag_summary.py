@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -289,7 +289,7 @@ class BagSummary:
         """Returns one topic under each of its types."""
         return tuple(self.at(position) for position in self.schema.positions.get(topic, ()))
 
-    def span_of(self, topics: Collection[str]) -> tuple[Ns, Ns]:
+    def span_of(self, topics: Collection[str]) -> Span:
         """Returns the first and last log time of these topics; it must hold one of them."""
         positions = self.schema.positions
         numbers = [

@@ -20,6 +20,7 @@ from ros2_memory.core.timebase import (
     NS_PER_US,
     START_SLACK_NS,
     Ns,
+    Span,
     ns_from_unix,
 )
 
@@ -91,7 +92,7 @@ class TimeWindow:
         """Returns the window from `reach` before a moment up to and including `reach` after it."""
         return cls(max(moment - reach, MIN_NS), min(moment + reach + 1, MAX_NS))
 
-    def asked(self) -> tuple[Ns, Ns]:
+    def asked(self) -> Span:
         """Returns the inclusive bounds that were asked for, without the tolerance of floats.
 
         They are whole microseconds, as a float of seconds states them.

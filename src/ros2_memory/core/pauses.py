@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-Pauses: TypeAlias = "tuple[tuple[Ns, Ns], ...]"
+Pauses: TypeAlias = "tuple[Span, ...]"
 """From the log time of the last message before each to that of the first after it, in order."""
 CountedPause: TypeAlias = "tuple[Ns, Ns, int]"
 """A pause, and how many messages the bag has before it."""

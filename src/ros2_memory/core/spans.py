@@ -7,18 +7,18 @@ from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
 """How far apart the log times of one message in two recordings are at most."""
-Spans: TypeAlias = list[tuple[Ns, Ns]]
+Spans: TypeAlias = list[Span]
 """Sorted and apart, where functions return them."""
 
 
-def united(spans: Iterable[tuple[Ns, Ns]], apart: Ns = 0) -> Spans:
+def united(spans: Iterable[Span], apart: Ns = 0) -> Spans:
     """Returns spans, sorted; those that touch, or are no farther apart, are merged."""
     merged: Spans = []
     for start, stop in sorted(spans):
@@ -31,7 +31,7 @@ def united(spans: Iterable[tuple[Ns, Ns]], apart: Ns = 0) -> Spans:
     return merged
 
 
-def without(spans: Iterable[tuple[Ns, Ns]], others: Sequence[tuple[Ns, Ns]]) -> Spans:
+def without(spans: Iterable[Span], others: Sequence[Span]) -> Spans:
     """Returns what is left of spans outside of others, which are sorted and apart."""
     left: Spans = []
     for start, stop in spans:
@@ -48,18 +48,18 @@ def without(spans: Iterable[tuple[Ns, Ns]], others: Sequence[tuple[Ns, Ns]]) -> 
     return left
 
 
-def lies_inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
+def lies_inside(spans: Sequence[Span], moment: Ns) -> bool:
     """Returns whether a moment lies in one of spans that are sorted and apart."""
     return overlaps_any(spans, moment, moment)
 
 
-def overlaps_any(spans: Sequence[tuple[Ns, Ns]], first: Ns, last: Ns) -> bool:
+def overlaps_any(spans: Sequence[Span], first: Ns, last: Ns) -> bool:
     """Returns whether a time (inclusive) overlaps one of spans that are sorted and apart."""
     nth = bisect_right(spans, first, key=lambda span: span[1])
     return nth < len(spans) and spans[nth][0] <= last
 
 
-def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
+def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[Span]:
     """Returns the half-open spans in which different recordings can hold copies.
 
     That is the time that both hold, widened by the horizon at both ends; spans that touch are
@@ -68,7 +68,7 @@ def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
     Args:
         held: first and last log times (inclusive) of files or recordings, and their recording.
     """
-    spans: list[tuple[Ns, Ns]] = []
+    spans: list[Span] = []
     # What reaches farthest of all so far, and of all other recordings than that.
     farthest: tuple[Ns, object] = (MIN_NS, None)
     another: tuple[Ns, object] = (MIN_NS, None)

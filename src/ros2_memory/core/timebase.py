@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Ns: TypeAlias = int
 """Nanoseconds: since the Unix epoch, or of a duration."""
 
+Span: TypeAlias = tuple[Ns, Ns]
+"""A first and a last time, or a start and the stop behind it."""
+
 NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000

@@ -23,7 +23,7 @@ from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, united, without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import (
     note_edges,
@@ -258,14 +258,14 @@ def place_bins(
     return TimeBins(names, edges, member, None)
 
 
-def _edges_at_spans(window: TimeWindow, span_lists: Sequence[Sequence[tuple[Ns, Ns]]]) -> Ints:
+def _edges_at_spans(window: TimeWindow, span_lists: Sequence[Sequence[Span]]) -> Ints:
     """Returns the bounds of a window, and those of spans that lie in it, in order."""
     bounds = {at for spans in span_lists for span in spans for at in span}
     inner = sorted(at for at in bounds if window.start < at < window.stop)
     return np.array([window.start, *inner, window.stop], np.int64)
 
 
-def _lies_in_spans(edges: Ints, spans: Sequence[tuple[Ns, Ns]]) -> Flags:
+def _lies_in_spans(edges: Ints, spans: Sequence[Span]) -> Flags:
     """Returns for each piece between two edges whether it lies in one of some half-open spans."""
     starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
     begun = np.searchsorted(starts, edges[:-1], side="right")
@@ -363,7 +363,7 @@ class BinnedWindow:
         if spans:
             self.add_lengths("unknown_s", "duration", spans)
 
-    def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[tuple[Ns, Ns]]) -> None:
+    def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[Span]) -> None:
         """Adds how much (ns) of half-open spans, which do not overlap, falls into each bin."""
         self.add_sums(column, kind, self._time_in_pieces(spans))
 
@@ -444,7 +444,7 @@ class BinnedWindow:
                 cut_days.add(day)
         return recorded_days - cut_days
 
-    def _time_in_pieces(self, spans: Sequence[tuple[Ns, Ns]]) -> Ints:
+    def _time_in_pieces(self, spans: Sequence[Span]) -> Ints:
         """Returns how much time (ns) of half-open spans passed in each piece."""
         starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._counted_bounds)
         lengths = self.bins.lengths(starts, stops)
@@ -453,7 +453,7 @@ class BinnedWindow:
         return lengths
 
     @property
-    def _counted_bounds(self) -> tuple[Ns, Ns]:
+    def _counted_bounds(self) -> Span:
         """Begin and end (ns) of the part of the window that is counted."""
         start = self.window.start if self._since is None else max(self.window.start, self._since)
         return start, max(start, self.window.stop)

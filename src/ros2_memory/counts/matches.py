@@ -42,7 +42,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united as united_spans
 from ros2_memory.core.spans import without
 from ros2_memory.core.text import Quoted, counted, listed, named, shortened
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Span
 from ros2_memory.counts.bins import BinnedWindow, By
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S, Call, Memory
@@ -362,7 +362,7 @@ def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool 
     return None if value is None else condition.matches(value)
 
 
-def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
+def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     """Returns the gaps in the recording, each until it is known what a topic says after it."""
     view = binned.view
     if view.limits.latching.is_latched(view.snapshot, topic):
@@ -377,7 +377,7 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     return [*zip(begins.tolist(), heard.tolist(), strict=True)]
 
 
-def _without_gaps(start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[tuple[Ns, Ns]]) -> _TrueSpans:
+def _without_gaps(start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[Span]) -> _TrueSpans:
     """Returns a time without the gaps in it; what comes after a gap is not known to begin there."""
     parts: _TrueSpans = []
     for begin, end in gaps:

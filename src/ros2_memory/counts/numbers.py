@@ -22,7 +22,7 @@ from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S
@@ -402,7 +402,7 @@ def _part_of(
     rows: Rows,
     field_numbers: FieldNumbers,
     bounds: tuple[int, int],
-    span: tuple[Ns, Ns],
+    span: Span,
     outline: Part | None,
 ) -> Part:
     """Returns some of the numbers of a field, in messages of a span (ns, inclusive), as a part."""

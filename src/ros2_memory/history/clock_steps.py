@@ -30,7 +30,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import Ns, unix_from_ns
+from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.history.coverage import seconds, unix_text
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import of_columns, scan
@@ -68,7 +68,7 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
     return tuple(step for step in _steps_around(view, window) if window.contains(step.at))
 
 
-def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[Ns, Ns]]:
+def without_steps(view: View, gaps: Sequence[Span]) -> Sequence[Span]:
     """Returns those gaps, of which there is one at least, in order, that are no clock step."""
     around = TimeWindow(gaps[0][0], gaps[-1][1])
     steps = {step.at for step in _known_steps(view, around) or () if step.by > 0}

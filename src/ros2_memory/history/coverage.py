@@ -49,6 +49,7 @@ from ros2_memory.core.timebase import (
     NS_PER_US,
     START_SLACK_NS,
     Ns,
+    Span,
     unix_from_ns,
     unix_rounded_up,
 )
@@ -185,9 +186,7 @@ def _span_text(start: Ns, end: Ns) -> str:
     return f"{unix_text(start)} to {unix_text(end)} ({seconds(end - start)})"
 
 
-def _unrecorded(
-    snapshot: Snapshot, gap: tuple[Ns, Ns], gone: Sequence[tuple[Ns, Ns]]
-) -> Sequence[tuple[Ns, Ns]]:
+def _unrecorded(snapshot: Snapshot, gap: Span, gone: Sequence[Span]) -> Sequence[Span]:
     """Returns the parts of a gap in which nothing was recorded that was deleted since."""
     parts = without([gap], gone)
     if parts == [gap]:
@@ -224,7 +223,7 @@ def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
         yield f"recorded, and deleted since: {listed(spans[-MAX_NAMED:], len(spans))}"
 
 
-def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
+def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
     """Returns when messages of a topic were deleted, and others of their bags were not.
 
     By request, or by `retention.topics`. Those intervals (log time, half-open) that overlap the
@@ -505,7 +504,7 @@ def why_nothing(when: str, *, deleted: bool) -> str:
     return f"what was recorded {when} was deleted" if deleted else f"nothing was recorded {when}"
 
 
-def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | None:
+def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> Span | None:
     """Returns the first and the last moment of what the memory has that a window can show.
 
     Without bags that a wrong clock dated, unless the window has nothing else. None without a bag.
@@ -530,7 +529,7 @@ def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
     return window.intersect(TimeWindow(first, last + 1))
 
 
-def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:
+def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Span]:
     """Yields where nothing was recorded, by `View.gaps`; of a window, the parts in it.
 
     A part that only the tolerance of its bounds reaches is left out.

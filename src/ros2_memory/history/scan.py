@@ -20,7 +20,7 @@ from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
@@ -57,11 +57,11 @@ def scan(
 class Wanted(TypedDict, total=False):
     """What of a topic a scan is of; each is as in `ScanRequest`."""
 
-    shared: Sequence[tuple[Ns, Ns]]
+    shared: Sequence[Span]
     may_match: Callable[[PartZones], bool | Mask]
     may_not_match: bool
     may_be_empty: bool
-    within: Sequence[tuple[Ns, Ns]]
+    within: Sequence[Span]
     stored: bool
 
 
@@ -336,7 +336,7 @@ def count_messages(
     # Those of bags are inclusive; spans are half-open, in order and apart.
     starts, stops = np.array([*shared, (MAX_NS, MAX_NS)], np.int64).T
     to_read: set[str] = set()
-    spans: list[tuple[Ns, Ns]] = []
+    spans: list[Span] = []
     for segment in view.timeline.segments_in(window):
         column = segment.column(topic)
         if column is None:

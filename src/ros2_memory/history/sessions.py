@@ -31,7 +31,7 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.scan import (
     joined_back,
@@ -73,14 +73,14 @@ class _TransformSpans(NamedTuple):
         joined: by folder, all that are joined with it by handovers.
     """
 
-    kinds: tuple[Mapping[str, tuple[Ns, Ns]], Mapping[str, tuple[Ns, Ns]]]
-    poses: Sequence[tuple[str, tuple[Ns, Ns]]]
+    kinds: tuple[Mapping[str, Span], Mapping[str, Span]]
+    poses: Sequence[tuple[str, Span]]
     joined: Mapping[str, Session]
 
 
 _RECORDED: Final[Key[_TransformSpans]] = Key()
 """Of a timeline: sidecars are read for it."""
-_RECORDINGS: Final[Key[dict[tuple[str, ...], dict[str, dict[Path, tuple[Ns, Ns]]]]]] = Key()
+_RECORDINGS: Final[Key[dict[tuple[str, ...], dict[str, dict[Path, Span]]]]] = Key()
 """Of a timeline: by topics, then by where they were recorded, the recordings that hold them."""
 _LINKED: Final[Key[set[tuple[tuple[str, str], Session | None]]]] = Key()
 """Of a timeline: what one call found, the next need not look for."""
@@ -117,9 +117,7 @@ class Sessions:
         """Returns where a recording was recorded; a saved moment keeps it elsewhere."""
         return self._names.recorded_as(str(recording))
 
-    def recordings_of(
-        self, session: Session, topics: tuple[str, ...]
-    ) -> Mapping[Path, tuple[Ns, Ns]]:
+    def recordings_of(self, session: Session, topics: tuple[str, ...]) -> Mapping[Path, Span]:
         """Returns the recordings of a session that hold some topics.
 
         With the log times of the first and the last message of these.
@@ -130,9 +128,9 @@ class Sessions:
         held = (by_folder.get(folder, {}) for folder in sorted(session))
         return {path: span for recordings in held for path, span in recordings.items()}
 
-    def _recordings_with(self, topics: Iterable[str]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
+    def _recordings_with(self, topics: Iterable[str]) -> dict[str, dict[Path, Span]]:
         """Returns the recordings that hold some topics, by where they were recorded."""
-        by_folder: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
+        by_folder: dict[str, dict[Path, Span]] = {}
         for topic in topics:
             for path, span in self._view.timeline.recordings(topic).items():
                 there = by_folder.setdefault(self.folder(path), {})
@@ -263,7 +261,7 @@ class Sessions:
             return frozenset({folder})
         return self._spans.joined.get(folder) or frozenset({folder, self._carried})
 
-    def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
+    def _spans_of(self, topics: Iterable[str]) -> dict[str, Span]:
         """Returns the log times of the first and the last message of some topics, by folder."""
         by_folder = self._recordings_with(topics)
         return {folder: enclosing(spans.values()) for folder, spans in by_folder.items()}
@@ -520,13 +518,13 @@ def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
     return component
 
 
-def enclosing(spans: Iterable[tuple[Ns, Ns]]) -> tuple[Ns, Ns]:
+def enclosing(spans: Iterable[Span]) -> Span:
     """Returns the earliest begin and the latest end of spans, of which there is one at least."""
     firsts, lasts = zip(*spans, strict=True)
     return min(firsts), max(lasts)
 
 
-def _distance(span: tuple[Ns, Ns], moment: Ns) -> Ns:
+def _distance(span: Span, moment: Ns) -> Ns:
     """Returns how far a moment is from a span of time."""
     first, last = span
     return max(first - moment, moment - last, 0)

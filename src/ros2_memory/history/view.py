@@ -24,6 +24,7 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     START_SLACK_NS,
     Ns,
+    Span,
     ns_from_unix,
     unix_from_ns,
 )
@@ -125,7 +126,7 @@ class View:
         if not part.empty and overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1):
             self.call.used_thinned = True
 
-    def gaps(self, window: TimeWindow, *, around: bool = False) -> Sequence[tuple[Ns, Ns]]:
+    def gaps(self, window: TimeWindow, *, around: bool = False) -> Sequence[Span]:
         """Returns the gaps of the snapshot that a window overlaps, without steps of the clock.
 
         Or only the one that is `around` all of it.

@@ -18,7 +18,7 @@ from ros2_memory.analysis.silences import SHORTEST_NS, Pacing, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.holes import Pause, pauses_between
 from ros2_memory.index.split_order import StepBack
@@ -38,9 +38,6 @@ _JITTER_NS: Final[Ns] = 50 * NS_PER_MS
 """The mean spacing may be shorter by this: publishers and transports are not exact."""
 _FEW_MESSAGES: Final = 5
 """Fewer have no usual spacing: a map may be published twice when its node starts."""
-
-Span: TypeAlias = "tuple[Ns, Ns]"
-"""Log times of a first and a last message, both inclusive."""
 
 
 _LOGS: Final = FOXGLOVE_LOGS | {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}

@@ -22,7 +22,7 @@ from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.spans import Spans, united, without
-from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, Ns, Span
 from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates, dated_segments
 from ros2_memory.index.holes import Pause, Rhythm, pause_between
 from ros2_memory.index.split_order import (
@@ -138,7 +138,7 @@ class Snapshot:
     @cached_property
     def _runs(self) -> dict[str, Spans]:
         """By topic, when bags hold it; see `silences`."""
-        by_topic: dict[str, list[tuple[Ns, Ns]]] = {}
+        by_topic: dict[str, list[Span]] = {}
         for segment in self.whole_segments:
             for topic, runs in segment.runs.items():
                 by_topic.setdefault(topic, []).extend(runs)
@@ -188,7 +188,7 @@ class Snapshot:
         return begin
 
     @cached_property
-    def gaps(self) -> Sequence[tuple[Ns, Ns]]:
+    def gaps(self) -> Sequence[Span]:
         """Where nothing was recorded: from the last message before to the first after, in order.
 
         Between bags or within one; see `index.holes`. Carried messages and bags that a wrong clock
@@ -198,7 +198,7 @@ class Snapshot:
         return sorted({(pause.start, pause.end) for pause in self._rhythm.gaps(self.pauses)})
 
     @cached_property
-    def breaks(self) -> Sequence[tuple[Ns, Ns]]:
+    def breaks(self) -> Sequence[Span]:
         """Those gaps after which another run of a recorder began."""
         pauses = [*self._rhythm.gaps(self.pauses)]
         within_runs = {(pause.start, pause.end) for pause in pauses if pause.ran_on}

@@ -19,12 +19,11 @@ from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.bag_rows import Bags
 from ros2_memory.index.segment import (
     Pace,
     Segment,
-    Span,
     TopicExtent,
     TopicTotals,
     add_totals,

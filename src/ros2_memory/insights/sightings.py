@@ -23,7 +23,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import Quoted, named, quote
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
@@ -156,7 +156,7 @@ def find_matches(
     )
 
 
-def _searched_times(view: View, window: TimeWindow, shown_at: Sequence[Ns]) -> tuple[Ns, Ns]:
+def _searched_times(view: View, window: TimeWindow, shown_at: Sequence[Ns]) -> Span:
     """Returns from when to when a window was searched (inclusive), and has what is shown."""
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (start, end)

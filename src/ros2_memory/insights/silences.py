@@ -15,6 +15,7 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     START_SLACK_NS,
     Ns,
+    Span,
     local_text,
 )
 from ros2_memory.history.coverage import cut_spans, recording_gaps, unix_text
@@ -86,7 +87,7 @@ def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
             yield part
 
 
-def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
+def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[Span]:
     """Returns the times of a window in which a topic was not recorded, in order, none overlapping.
 
     Nothing was recorded, or the topic has a usual rate and was silent.

@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, Span, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     cut_spans,
@@ -116,7 +116,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     )
 
 
-def gaps_with_deleted(view: View, gaps: Iterable[tuple[Ns, Ns]]) -> tuple[Gap, ...]:
+def gaps_with_deleted(view: View, gaps: Iterable[Span]) -> tuple[Gap, ...]:
     """Returns gaps, each with how much of it retention deleted."""
     deleted = deleted_between(view, TimeWindow.everything())
     return tuple(Gap(start, end, length_in(deleted, start, end)) for start, end in gaps)

@@ -21,7 +21,7 @@ from ros2_memory.core.geometry import yaw
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
@@ -204,7 +204,7 @@ def farthest_from(
     view: View,
     value: JsonValue,
     topic: str,
-    spans: Sequence[tuple[Ns, Ns]],
+    spans: Sequence[Span],
     frame_id: str | None,
 ) -> FarthestPose | None:
     """Returns the pose in some times (both ends inclusive, in order) that is farthest from a point.
@@ -249,7 +249,7 @@ class _DistantPose(NamedTuple):
 def _farthest_pose(
     tracks: TrackReader,
     track: RobotTrack,
-    spans: Sequence[tuple[Ns, Ns]],
+    spans: Sequence[Span],
     point: tuple[float, float],
 ) -> _DistantPose | None:
     """Returns the pose in some times that is farthest from a point (m).
@@ -276,7 +276,7 @@ def _farthest_pose(
     return farthest
 
 
-def _along(track: RobotTrack, spans: Sequence[tuple[Ns, Ns]]) -> tuple[Times, Floats, Floats]:
+def _along(track: RobotTrack, spans: Sequence[Span]) -> tuple[Times, Floats, Floats]:
     """Returns where the track was in some times: its vertices, and where each begins and ends.
 
     Without those that the robot jumped to and from.

@@ -14,7 +14,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
 from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.regions import Steps
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import Span, unix_from_ns
 from ros2_memory.results import FarFromOther, Pair, StandstillPlace
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def _distances_to(points: Floats, steps: _Steps) -> list[float]:
 
 
 def placed_standstills(
-    track: RobotTrack, spans: Iterable[tuple[Ns, Ns]], region: Region | None = None
+    track: RobotTrack, spans: Iterable[Span], region: Region | None = None
 ) -> Iterator[PlacedStandstill]:
     """Yields standstills with their place on the track; those in a region, if one is given.
 

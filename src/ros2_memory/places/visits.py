@@ -24,7 +24,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTim
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Region, Steps
 from ros2_memory.core.spans import Spans, united
-from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns, ns_from_unix
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns, Span, ns_from_unix
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
@@ -457,7 +457,7 @@ class ConfirmedStays:
         return min(approaches, default=(float(min(off[nearest], circle.radius_m)), at))
 
 
-def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[tuple[Ns, Ns]]:
+def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[Span]:
     """Yields the last pose inside, and the next one, around each absence as long as leaving takes.
 
     On a straight way from one part of a region to another one there are poses of both.

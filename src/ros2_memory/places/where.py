@@ -22,7 +22,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
 from ros2_memory.core.spans import Spans, lies_inside, united, without
 from ros2_memory.core.text import abbreviate, caseless
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import holds_on
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
     # Not at runtime: pydantic, which `WhileCondition` is an argument of, takes no recursive type.
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
     from ros2_memory.places.robot_tracks import KnownTrack
@@ -144,7 +145,7 @@ def parse_where(
     return Where(region, _frame_of(places), names, places)
 
 
-def _places_by_name(limits: QuerySettings, value: JsonValue) -> dict[str, JsonValue] | None:
+def _places_by_name(limits: QuerySettings, value: JsonValue) -> JsonObject | None:
     """Returns places by name; None of a value that is to be one place."""
     if isinstance(value, str):
         names = [name.strip() for name in value.split(",")]
@@ -422,7 +423,7 @@ class _ConditionStates:
             time = following
         return min(time, end)
 
-    def parts_of(self, first: Ns, last: Ns) -> Iterator[tuple[Ns, Ns]]:
+    def parts_of(self, first: Ns, last: Ns) -> Iterator[Span]:
         """Yields the parts of a time (inclusive) in which the condition is met, in order."""
         time = first
         while time <= last:

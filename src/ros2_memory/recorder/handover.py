@@ -49,7 +49,7 @@ from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.recorder.policies import ClockReading, set_back
 from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
 
@@ -453,7 +453,7 @@ class _Side(NamedTuple):
         """The last log time."""
         return max(bag.end for bag in self.bags.values())
 
-    def hidden(self) -> Iterator[tuple[Ns, Ns]]:
+    def hidden(self) -> Iterator[Span]:
         """Yields between which log times the cut may hide messages, both included."""
         for name, bag in self.bags.items():
             rule = self.cut.rule(name)

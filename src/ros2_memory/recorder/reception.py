@@ -20,7 +20,7 @@ from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import EpisodicError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.recorder.measure import (
     Arrivals,
     LossCounter,
@@ -123,7 +123,7 @@ class _Recording:
     """Topics with a publisher that this recording's subscription does not fit."""
     asked_anew: frozenset[str] = frozenset()
     """Topics that it asked for with what fits every publisher."""
-    span: tuple[Ns, Ns] = (0, 0)
+    span: Span = (0, 0)
     """First and last log time of what it has."""
 
 

@@ -36,7 +36,7 @@ from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
 from ros2_memory.core.arrays import numbered
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import NAMES_IN_MESSAGES
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.messages.detections import detections_of, looks_like_json
 from ros2_memory.storage.base import Definition
@@ -486,7 +486,7 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
     )
 
 
-def _few_a_day(pauses: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
+def _few_a_day(pauses: Iterable[Span]) -> Iterator[Span]:
     """Yields pauses in order of time, each once: the first `_MOST_PAUSES` of a day."""
     counts = Counter[str]()
     for start, end in sorted({*pauses}):
@@ -496,7 +496,7 @@ def _few_a_day(pauses: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
             yield start, end
 
 
-def beside_pauses(pauses: Iterable[tuple[Ns, Ns]], times: IntArray) -> IntArray:
+def beside_pauses(pauses: Iterable[Span], times: IntArray) -> IntArray:
     """Returns those of some log times (ns) that lie so near a pause that they show a step."""
     near = np.zeros(times.size, bool)
     for start, end in pauses:

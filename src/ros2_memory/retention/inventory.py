@@ -28,7 +28,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import known_identity
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.retention.delete import beside_bags, size_of
@@ -267,7 +267,7 @@ class Inventory:
             device = -1
         return {(device, stamp.inode): stamp.size for stamp in known.saved.values()}
 
-    def _dating_span(self, bag: BagFile) -> tuple[Ns, Ns]:
+    def _dating_span(self, bag: BagFile) -> Span:
         """Returns the log times of the first and last message that dates a bag (inclusive)."""
         dating = [topic for topic in bag.summary.topics if not self._is_received_again(topic)]
         if not dating:

@@ -38,7 +38,7 @@ from ros2_memory.core.arrays import (
     narrowed,
     numbered,
 )
-from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, Ns, Span
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.places import (
     GATE_MM,
@@ -303,7 +303,7 @@ class Estimate:
         return max(1, int(newest[len(newest) // 2]))
 
     def missing(
-        self, instance: Instance, stay: PlacedStay, window: tuple[Ns, Ns] | None = None
+        self, instance: Instance, stay: PlacedStay, window: Span | None = None
     ) -> tuple[int, Ns | None]:
         """Returns `looks_without` a thing after one of its stays, or in a window before it."""
         evidence = self.evidence[instance.key, instance.epoch, stay.place]

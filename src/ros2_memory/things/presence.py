@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.sights import JoinedSights
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.core.timebase import Ns, Span
 
 
 _FALSE_RATE: Final = 0.01
@@ -544,7 +544,7 @@ def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
 
 
 def looks_without(
-    every: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
+    every: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: Span
 ) -> tuple[int, Ns | None]:
     """Returns how many messages of a window [start, stop) could have had a thing, and have not.
 

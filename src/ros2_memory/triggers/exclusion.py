@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -55,7 +55,7 @@ class RecordingConditions(NamedTuple):
     start: Ns
     end: Ns | None
     heard: Sequence[ConditionInterval]
-    unclear: Sequence[tuple[Ns, Ns]] = ()
+    unclear: Sequence[Span] = ()
     name: str = ""
     previous: str | None = None
 
@@ -128,7 +128,7 @@ def excluded_intervals(
 
 def _unknown(
     recordings: Sequence[RecordingConditions], held: Spans, free: Sequence[Spans]
-) -> Iterator[tuple[Ns, Ns]]:
+) -> Iterator[Span]:
     """Yields where recordings did not know, by themselves or by others, whether it holds."""
     for recording in recordings:
         # Of those alone that ran beside it by one clock.
@@ -266,7 +266,7 @@ def _published(log_time: Ns, publish_time: Ns) -> Ns:
     return publish_time if 0 < publish_time < log_time else log_time
 
 
-def _widened(spans: Iterable[tuple[Ns, Ns]], margin: Ns) -> Spans:
+def _widened(spans: Iterable[Span], margin: Ns) -> Spans:
     return united(
         (max(start - margin, MIN_NS), min(stop + margin, MAX_NS))
         for start, stop in spans

@@ -27,7 +27,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, ns_from_unix
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, Span, ns_from_unix
 from ros2_memory.triggers.rules import Firing, Rule, SplitSearch, chains_to_search
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Triggers:
         self._is_recorded = is_recorded
         self._state: TriggerState | None = None
         self._lock = threading.Lock()
-        self.restarts: list[tuple[Ns, Ns]] = []
+        self.restarts: list[Span] = []
         self._deleted = 0
         self._is_written = False
         self._reported: dict[str, Ns] = {}

@@ -21,7 +21,7 @@ import numpy as np
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES, BagSummary
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, Ns, Span
 from ros2_memory.storage.base import (
     Batch,
     Channel,
@@ -596,7 +596,7 @@ def _split_window(
 
 def _overlooked(
     believed: McapIndex, index: McapIndex, wanted: Collection[int], passed: TimeWindow
-) -> tuple[Ns, Ns] | None:
+) -> Span | None:
     """Returns between which log times messages were missed, in a part read by wrong indexes."""
     believed_at = {chunk.offset: chunk for chunk in believed.chunks}
     chunks = [
