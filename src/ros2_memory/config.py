@@ -673,7 +673,7 @@ def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None =
 
 
 def load_explained(
-    overrides: Sequence[str] = (), env: Mapping[str, str] | None = None
+    overrides: Sequence[str], env: Mapping[str, str] | None = None
 ) -> tuple[Settings, Sources]:
     """Returns the configuration as `load_settings` does, and the source of each of its keys.
 

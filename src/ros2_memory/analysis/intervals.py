@@ -76,7 +76,7 @@ class VisibleInterval(NamedTuple):
     label: str
     first: Ns
     last: Ns
-    best: float | None = None
+    best: float | None
 
 
 class IntervalTable(NamedTuple):

@@ -199,7 +199,7 @@ class FileRule(NamedTuple):
     exclusions: tuple[Exclusion, ...]
     also: Mapping[str, tuple[str, ...]]
     elsewhere: Mapping[str, tuple[str, ...]]
-    hides_latched: bool = False
+    hides_latched: bool
 
     @property
     def hides_all(self) -> bool:

@@ -480,7 +480,7 @@ class OwnRecordings:
         except OSError as error:
             raise self._failure(error) from error
 
-    def _rewrite(self, rows: Iterable[ListRow] = ()) -> None:
+    def _rewrite(self, rows: Iterable[ListRow]) -> None:
         """Writes the list again with these entries, and without recordings that have gone."""
         before = self._rows
         try:

@@ -253,7 +253,7 @@ def require_recorder(settings: Settings) -> None:
 def open_memory(
     settings: Settings,
     *,
-    verbose: bool = False,
+    verbose: bool,
     scans: bool = True,
     setting: str | None = None,
     cache_mb: int | None = None,

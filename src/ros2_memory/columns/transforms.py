@@ -29,7 +29,7 @@ _TRANSLATION: Final = tuple(f"transform.translation.{axis}" for axis in "xyz")
 _ROTATION: Final = tuple(f"transform.rotation.{part}" for part in "xyzw")
 
 
-def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Edges | None:
+def edges_in(table: Table, times: IntArray, index: IntArray | None) -> Edges | None:
     """Returns the transforms in some rows of a table; None where only its messages have them.
 
     Numbers are rounded as the store rounds them, so they are the same from a part and from a bag.

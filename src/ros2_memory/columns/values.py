@@ -147,7 +147,7 @@ class LeafNumbers(NamedTuple):
     """
 
     values: Numeric
-    error: float | Floats = 0.0
+    error: float | Floats
     exactly: Callable[[Ints], Floats] | None = None
 
 

@@ -246,7 +246,7 @@ class Twist:
 
     linear: Vector3
     angular: Vector3
-    frame_id: str = ""
+    frame_id: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -219,7 +219,7 @@ UNKNOWN: Final = "(unknown)"
 
 
 def place_bins(
-    view: View, window: TimeWindow, counted: TimeWindow, where: Where | None = None
+    view: View, window: TimeWindow, counted: TimeWindow, where: Where | None
 ) -> TimeBins:
     """Returns places as bins: when the robot was in each, by its track in what is counted.
 

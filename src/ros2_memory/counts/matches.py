@@ -578,7 +578,7 @@ def count_values(
     topic: str,
     asked: TimeWindow,
     *,
-    fields: Sequence[str] = (),
+    fields: Sequence[str],
     condition: Condition | None = None,
 ) -> Bins:
     """Returns a row for each value that held at some time of a window, that of the longest first.

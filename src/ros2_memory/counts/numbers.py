@@ -475,7 +475,7 @@ def count_range(
     span: TimeRange,
     by: By | Literal["value"],
     *,
-    fields: Sequence[str] = (),
+    fields: Sequence[str],
 ) -> Bins:
     """Returns how many messages of a topic each bin holds, and the numbers of fields in them.
 

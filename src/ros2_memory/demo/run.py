@@ -133,9 +133,7 @@ def server_environment(
 
 
 @contextmanager
-def running_server(
-    bag_dir: Path, port: int, *, verbose: bool = False
-) -> Iterator[tuple[Child, str]]:
+def running_server(bag_dir: Path, port: int, *, verbose: bool) -> Iterator[tuple[Child, str]]:
     """Yields a server that answers, with its address, and ends it after the block.
 
     Its log goes to stderr where `verbose`; its columns into a folder that is removed at the end: no

@@ -48,7 +48,7 @@ class BagAccess:
         notes: what the reply reports besides its answer.
     """
 
-    def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
+    def __init__(self, memory: Memory, call: Call, reach: Ns | None) -> None:
         self.memory = memory
         self.call = call
         with call.stages.timed("index"):

@@ -67,7 +67,7 @@ class FoundTransform(NamedTuple):
 
     transform: Transform
     clock: TfClock
-    reach: Ns = TF_CACHE_NS
+    reach: Ns
 
 
 def transform_at(

@@ -149,7 +149,7 @@ class MemoryDays:
         extractor: SchemaExtractor,
         *,
         limits: MemoryLimits | None,
-        static_topics: Collection[str] = (),
+        static_topics: Collection[str],
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder = bag_dir / MEMORY_FOLDER

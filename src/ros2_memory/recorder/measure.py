@@ -98,7 +98,7 @@ class Hole(NamedTuple):
     before: Position
     after: Position
     missing: int
-    is_open: bool = False
+    is_open: bool
 
 
 @dataclass(slots=True)

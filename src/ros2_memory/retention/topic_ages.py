@@ -117,7 +117,7 @@ class TopicCutter:
         reader: BagReader,
         writer: BagWriter,
         *,
-        static_topics: Collection[str] = (),
+        static_topics: Collection[str],
         is_quiet: Callable[[], bool],
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,

@@ -251,7 +251,7 @@ def _short(text: str) -> str:
     return shortened(encodable(text), _MAX_CHARS)
 
 
-def read_health(host: str, port: int, token: str = "") -> tuple[int, JsonObject]:
+def read_health(host: str, port: int, token: str) -> tuple[int, JsonObject]:
     """Returns the status and the reply of `/health`; an empty reply if it refuses the token.
 
     Linux connects to the loopback address where `host` is that of all interfaces.

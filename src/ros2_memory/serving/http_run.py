@@ -29,7 +29,7 @@ def serve_http(
     app: ASGIApp,
     at: Address,
     dispatcher: Dispatcher,
-    when_listening: Callable[[str], None] | None = None,
+    when_listening: Callable[[str], None] | None,
 ) -> None:
     """Serves over HTTP until a signal comes; `when_listening` is called with the site's address.
 

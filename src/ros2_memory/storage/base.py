@@ -443,8 +443,8 @@ class Rewritten:
 
     messages: int
     lost_bytes: int
-    notes: tuple[str, ...] = ()
-    last: Ns | None = None
+    notes: tuple[str, ...]
+    last: Ns | None
 
     def describe_loss(self) -> str:
         """Returns a sentence on what was lost."""
@@ -541,9 +541,9 @@ def summarize_channels(
     absences: Mapping[int, Sequence[CountedPause]],
     *,
     complete: bool = True,
-    notes: tuple[str, ...] = (),
-    set_back: tuple[Ns, Ns] = (0, 0),
-    pauses: Sequence[CountedPause] = (),
+    notes: tuple[str, ...],
+    set_back: tuple[Ns, Ns],
+    pauses: Sequence[CountedPause],
 ) -> BagSummary:
     """Returns the summary of a file; channels of one topic and type count as one.
 

@@ -124,6 +124,6 @@ Take ages, durations and distances from the reply, unchanged.
 """
 
 
-def prompt(*, additions: bool = True) -> str:
+def prompt(*, additions: bool) -> str:
     """Returns the text that the prompt appends to the instructions; `additions`: as there."""
     return (_ANSWERS if additions else _SPEC_ANSWERS) + _NUMBERS

@@ -110,7 +110,7 @@ class PartialTrack(NamedTuple):
     turns: Times
     known: Mask
     settled: Mask
-    left_out: int = 0
+    left_out: int
     recording: str = ""
 
     @property

@@ -47,7 +47,7 @@ def record_argv(
     cache_bytes: int,
     use_sim_time: bool = False,
     repeat_latched: Sequence[str] = (),
-    known_options: Collection[str] = (),
+    known_options: Collection[str],
 ) -> list[str]:
     """Returns the argv of one recording.
 

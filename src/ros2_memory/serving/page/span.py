@@ -152,16 +152,16 @@ class SpanRequest:
         first: whether nothing is shown yet, so that the answer must not take long as a whole.
     """
 
-    start_s: float | None = None
-    end_s: float | None = None
-    last_s: float = LAST_S
-    since_s: float | None = None
-    version: str = ""
-    things: bool = True
-    status: bool = True
-    patient: bool = False
-    first: bool = False
-    signals: tuple[Signal, ...] = ()
+    start_s: float | None
+    end_s: float | None
+    last_s: float
+    since_s: float | None
+    version: str
+    things: bool
+    status: bool
+    patient: bool
+    first: bool
+    signals: tuple[Signal, ...]
 
     def window(self, earliest: Ns, latest: Ns) -> TimeWindow:
         """Returns the span over a memory that begins and ends so; at least a second long.

@@ -75,7 +75,7 @@ class ReadChunks(NamedTuple):
 
     chunks: Sequence[Chunk]
     buffer: bytes | None
-    sizes: Sequence[int] = ()
+    sizes: Sequence[int]
     indexes: Sequence[bytes] = ()
 
 
