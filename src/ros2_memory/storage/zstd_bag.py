@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import zstandard
@@ -128,12 +129,22 @@ def decompress_zstd(compressed: bytes, limit: SizeLimit) -> bytes:
         if stated > LARGE_BYTES:
             take_turn()
         return _OWN.decompressor.decompress(compressed)
-    data = zstd_front(compressed, min(LARGE_BYTES, max_bytes) + 1)
-    if LARGE_BYTES < len(data) <= max_bytes:
-        take_turn()
-        data = zstd_front(compressed, max_bytes + 1)
+    data = in_turn(partial(zstd_front, compressed), limit)
     if len(data) > max_bytes:
         raise UnreadableError(too_large("compressed data", max_bytes))
+    return data
+
+
+def in_turn(front: Callable[[int], bytes], limit: SizeLimit) -> bytes:
+    """Returns at most one byte more than allowed, so that the caller sees the excess.
+
+    `front` decompresses so many bytes; it does so again, in its turn, where they are many.
+    """
+    max_bytes, take_turn = limit
+    data = front(min(LARGE_BYTES, max_bytes) + 1)
+    if LARGE_BYTES < len(data) <= max_bytes:
+        take_turn()
+        data = front(max_bytes + 1)
     return data
 
 

@@ -10,6 +10,7 @@ import struct
 import zlib
 from array import array
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]  # has no types
@@ -40,7 +41,7 @@ from ros2_memory.storage.mcap.records import (
     UINT64,
     FileRecord,
 )
-from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
+from ros2_memory.storage.zstd_bag import decompress_zstd, in_turn, zstd_front
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -470,31 +471,23 @@ def decompressed_chunk(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> 
 
 def decompressed_prefix(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> bytes:
     """Decompresses the front of a chunk that its file ends in."""
-    max_bytes, take_turn = limit
     if head.compression == "zstd":
-        data = zstd_front(compressed, min(LARGE_BYTES, max_bytes))
-        if len(data) < LARGE_BYTES:
-            return data
-        take_turn()
-        return zstd_front(compressed, max_bytes)
-    return _decompressed(head.compression, compressed, limit)[:max_bytes]
+        data = in_turn(partial(zstd_front, compressed), limit)
+    else:
+        data = _decompressed(head.compression, compressed, limit)
+    return data[: limit.max_bytes]
 
 
 def _decompressed(compression: str, compressed: bytes, limit: SizeLimit) -> bytes:
     """Returns at most one byte more than allowed, so that the caller sees the excess."""
-    max_bytes, take_turn = limit
     if not compression:
         if len(compressed) > LARGE_BYTES:
-            take_turn()
+            limit.take_turn()
         return compressed
     if compression == "zstd":
         return decompress_zstd(compressed, limit)
     if compression == "lz4":
-        data = _lz4_front(compressed, min(LARGE_BYTES, max_bytes) + 1)
-        if LARGE_BYTES < len(data) <= max_bytes:
-            take_turn()
-            data = _lz4_front(compressed, max_bytes + 1)
-        return data
+        return in_turn(partial(_lz4_front, compressed), limit)
     raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")
 
 
