@@ -88,6 +88,11 @@ class TimeWindow:
         return cls(MIN_NS, min(end + 1, MAX_NS))
 
     @classmethod
+    def before(cls, moment: Ns, reach: Ns) -> TimeWindow:
+        """Returns the window from `reach` before a moment up to and including it."""
+        return cls(max(moment - reach, MIN_NS), moment + 1)
+
+    @classmethod
     def around(cls, moment: Ns, reach: Ns) -> TimeWindow:
         """Returns the window from `reach` before a moment up to and including `reach` after it."""
         return cls(max(moment - reach, MIN_NS), min(moment + reach + 1, MAX_NS))

@@ -211,7 +211,7 @@ def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
     is_long = pause.end - pause.start >= SHORTEST_STEP_NS
     if step is not None or not is_long or topic is None or _is_late(view, topic, pause):
         return step
-    before = TimeWindow(pause.start - BESIDE_NS, pause.start + 1)
+    before = TimeWindow.before(pause.start, BESIDE_NS)
     after = TimeWindow(pause.end, pause.end + BESIDE_NS)
     bags = [view.timeline.overlapping(window) for window in (before, after)]
     # A recording that ended before the pause tells nothing about one that began after it.

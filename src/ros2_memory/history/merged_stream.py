@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.history.bag_access import BagAccess
     from ros2_memory.history.stored_message import StoredMessage
-    from ros2_memory.index.segment import Segment
 
 _Row: TypeAlias = tuple[str, Ns, Ns, int]
 """Of a message of a topic: its file, log time, publish time, and the hash of its payload."""
@@ -110,7 +109,7 @@ class MergedStream:
             spans = [segment.spans[topic] for topic in topics if topic in segment.spans]
             if spans:
                 first, last = min(first for first, _ in spans), max(last for _, last in spans)
-                edges.update((_start_of(segment), first + 1, last))
+                edges.update((segment.bags[0].start, first + 1, last))
         inside = sorted(edge for edge in edges if window.start <= edge <= window.stop)
         return [TimeWindow(start, stop) for start, stop in pairwise(inside)]
 
@@ -251,11 +250,6 @@ def _since_published(stored: StoredMessage) -> TimeWindow:
     """Returns the window in which a late message may have been received before."""
     since = max(stored.record.publish_time - COPY_HORIZON_NS, MIN_NS)
     return TimeWindow(since, stored.time + 1)
-
-
-def _start_of(segment: Segment) -> Ns:
-    """Returns the log time of a segment's first message; segments are in this order."""
-    return segment.bags[0].start
 
 
 def _span_order(span: TopicExtent) -> tuple[Ns, Ns, str]:

@@ -374,7 +374,7 @@ def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | No
     Raises:
         InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
     """
-    window = TimeWindow(max(at - _POSE_NS, MIN_NS), at + 1)
+    window = TimeWindow.before(at, _POSE_NS)
     try:
         message, pose = newest_pose(view, resolve_path_topic(view), window) or (None, None)
     except (InvalidArgumentsError, NoDataError):
@@ -396,7 +396,7 @@ def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
     for topic in timeline.topics():
         if BATTERY not in timeline.types_of(topic):
             continue
-        message = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
+        message = view.stream.newest(topic, TimeWindow.before(at, _LEAD_NS))
         fraction = None if message is None else charge_of(view.value(message))
         if fraction is not None:
             yield topic, f"{fraction:.0%}"

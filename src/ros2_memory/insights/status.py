@@ -365,7 +365,7 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None
     last = max((total.last for total in snapshot.timeline.totals(topic).values()), default=0)
-    window = TimeWindow(last - _RATE_WINDOW_NS, last + 1)
+    window = TimeWindow.before(last, _RATE_WINDOW_NS)
     bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
     parts = [part for bag in bags for part in bag.summary.of(topic)]
     intervals = sum(part.count - 1 for part in parts)

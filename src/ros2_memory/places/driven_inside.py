@@ -21,7 +21,7 @@ from ros2_memory.core.geometry import yaw
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
@@ -179,7 +179,7 @@ def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoin
     """
     if waypoint.yaw_rad is None or np.isin(waypoint.time, line.times):
         return waypoint
-    window = TimeWindow(max(waypoint.time - NEWEST_POSE_NS, MIN_NS), waypoint.time + 1)
+    window = TimeWindow.before(waypoint.time, NEWEST_POSE_NS)
     newest = newest_pose(view, topic, window)
     pose = None if newest is None else newest[1]
     orientation = None if pose is None else pose.orientation

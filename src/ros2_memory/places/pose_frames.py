@@ -122,7 +122,7 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     In the map where transforms lead there, or in `frame_id`. Where the session of this recording
     has poses, it is one of these.
     """
-    window = TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1)
+    window = TimeWindow.before(at, NEWEST_POSE_NS)
     topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
     stored, pose = newest_pose(view, topic, window, recording) or (None, None)
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):

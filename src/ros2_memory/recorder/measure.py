@@ -458,7 +458,7 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
     window = TimeWindow.everything()
     is_whole = not end_only and path.stat().st_size <= SPLIT_BYTES
     if not is_whole and not (summary := reader.summarize(path)).empty:
-        window = TimeWindow(summary.end - TAIL_NS, summary.end + 1)
+        window = TimeWindow.before(summary.end, TAIL_NS)
     times: dict[str, list[Ns]] = {}
     largest: dict[str, int] = {}
     arrivals: dict[str, Arrival] = {}

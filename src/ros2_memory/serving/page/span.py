@@ -323,7 +323,7 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
         why = why_no_path(view)
         return Shown({"path": None, "robot": None, "no_path": why}, (why,))
     if window.stop <= latest or not len(path.track.times):
-        newest = robot_path(view, TimeWindow(latest - _NEWEST_NS, latest + 1))
+        newest = robot_path(view, TimeWindow.before(latest, _NEWEST_NS))
     named: list[JsonValue] = [
         _place_outline(place) for place in memory.limits.places if place.frame_id == path.frame
     ]
