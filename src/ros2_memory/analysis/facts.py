@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import joined_codes, merged_times, numbered
+from ros2_memory.core.arrays import joined_codes, merged_times, numbered, places_among
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
@@ -279,10 +279,8 @@ class Facts(NamedTuple):
 
     def at(self, rows: Ints) -> Facts:
         """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
-        place = np.searchsorted(rows, self.rows)
-        kept = place < rows.size
-        kept[kept] = rows[place[kept]] == self.rows[kept]
-        return self._replace(rows=place)._where(kept)
+        place, is_among = places_among(self.rows, rows)
+        return self._replace(rows=place)._where(is_among)
 
     def _where(self, kept: Flags) -> Facts:
         return Facts(self.rows[kept], self.codes[kept], self.values[kept], self.words)

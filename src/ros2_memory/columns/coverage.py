@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.core.arrays import places_among
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.index.bag_rows import Bags
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.store import ColumnStore, State
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.segment import Segment, TopicExtent
     from ros2_memory.index.timeline import Timeline
@@ -97,12 +99,9 @@ class Coverage:
             if is_missing.any():
                 yield from covered.segment.extents(topic, window, is_missing)
 
-    def _are_there(self, numbers: IntArray) -> Mask:
+    def _are_there(self, numbers: IntArray) -> Flags:
         """Returns which of some numbers are of bags of the timeline."""
-        if not self._numbers.size:
-            return np.zeros(numbers.shape, np.bool_)
-        at = np.minimum(np.searchsorted(self._numbers, numbers), self._numbers.size - 1)
-        return np.asarray(self._numbers[at] == numbers)
+        return places_among(numbers, self._numbers)[1]
 
     def of_part(self, part: int, numbers: IntArray) -> IntArray:
         """Returns those of the numbers of a part whose bags are bags of the timeline."""

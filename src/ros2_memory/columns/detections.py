@@ -33,14 +33,16 @@ from ros2_memory.columns.values import (
     zone_of,
 )
 from ros2_memory.columns.walk import entries_of_codes
+from ros2_memory.core.arrays import places_among
 from ros2_memory.messages.detections import Detection, detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.columns.values import Floats, Ints, Level, Mask
+    from ros2_memory.columns.values import Floats, Level
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import IntArray, Mask
 
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
@@ -56,20 +58,18 @@ class Detections(NamedTuple):
         frames: the frame of each, empty where the message names none.
     """
 
-    rows: Ints
+    rows: IntArray
     labels: Texts
     scores: Floats
     places: Points
     frames: Texts
 
-    def at(self, rows: Ints) -> Detections:
+    def at(self, rows: IntArray) -> Detections:
         """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
-        message = np.searchsorted(rows, self.rows)
-        is_among = message < rows.size
-        is_among[is_among] = rows[message[is_among]] == self.rows[is_among]
+        message, is_among = places_among(self.rows, rows)
         return self._replace(rows=message).taken(is_among)
 
-    def taken(self, which: Ints | Mask) -> Detections:
+    def taken(self, which: IntArray | Mask) -> Detections:
         """Returns some of them."""
         rows, labels, scores, places, frames = self
         return Detections(
@@ -91,7 +91,7 @@ class StampedDetections(NamedTuple):
     """
 
     detections: Detections
-    stamps: Ints | None
+    stamps: IntArray | None
     frames: Texts
 
 
@@ -238,7 +238,9 @@ def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
     return _placed(values, source, positions, detections) if places else detections
 
 
-def _detections_at(values: Values, level: Level, positions: Ints, named: NamedScores) -> Detections:
+def _detections_at(
+    values: Values, level: Level, positions: IntArray, named: NamedScores
+) -> Detections:
     """Returns the detections at some positions of a level, by their rows, without a place."""
     return Detections(
         _owners_at(values, level, positions, ROWS),
@@ -279,7 +281,9 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     yield found._replace(frames=or_else(found.frames, frames))
 
 
-def _placed(values: Values, source: Labels, positions: Ints, detections: Detections) -> Detections:
+def _placed(
+    values: Values, source: Labels, positions: IntArray, detections: Detections
+) -> Detections:
     """Returns detections at the first valid point of each; NaN where it has none."""
     if source.points is None:
         raise UnknownShapeError("points are of another shape in each message")
@@ -299,7 +303,7 @@ def _placed(values: Values, source: Labels, positions: Ints, detections: Detecti
     return detections._replace(places=places, frames=frames)
 
 
-def _frames_at(values: Values, level: Level, positions: Ints, leaves: Sequence[Leaf]) -> Texts:
+def _frames_at(values: Values, level: Level, positions: IntArray, leaves: Sequence[Leaf]) -> Texts:
     """Returns the frame of each detection: what the innermost object around it names."""
     frames = _no_frames(positions.size)
     for leaf in leaves:
@@ -309,7 +313,7 @@ def _frames_at(values: Values, level: Level, positions: Ints, leaves: Sequence[L
     return frames
 
 
-def _owners_at(values: Values, level: Level, positions: Ints, outer: Level) -> Ints:
+def _owners_at(values: Values, level: Level, positions: IntArray, outer: Level) -> IntArray:
     """Returns, of some elements of a level, the elements or rows around them."""
     while level != outer and level.parent is not None:
         positions, level = values.elements(level).owners[positions], level.parent

@@ -72,6 +72,15 @@ def in_ranges(starts: Ints, sizes: Ints) -> Ints:
     return numbers
 
 
+def places_among(numbers: Ints, some: Ints) -> tuple[Ints, Flags]:
+    """Returns where each number lies among some, which ascend, and whether it is one of them."""
+    place = np.searchsorted(some, numbers)
+    if not some.size:
+        return place, np.zeros(place.shape, np.bool_)
+    # What lies behind all of them is not the last, either.
+    return place, some.take(place, mode="clip") == numbers
+
+
 def begins_of(group: Ints, groups: int) -> Ints:
     """Returns where each of so many groups begins in rows that are in their order, and the end."""
     begins = np.zeros(groups + 1, np.int64)

@@ -22,14 +22,21 @@ from ros2_memory.analysis.sights import (
     CELL_MM,
     SLICE_NS,
     STOREY_MM,
-    Flags,
     Floats,
     Hit,
-    Ints,
     Look,
     Unplaced,
 )
-from ros2_memory.core.arrays import Groups, begins_of, distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import (
+    Flags,
+    Groups,
+    Ints,
+    begins_of,
+    distinct_rows,
+    in_ranges,
+    narrowed,
+    places_among,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -144,8 +151,8 @@ class Cells:
             unplaced[:, Unplaced.N],
         )
         look_keys = self.slice[looks] * topics + self.topic[looks]
-        rows = np.searchsorted(keys, look_keys)
-        totals: Ints = np.where(_are_in(keys, look_keys), np.append(n, 0)[rows], 0)
+        rows, has_total = places_among(look_keys, keys)
+        totals: Ints = np.where(has_total, np.append(n, 0)[rows], 0)
         return totals
 
     def looked_in(self, number: int) -> Ns | None:
@@ -166,7 +173,8 @@ class Cells:
         is_repeated: Flags = (hits == 0) & (previous >= 0)
         rows = np.flatnonzero(is_repeated)
         before = _keys(_place(looks[rows]), previous[rows])
-        is_repeated[rows] = ~_are_in(looks[hits > 0], before)
+        _, has_hit = places_among(before, looks[hits > 0])
+        is_repeated[rows] = ~has_hit
         return is_repeated
 
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
@@ -204,8 +212,8 @@ def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) ->
     for step in [*product((-1, 0, 1), repeat=3)][14:]:  # the others are from those to these
         turned = (cells[:, 0] + step[0]) % _YAWS - cells[:, 0]
         wanted = keys + turned * weights[0] + weights[1:] @ step[1:]
-        place = np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)
-        one = np.flatnonzero((ordered[place] == wanted) & (cells[:, 0] >= 0))
+        place, is_there = places_among(wanted, ordered)
+        one = np.flatnonzero(is_there & (cells[:, 0] >= 0))
         other = order[place[one]]
         turn = np.abs((yaw[other] - yaw[one] + 180.0) % 360.0 - 180.0)
         near = (turn < CELL_DECIDEG / 10) & (
@@ -365,8 +373,7 @@ def evidence_at(
     hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
     beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
     keys = cells.cells_of(beside)
-    cell = np.searchsorted(hit_cells, keys)
-    is_of_one = np.append(hit_cells, -1)[cell] == keys
+    cell, is_of_one = places_among(keys, hit_cells)
     looks_in = cells.looks_in[_number(hit_cells[sees])]
     cell = np.concatenate((cell[is_of_one], np.repeat(np.flatnonzero(sees), looks_in)))
     looks = np.concatenate((beside[is_of_one], cells.looks_from(hit_cells[sees])))
@@ -424,12 +431,6 @@ def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
     """Returns the distinct keys in order, and the sum of each."""
     distinct, row_of = np.unique(keys, return_inverse=True)
     return distinct, np.bincount(row_of, n, len(distinct)).astype(np.int64)
-
-
-def _are_in(ordered: Ints, keys: Ints) -> Flags:
-    """Returns which keys are among some that are in order."""
-    are_in: Flags = np.append(ordered, -1)[np.searchsorted(ordered, keys)] == keys
-    return are_in
 
 
 def _sees(cells: Cells, hit_cells: Ints, cell: Ints, hit_looks: Ints, hits: Ints) -> Flags:
