@@ -27,11 +27,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.index.segment import TopicColumn
+    from ros2_memory.storage.base import IntArray, Mask
 
 T = TypeVar("T", bound="Sized")
 V = TypeVar("V")
@@ -333,33 +334,42 @@ def count_messages(
             counted.add_times(rows.times, edges)
         return counted
     shared = open_scan(view, topic, window).shared
-    # Those of bags are inclusive; spans are half-open, in order and apart.
-    starts, stops = np.array([*shared, (MAX_NS, MAX_NS)], np.int64).T
+    shared_ends = np.array([*shared, (MAX_NS, MAX_NS)], np.int64).T
     to_read: set[str] = set()
     spans: list[Span] = []
     for segment in view.timeline.segments_in(window):
         column = segment.column(topic)
         if column is None:
             continue
-        bag_numbers, firsts, lasts, messages = column
+        bags, firsts, lasts, messages = column
         pieces = np.searchsorted(edges, firsts, side="right")
-        is_cut = pieces != np.searchsorted(edges, lasts, side="right")
-        is_cut |= (firsts < window.start) | (lasts >= window.stop)
-        is_cut |= starts[np.searchsorted(stops, firsts, side="right")] <= lasts
-        # Under none of its types is a bag counted that is read.
-        is_cut = np.isin(bag_numbers, bag_numbers[is_cut])
         is_here = (firsts < window.stop) & (lasts >= window.start)
+        is_cut = _are_cut(column, window, edges, shared_ends)
         is_in = is_here & ~is_cut
         counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
         for row in np.flatnonzero(is_here & is_cut).tolist():
             # A bag has a row for each type of the topic.
-            to_read.add(segment.bags[bag_numbers[row]].file)
+            to_read.add(segment.bags[bags[row]].file)
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
     near_those = united(sorted(spans))
     for rows in scan(view, topic, window, columns=proves, shared=shared, within=near_those):
         for _, positions in rows.bag_rows(to_read):
             counted.add_times(rows.times[positions], edges)
     return counted
+
+
+def _are_cut(column: TopicColumn, window: TimeWindow, edges: IntArray, shared_ends: Ints) -> Mask:
+    """Returns which bags have to be read: those of several pieces, and those with shared times.
+
+    A bag of which one type of the topic has to be read is read under all. `shared_ends` has the
+    starts and the stops of shared times, which are in order and apart.
+    """
+    bags, firsts, lasts, _ = column
+    is_cut = (firsts < window.start) | (lasts >= window.stop)
+    is_cut |= np.searchsorted(edges, firsts, "right") != np.searchsorted(edges, lasts, "right")
+    starts, stops = shared_ends
+    is_cut |= starts[np.searchsorted(stops, firsts, side="right")] <= lasts
+    return np.isin(bags, bags[is_cut])
 
 
 def pick(
