@@ -36,10 +36,9 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.transforms import Pair
-    from ros2_memory.columns.values import Mask
     from ros2_memory.columns.writing import PackedPart
     from ros2_memory.index.timeline import Timeline
-    from ros2_memory.storage.base import Channel, IntArray
+    from ros2_memory.storage.base import Channel, IntArray, Mask
 
 T = TypeVar("T", bound="Sized")
 
@@ -346,21 +345,23 @@ class Scanner:
             raise GoneError
         packed = partial(self.packed, head, together=together)
 
-        def load(path: str) -> Column:
+        def column_at(path: str) -> Column | None:
             column = packed(path)
+            return None if column is None else self._column(head, path, column, together)
+
+        def load(path: str) -> Column:
+            column = column_at(path)
             if column is None:
                 raise KeyError(path)
-            return self._column(head, path, column, together)
+            return column
 
         counting = coverage.of_part(head.number, head.bags)
         if not counting.size:
             return None
 
         def integers(path: str) -> IntArray | None:
-            column = packed(path)
-            if column is None:
-                return None
-            return np.asarray(self._column(head, path, column, together), np.int64)
+            column = column_at(path)
+            return None if column is None else np.asarray(column, np.int64)
 
         def bag_of(number: int) -> BagFile:
             bag = coverage.bag(number + offset)
