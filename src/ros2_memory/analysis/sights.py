@@ -22,16 +22,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ros2_memory.core.arrays import Groups, distinct_rows, rows_of, run_starts
+from ros2_memory.core.arrays import Flags, Groups, Ints, distinct_rows, rows_of, run_starts
 from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, NS_PER_US
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
-Flags: TypeAlias = NDArray[np.bool_]
 
 CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100

@@ -29,6 +29,7 @@ from ros2_memory.cli.output import (
     print_notes,
     spinner,
 )
+from ros2_memory.core.arrays import Ints
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import united, without
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+
 
 FORMATS: Final = (".svg", ".png", ".pdf")
 _EVERYWHERE: Final = Box(-math.inf, -math.inf, math.inf, math.inf, 0.001)
@@ -352,7 +354,7 @@ def _number(value: JsonValue) -> float:
     return float(value) if isinstance(value, bool | int | float) else math.nan
 
 
-def _with_breaks(times: NDArray[np.int64], values: Floats) -> tuple[Floats, Floats]:
+def _with_breaks(times: Ints, values: Floats) -> tuple[Floats, Floats]:
     """Returns points in seconds, and NaN where there was none for much longer than usual."""
     steps = np.diff(times)
     usual = np.sort(steps)[len(steps) // 2] if len(steps) else 0

@@ -11,7 +11,7 @@ from ros2_memory.columns.values import Leaf, Level, UnknownShapeError, Values
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.columns.values import Ints, Mask
+    from ros2_memory.storage.base import IntArray, Mask
 
 
 class TruthValues(NamedTuple):
@@ -61,9 +61,9 @@ class Limit(NamedTuple):
     """
 
     level: Level
-    find: Callable[[Values, Ints], TruthValues]
+    find: Callable[[Values, IntArray], TruthValues]
 
-    def kept(self, values: Values, positions: Ints) -> TruthValues:
+    def kept(self, values: Values, positions: IntArray) -> TruthValues:
         """Returns which of some rows or elements of the level have it."""
         try:
             return self.find(values, positions)
@@ -74,7 +74,7 @@ class Limit(NamedTuple):
 def at_place(level: Level, place: int) -> Limit:
     """Returns the limit to the element at this place of each list; negative from the end."""
 
-    def find(values: Values, positions: Ints) -> TruthValues:
+    def find(values: Values, positions: IntArray) -> TruthValues:
         return TruthValues.known(values.places(level, positions, from_end=place < 0) == place)
 
     return Limit(level, find)
@@ -86,7 +86,7 @@ def at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Lim
     Of an array of fixed length, whose elements are columns of their own: to rows where it is `nth`.
     """
 
-    def find(values: Values, positions: Ints) -> TruthValues:
+    def find(values: Values, positions: IntArray) -> TruthValues:
         texts, owners = values.texts(names), values.elements(names.level).owners
         has_name = np.array([word == name for word in texts.words], np.bool_)[texts.codes]
         found = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
@@ -103,7 +103,7 @@ def at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Lim
 def where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) -> Limit:
     """Returns the limit to sequences of more numbers than this, or else of no more."""
 
-    def find(values: Values, positions: Ints) -> TruthValues:
+    def find(values: Values, positions: IntArray) -> TruthValues:
         lengths = values.numeric(level, f"{sequence}.length")
         if lengths is None:
             return unknown(len(positions))
@@ -113,8 +113,8 @@ def where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) ->
 
 
 def placed(
-    values: Values, level: Level, positions: Ints, limits: Sequence[Limit], *, surely: bool
-) -> tuple[Ints, Ints]:
+    values: Values, level: Level, positions: IntArray, limits: Sequence[Limit], *, surely: bool
+) -> tuple[IntArray, IntArray]:
     """Returns which of some rows or elements have a field, and the row of each.
 
     Args:

@@ -15,8 +15,9 @@ from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShap
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.columns.values import Floats, Ints
+    from ros2_memory.columns.values import Floats
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import IntArray
 
 _LARGEST_INT64: Final = 2**63 - 1
 
@@ -34,11 +35,11 @@ class FieldNumbers(NamedTuple):
             has them, and of several numbers of a message.
     """
 
-    rows: Ints
-    numbers: Ints | Floats
+    rows: IntArray
+    numbers: IntArray | Floats
     error: float
     errors: Floats | None = None
-    exactly: Callable[[Ints], Floats] | None = None
+    exactly: Callable[[IntArray], Floats] | None = None
 
 
 def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumbers | None:

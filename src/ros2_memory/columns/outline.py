@@ -13,7 +13,7 @@ import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.table import IN_PART, Numbers, Table, Texts, letters_of, words_of
-from ros2_memory.core.arrays import numbered
+from ros2_memory.core.arrays import Flags, Ints, numbered
 from ros2_memory.core.text import caseless
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Span
     from ros2_memory.storage.base import IntArray
 
-    Mask = NDArray[np.bool_]
     Floats = NDArray[np.float64]
 
 _BYTES: Final = 500
@@ -73,7 +72,7 @@ class Letters(NamedTuple):
         rows = np.array(has_word, np.bool_).reshape(len(words), len(spellings))[:, nth[texts.codes]]
         return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
 
-    def may_have(self, text: str) -> Mask:
+    def may_have(self, text: str) -> Flags:
         """Returns in which texts a casefolded text may be; surely, if it is one row of letters."""
         bits = np.full(self.has.shape[1], 0xFF, np.uint8)
         for letters in letters_of(text):
@@ -96,7 +95,7 @@ class Outline(NamedTuple):
     paths: Sequence[str]
     sizes: IntArray
     sums: Floats
-    times: NDArray[np.int64]
+    times: Ints
     letters: Mapping[str, Letters]
 
     @classmethod

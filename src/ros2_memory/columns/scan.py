@@ -34,7 +34,7 @@ from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.segment import in_time
-from ros2_memory.storage.base import REPEATED_NS, IntArray
+from ros2_memory.storage.base import REPEATED_NS, IntArray, Mask
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.columns.store import PartHead
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.index.timeline import Timeline
 

@@ -21,19 +21,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.sights import (
-    SLICE_NS,
-    TABLES,
-    Fix,
-    Hit,
-    Ints,
-    Look,
-    Sights,
-    Spot,
-    Unplaced,
-)
+from ros2_memory.analysis.sights import SLICE_NS, TABLES, Fix, Hit, Look, Sights, Spot, Unplaced
 from ros2_memory.columns.pack import byte_planes, compressed, decompressed
-from ros2_memory.core.arrays import Columns, begins_of, distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import Columns, Ints, begins_of, distinct_rows, in_ranges, narrowed
 from ros2_memory.core.timebase import NS_PER_US
 
 if TYPE_CHECKING:

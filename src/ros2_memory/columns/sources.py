@@ -22,7 +22,8 @@ from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, SCORES, looks_
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from ros2_memory.columns.values import Floats, Ints, Mask, Values
+    from ros2_memory.columns.values import Floats, Values
+    from ros2_memory.storage.base import IntArray, Mask
 
 
 class NamedScores(NamedTuple):
@@ -37,7 +38,7 @@ class NamedScores(NamedTuple):
         """Which objects have a name."""
         return np.array([bool(word.strip()) for word in self.name.words], np.bool_)[self.name.codes]
 
-    def at(self, positions: Ints) -> NamedScores:
+    def at(self, positions: IntArray) -> NamedScores:
         """Returns some of them."""
         name, score, error = self
         return NamedScores(Texts(name.codes[positions], name.words), score[positions], error)
@@ -123,7 +124,7 @@ class Labels(NamedTuple):
         level = self.scored.level
         return level.parent if self.is_best and level.parent else level
 
-    def read(self, values: Values) -> tuple[Ints, NamedScores]:
+    def read(self, values: Values) -> tuple[IntArray, NamedScores]:
         """Returns what names the objects, and its positions in the level of `scored`.
 
         Raises:
@@ -146,7 +147,7 @@ class Labels(NamedTuple):
                 raise UnknownShapeError("another hypothesis may be the best")
         return best, named.at(best)
 
-    def objects(self, values: Values, positions: Ints) -> Ints:
+    def objects(self, values: Values, positions: IntArray) -> IntArray:
         """Returns the objects that are named at some positions in the level of `scored`."""
         return values.elements(self.scored.level).owners[positions] if self.is_best else positions
 
@@ -251,7 +252,7 @@ def _limited(node: dict[str, Node], labels: Labels, least: float) -> Node:
         perhaps[owners] = ~(named.is_named & (named.score < least - named.error))
         return TruthValues(surely, perhaps)
 
-    def find(values: Values, positions: Ints) -> TruthValues:
+    def find(values: Values, positions: IntArray) -> TruthValues:
         surely, perhaps = values.once(limit, of_objects)
         return TruthValues(surely[positions], perhaps[positions])
 
@@ -260,7 +261,7 @@ def _limited(node: dict[str, Node], labels: Labels, least: float) -> Node:
     if not labels.is_best or not isinstance(results, Listing):
         return narrowed(node, limit)
 
-    def of_hypotheses(values: Values, positions: Ints) -> TruthValues:
+    def of_hypotheses(values: Values, positions: IntArray) -> TruthValues:
         named, owners = labels.scored.read(values), labels.objects(values, positions)
         # Where it is not sure that the detection is one, neither is what stays of it.
         is_detection, score = limit.kept(values, owners).surely, named.score[positions]

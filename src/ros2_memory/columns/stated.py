@@ -47,9 +47,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Floats, Ints, Mask
+    from ros2_memory.columns.values import Floats
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import IntArray, Mask
 
 
 _NO_ROWS: Final = np.empty(0, np.int64)
@@ -64,9 +65,9 @@ class FromColumns(NamedTuple):
     """
 
     stated: Stated
-    unsure: Ints
+    unsure: IntArray
 
-    def to_read(self, index: Ints | None) -> Ints:
+    def to_read(self, index: IntArray | None) -> IntArray:
         """Returns the positions, among some rows (None: all), of the messages to be read."""
         return self.unsure if index is None else np.flatnonzero(np.isin(index, self.unsure))
 
@@ -109,7 +110,7 @@ def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
         return _goals
     if has_errors(type_name):
         return partial(_entries, _entry_leaves(value, type_name), type_name)
-    numbers: Callable[[Values], tuple[Facts, Ints]] | None = None
+    numbers: Callable[[Values], tuple[Facts, IntArray]] | None = None
     commands = [*_command_leaves(value)] if type_name in VELOCITIES else []
     charges = _leaves_at(value, "percentage") if type_name == BATTERY else []
     if commands:
@@ -178,7 +179,7 @@ def _entries(entry: _Entry, type_name: str, values: Values) -> FromColumns:
 def _states(
     sources: Sequence[Source],
     flags: Sequence[tuple[str, Leaf]],
-    numbers: Callable[[Values], tuple[Facts, Ints]] | None,
+    numbers: Callable[[Values], tuple[Facts, IntArray]] | None,
     values: Values,
 ) -> FromColumns:
     """Returns what messages state by labels with their scores, booleans and numbers."""
@@ -246,7 +247,7 @@ def _facts_of_entry(level: int, type_name: str, name: str = "", text: str = "") 
     return state_of(value, type_name).facts
 
 
-def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, Ints]:
+def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, IntArray]:
     """Returns how low a battery is, and the rows in which rounding may have changed that."""
     charges, error = values.floats(leaf)
     low, levels, high = (charge_levels(charges + off) for off in (-error, 0, error))
@@ -255,7 +256,7 @@ def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, Ints]:
     return charge, np.flatnonzero(low != high)
 
 
-def _command_facts(leaves: Sequence[Leaf], values: Values) -> tuple[Facts, Ints]:
+def _command_facts(leaves: Sequence[Leaf], values: Values) -> tuple[Facts, IntArray]:
     """Returns whether a velocity is commanded, and the rows in which rounding may hide that."""
     surely, perhaps = np.ones(values.rows, np.bool_), np.ones(values.rows, np.bool_)
     for leaf in leaves:
@@ -266,7 +267,9 @@ def _command_facts(leaves: Sequence[Leaf], values: Values) -> tuple[Facts, Ints]
     return _facts_of(COMMAND, settled, ~surely[settled]), np.flatnonzero(surely != perhaps)
 
 
-def _facts_of(kind: str, rows: Ints, numbers: Ints | Mask | Floats, name: str = "") -> Facts:
+def _facts_of(
+    kind: str, rows: IntArray, numbers: IntArray | Mask | Floats, name: str = ""
+) -> Facts:
     """Returns a number of each row as a fact, under one word."""
     words = [Word(kind, name) if name else Word(kind)]
     return Facts(rows, np.zeros(rows.size, np.int64), numbers.astype(np.float64), words)

@@ -45,9 +45,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Mask, Numeric, ZoneOf
+    from ros2_memory.columns.values import Numeric, ZoneOf
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import Mask
 
 _EXACT_BELOW: Final = 2**53
 _ROUNDING: Final = 1e-9

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.columns.writing import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
-from ros2_memory.core.arrays import Groups, distinct_rows, in_ranges
+from ros2_memory.core.arrays import Flags, Groups, distinct_rows, in_ranges
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.index.segment import in_time
@@ -29,8 +29,6 @@ from ros2_memory.storage.base import REPEATED_NS, IntArray
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
@@ -88,7 +86,7 @@ class Unit:
         """Returns for each row the number of its bag."""
         return self._column(BAG)
 
-    def counting(self) -> NDArray[np.bool_] | None:
+    def counting(self) -> Flags | None:
         """Returns which rows are of bags that count; None: all are."""
         return None if self.all_count else np.isin(self.bag_numbers(), self.numbers)
 
@@ -235,7 +233,7 @@ class Rows:
         index = positions if self.index is None else self.index[positions]
         return Rows.of(self.unit, index)
 
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self) -> Flags:
         """Returns for each row of the table whether it counts."""
         if self.index is None:
             return np.ones(len(self.table), np.bool_)
@@ -264,7 +262,7 @@ class Identities(NamedTuple):
         return Identities(*(column[positions] for column in self))
 
 
-def copies_among(messages: Identities) -> NDArray[np.bool_]:
+def copies_among(messages: Identities) -> Flags:
     """Returns which of the messages repeat an earlier one of another recording.
 
     Of several of one log time that of the recording with the lowest number counts.
@@ -291,7 +289,7 @@ def copies_among(messages: Identities) -> NDArray[np.bool_]:
     return copies
 
 
-def repeated_among(messages: Identities) -> NDArray[np.bool_]:
+def repeated_among(messages: Identities) -> Flags:
     """Returns which messages were received again: late, and before by another recording."""
     order = np.lexsort(
         (messages.recordings, messages.log_times, messages.hashes, messages.publish_times)

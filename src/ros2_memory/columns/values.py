@@ -27,12 +27,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ros2_memory.columns.limits import Limit
+    from ros2_memory.storage.base import IntArray, Mask
 
     Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
     # Of any dtype: that of floats has the operations that all of them have.
     Numeric: TypeAlias = Floats
-    Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
-    Mask: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
 T = TypeVar("T")
 
@@ -148,7 +147,7 @@ class LeafNumbers(NamedTuple):
 
     values: Numeric
     error: float | Floats
-    exactly: Callable[[Ints], Floats] | None = None
+    exactly: Callable[[IntArray], Floats] | None = None
 
 
 class Values:
@@ -194,7 +193,7 @@ class Values:
         around = self._rows(level.parent)
         return None if around is None else around.elements.get(level.name)
 
-    def places(self, level: Level, positions: Ints, *, from_end: bool) -> Ints:
+    def places(self, level: Level, positions: IntArray, *, from_end: bool) -> IntArray:
         """Returns the places of some elements in their lists: 0, 1, ... or -1, -2, ..."""
         owners = self.elements(level).owners
         edge = np.searchsorted(owners, owners[positions], side="right" if from_end else "left")
@@ -289,7 +288,7 @@ class Values:
         if error:
             return LeafNumbers(angles, _angle_error(error, turn.length, turn.cosine, angles))
 
-        def exactly(positions: Ints) -> Floats:
+        def exactly(positions: IntArray) -> Floats:
             angle_of: dict[tuple[float, float, float, float], float] = {}
             exact = np.empty(len(positions))
             rows = zip(*(part[positions].tolist() for part in floats), strict=True)

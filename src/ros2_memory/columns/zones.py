@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.stored import Topic
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.storage.base import Channel, Definition, IntArray
 
     Floats = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 _EXACT_BELOW: Final = 2.0**53
 _ANY: Final = -1
@@ -91,27 +91,27 @@ class Zones(NamedTuple):
         """Returns the zones of the values divided by a positive number."""
         return self._replace(low=self.low / by, high=self.high / by)
 
-    def spans(self, number: float) -> Mask:
+    def spans(self, number: float) -> Flags:
         """Returns in which parts a number may be a value."""
         at = as_float(number)
         return (self.low <= at) & (at <= self.high)
 
-    def reaches(self, limit: float, *, above: bool) -> Mask:
+    def reaches(self, limit: float, *, above: bool) -> Flags:
         """Returns in which parts some value may lie above a limit, or below it."""
         # An integer that no float reaches is below infinity all the same.
         at = min(max(as_float(limit), -sys.float_info.max), sys.float_info.max)
         return self.high > at if above else self.low < at
 
-    def may_be_near(self, place: float, distance: float) -> Mask:
+    def may_be_near(self, place: float, distance: float) -> Flags:
         """Returns in which parts some value may be within a distance of a place."""
         return (self.low - place <= distance) & (place - self.high <= distance)
 
-    def may_have(self, text: str) -> Mask:
+    def may_have(self, text: str) -> Flags:
         """Returns in which parts a casefolded text may be part of a value."""
         return self._where(lambda words: may_be_in(words, text))
 
     @property
-    def may_be_json(self) -> Mask:
+    def may_be_json(self) -> Flags:
         """In which parts a text may be a JSON array or object."""
         return self._where(lambda words: may_be_in(words, "[") or may_be_in(words, "{"))
 
@@ -120,7 +120,7 @@ class Zones(NamedTuple):
         """About how much memory it takes."""
         return 32 * self.parts.size + sum(60 + len(words) for words in self.words)
 
-    def _where(self, may_have: Callable[[str], bool]) -> Mask:
+    def _where(self, may_have: Callable[[str], bool]) -> Flags:
         """Returns in which parts words may have something; these may be few of many."""
         flags = np.ones(len(self.words) + 1, np.bool_)
         for code in np.unique(self.codes[self.codes != _ANY]).tolist():

@@ -21,11 +21,9 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
-    from numpy.typing import NDArray
-
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.pauses import Absences, Pauses
 
-    IntArray = NDArray[np.int64]
 
 SetBack: TypeAlias = "tuple[Ns, Ns] | None"
 """By how much log times go back, and the first one after that; None where they do not."""
@@ -151,7 +149,7 @@ DOUBTS: Final = (
 
 def numbers_of(
     schema: SummarySchema, joined: bytes, summaries: int, positions: Sequence[int]
-) -> IntArray:
+) -> Ints:
     """Returns count, first and last of some topics, of the joined `data` of so many summaries.
 
     These share the schema, and the size of their data. Of the shape (positions, summaries, 3).
@@ -164,7 +162,7 @@ def numbers_of(
     # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
     shape, strides = (2, len(schema.topics), summaries), (_TIME_BYTES, _TOPIC_BYTES, size)
     pairs = np.ndarray(shape, "<i8", joined, _BASE.size, strides)[:, [*positions]]
-    numbers: IntArray = np.empty((3, len(positions), summaries), np.int64)
+    numbers: Ints = np.empty((3, len(positions), summaries), np.int64)
     numbers[0] = pairs[0] & ((1 << 8 * _COUNT_BYTES) - 1)
     numbers[1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
     return numbers.transpose(1, 2, 0)

@@ -14,7 +14,7 @@ from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from ros2_memory.core.arrays import Ints
 
 Pauses: TypeAlias = "tuple[Span, ...]"
 """From the log time of the last message before each to that of the first after it, in order."""
@@ -36,9 +36,9 @@ _MOST: Final = 64
 
 
 def pauses_among(
-    firsts: NDArray[np.int64],
-    lasts: NDArray[np.int64],
-    counts: NDArray[np.int64],
+    firsts: Ints,
+    lasts: Ints,
+    counts: Ints,
     *,
     longer_than: Ns = SHORTEST_PAUSE_NS,
 ) -> list[CountedPause]:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.arrays import Flags
+
 Floats: TypeAlias = "NDArray[np.float64]"
 Point: TypeAlias = "tuple[float, float]"
 
@@ -202,7 +204,7 @@ class AnyOf:
 Region: TypeAlias = "Circle | Rectangle | Polygon | AnyOf"
 
 
-def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> NDArray[np.bool_]:
+def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> Flags:
     inside = np.zeros(np.shape(x), np.bool_)
     for (ax, ay), (bx, by) in zip(corners, (*corners[1:], corners[0]), strict=True):
         crosses = (ay > y) != (by > y)

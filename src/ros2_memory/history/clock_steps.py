@@ -41,10 +41,9 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.zones import PartZones
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.view import View
 
 _MOST_SUSPECTS: Final = 32
@@ -246,14 +245,14 @@ def _is_late(view: View, topic: str, pause: Pause) -> bool:
     return any(pause.start + ALIKE_NS < at < pause.end - ALIKE_NS for at in sent)
 
 
-def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np.int64]]:
+def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, Ints]:
     """Returns the log times and header stamps of a topic in a window, of each recording."""
-    by_recording: dict[Path, list[NDArray[np.int64]]] = defaultdict(list)
+    by_recording: dict[Path, list[Ints]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
         return _STAMP in parts.topic.layout.slots
 
-    def stamped(rows: Rows) -> NDArray[np.int64] | None:
+    def stamped(rows: Rows) -> Ints | None:
         column = rows.table.columns.get(_STAMP)
         if column is None or isinstance(column, Texts):
             return None

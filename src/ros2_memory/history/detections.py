@@ -26,12 +26,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import IntArray, Mask
 
 _LONGEST_LATENCY_NS: Final[Ns] = 10 * NS_PER_S
 """So long a large model may look at an image before it says what is in it."""

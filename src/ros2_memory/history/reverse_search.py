@@ -52,10 +52,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.stored_message import StoredMessage
-    from ros2_memory.storage.base import IntArray, Schema
+    from ros2_memory.storage.base import IntArray, Mask, Schema
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
 _CONSTANT: Final = re.compile(

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
+    from ros2_memory.storage.base import Mask
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment moving transforms are read; the last is the length of tf2's cache."""

@@ -10,7 +10,7 @@ from functools import cached_property, reduce
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.arrays import Flags
+    from ros2_memory.core.arrays import Flags, Ints
 
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
@@ -48,8 +48,6 @@ _OCTAVES: Final = 64 * _PER_OCTAVE
 """A period of 64 bits is in one of so many parts of octaves."""
 _NONE: Final = (0, MAX_NS, MIN_NS)
 """Count, first and last log time of a topic of which a bag has no message."""
-
-_Times: TypeAlias = "NDArray[np.int64]"
 
 
 class TopicExtent(NamedTuple):
@@ -70,9 +68,9 @@ class TopicColumn(NamedTuple):
     """
 
     bags: NDArray[np.intp]
-    firsts: NDArray[np.int64]
-    lasts: NDArray[np.int64]
-    messages: NDArray[np.int64]
+    firsts: Ints
+    lasts: Ints
+    messages: Ints
 
 
 class TopicTotals(NamedTuple):
@@ -258,7 +256,7 @@ class Segment:
         }
 
     @cached_property
-    def _by_folder(self) -> NDArray[np.int64]:
+    def _by_folder(self) -> Ints:
         """Count, first and last by topic of one type, and folder."""
         numbers = self.bags.folder_of[self._order]
         order = np.argsort(numbers, kind="stable")
@@ -297,7 +295,7 @@ class Segment:
         counts, firsts, lasts = numbers[types, bags].T
         return TopicColumn(bags, firsts, lasts, counts)
 
-    def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
+    def _numbers(self, headers: Sequence[TopicHeader]) -> Ints:
         """Returns count, first and last by topic of one type, and bag; `_NONE` without messages.
 
         The bags are in the order of `_order`.
@@ -351,7 +349,7 @@ class Segment:
         numbers, _ = self._between_absences()
         return dict(zip(sorted(self.types), _runs(numbers), strict=True))
 
-    def _between_absences(self) -> tuple[NDArray[np.int64], _Times]:
+    def _between_absences(self) -> tuple[Ints, Ints]:
         """Returns count, first and last by topic (sorted) and bag, and the length of the bags.
 
         In all (ns), of the bags that hold each topic. Between absences a bag is as many: what
@@ -426,9 +424,7 @@ def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, N
     totals[type_name] = added if before is None else before | added
 
 
-def _added(
-    numbers: NDArray[np.int64], begins: Sequence[int] | NDArray[np.intp], axis: int
-) -> NDArray[np.int64]:
+def _added(numbers: Ints, begins: Sequence[int] | NDArray[np.intp], axis: int) -> Ints:
     """Returns count, first and last of some rows together, each from one of `begins` on."""
     added = (np.add, np.minimum, np.maximum)
     return np.stack(
@@ -436,7 +432,7 @@ def _added(
     )
 
 
-def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[Span, ...]]:
+def _runs(numbers: Ints) -> Iterator[tuple[Span, ...]]:
     """Yields the runs of each topic, by count, first and last; see `analysis.silences`."""
     _, firsts, lasts = numbers.transpose(2, 0, 1)
     order = np.argsort(firsts, axis=1, kind="stable")
@@ -449,7 +445,7 @@ def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[Span, ...]]:
         yield tuple(zip(starts, reach[nth, [*edges, -1]].tolist(), strict=True))
 
 
-def _spacings(counts: NDArray[np.int64], spans: NDArray[np.int64]) -> list[dict[int, Spacing]]:
+def _spacings(counts: Ints, spans: Ints) -> list[dict[int, Spacing]]:
     """Returns the spacings of each topic, by the part of an octave of the period."""
     topics, bags = np.nonzero((counts >= _FEWEST) & (spans > 0))
     spans, intervals = spans[topics, bags], counts[topics, bags] - 1

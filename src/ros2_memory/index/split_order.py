@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.segment import Segment
@@ -73,7 +74,7 @@ class SplitNames(NamedTuple):
 
     stems: Sequence[Stem]
     positions: NDArray[np.uint16]
-    numbers: NDArray[np.int64]
+    numbers: Ints
 
 
 def stem_of(file: str) -> str:

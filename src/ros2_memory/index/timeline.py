@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
-from ros2_memory.core.arrays import joined_codes
+from ros2_memory.core.arrays import Ints, joined_codes
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
@@ -36,8 +36,6 @@ from ros2_memory.index.unreadable_span import MAX_FILE_NS
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 SEGMENT_BAGS: Final = 1024
@@ -145,7 +143,7 @@ class Timeline:
         return Bags(segment.bags for segment in self.segments)
 
     @property
-    def starts(self) -> NDArray[np.int64]:
+    def starts(self) -> Ints:
         """Log time of the first message in each of all bags."""
         return np.concatenate(
             [np.empty(0, np.int64), *(part.bags.starts for part in self.segments)]
@@ -157,12 +155,12 @@ class Timeline:
         return max((segment.latest for segment in self.segments), default=MIN_NS)
 
     @property
-    def ends(self) -> NDArray[np.int64]:
+    def ends(self) -> Ints:
         """Log time of the last message in each of all bags."""
         return np.concatenate([np.empty(0, np.int64), *(part.bags.ends for part in self.segments)])
 
     @property
-    def folder_numbers(self) -> NDArray[np.int64]:
+    def folder_numbers(self) -> Ints:
         """For each of all bags a number; those of one folder have the same."""
         bags = (segment.bags for segment in self.segments)
         return joined_codes((part.folder_of, part.folders) for part in bags)[0]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Ints, Spot, bin_of
+from ros2_memory.analysis.sights import SCORE_BINS, Spot, bin_of
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, places_at
@@ -37,6 +37,7 @@ from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue, Vector3
     from ros2_memory.history.context import Call, Memory, QuerySettings
 

@@ -16,7 +16,7 @@ from itertools import accumulate
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
-from ros2_memory.analysis.sights import Ints, Spot
+from ros2_memory.analysis.sights import Spot
 from ros2_memory.columns.sights import joined
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.regions import Place, places_at
@@ -31,6 +31,7 @@ from ros2_memory.things.seen import SIGHTS_NS, SeenStretch, Watching, spots_in
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
 
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import TimeWindow, Vector3
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View

@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
-from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Flags, Ints, Look, Spot
-from ros2_memory.core.arrays import distinct_rows, run_starts
+from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Look, Spot
+from ros2_memory.core.arrays import Flags, Ints, distinct_rows, run_starts
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 

@@ -24,12 +24,11 @@ from ros2_memory.analysis.sights import (
     SLICE_NS,
     DetectorMessages,
     Floats,
-    Ints,
     Sights,
     fixes_of,
     sights_of,
 )
-from ros2_memory.core.arrays import run_starts
+from ros2_memory.core.arrays import Ints, run_starts
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow

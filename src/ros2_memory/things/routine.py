@@ -21,7 +21,8 @@ from ros2_memory.results import UsualPlace
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.sights import Flags, Floats, Ints
+    from ros2_memory.analysis.sights import Floats
+    from ros2_memory.core.arrays import Flags, Ints
 
 
 _HOUR_NS: Final = 3600 * NS_PER_S

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.conditions import Contains, Equals
-from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
-from ros2_memory.core.arrays import Columns, distinct_rows
+from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, Unplaced
+from ros2_memory.core.arrays import Columns, Ints, distinct_rows
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NotInLakeError,

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.sights import Ints
+from ros2_memory.core.arrays import Ints
 from ros2_memory.things.places import Sightings, stays_in
 from tests.support.bags import Msg, header, make, point, quaternion, write_splits
 from tests.support.examples import examples

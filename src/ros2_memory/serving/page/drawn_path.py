@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
 
@@ -54,10 +55,10 @@ class Box(NamedTuple):
 class Line(NamedTuple):
     """Points of a path in order of time; `begins`: whether no line leads to a point."""
 
-    times: NDArray[np.int64]
+    times: Ints
     x: NDArray[np.float64]
     y: NDArray[np.float64]
-    begins: NDArray[np.bool_]
+    begins: Flags
 
     def some(self, kept: NDArray[np.intp]) -> Line:
         """Returns the points with these indices."""

@@ -37,8 +37,7 @@ from ros2_memory.insights.status import usual_rate
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from numpy.typing import NDArray
-
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.context import Call, Memory
 
 
@@ -71,9 +70,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     return {"end": unix_from_ns(window.stop), "labels": shown, "labels_total": len(rows)}
 
 
-def _label(
-    label: str, first: NDArray[np.int64], last: NDArray[np.int64], window: TimeWindow
-) -> JsonObject:
+def _label(label: str, first: Ints, last: Ints, window: TimeWindow) -> JsonObject:
     """Returns a row of a label, whose intervals are in order and do not overlap."""
     start, stop = first.clip(window.start), last.clip(None, window.stop)
     is_apart = start[1:] - stop[:-1] > (window.stop - window.start) // _BARS
@@ -228,7 +225,7 @@ def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
     }
 
 
-def _spoke(view: View, topic: str, window: TimeWindow) -> NDArray[np.int64]:
+def _spoke(view: View, topic: str, window: TimeWindow) -> Ints:
     """Returns how many messages each bin of a window has."""
     extents = [*view.timeline.extents(topic, window)]
     messages = sum(summary.count for extent in extents for summary in extent.bag.summary.of(topic))
@@ -249,7 +246,7 @@ def _spoke(view: View, topic: str, window: TimeWindow) -> NDArray[np.int64]:
     return _binned(np.concatenate([np.zeros(0, np.int64), *spread]), window)
 
 
-def _binned(times: NDArray[np.int64], window: TimeWindow) -> NDArray[np.int64]:
+def _binned(times: Ints, window: TimeWindow) -> Ints:
     length: Ns = window.stop - window.start
     inside = times[(times >= window.start) & (times < window.stop)] - window.start
     return np.bincount((inside / length * BINS).astype(np.int64).clip(0, BINS - 1), minlength=BINS)
