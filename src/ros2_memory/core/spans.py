@@ -31,6 +31,12 @@ def united(spans: Iterable[Span], apart: Ns = 0) -> Spans:
     return merged
 
 
+def enclosing(spans: Iterable[Span]) -> Span:
+    """Returns the earliest begin and the latest end of spans, of which there is one at least."""
+    firsts, lasts = zip(*spans, strict=True)
+    return min(firsts), max(lasts)
+
+
 def without(spans: Iterable[Span], others: Sequence[Span]) -> Spans:
     """Returns what is left of spans outside of others, which are sorted and apart."""
     left: Spans = []

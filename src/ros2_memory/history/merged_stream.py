@@ -22,6 +22,7 @@ from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import (
     COPY_HORIZON_NS,
     Spans,
+    enclosing,
     lies_inside,
     overlap_spans,
     united,
@@ -108,7 +109,7 @@ class MergedStream:
         for segment in self._timeline.segments_in(window):
             spans = [segment.spans[topic] for topic in topics if topic in segment.spans]
             if spans:
-                first, last = min(first for first, _ in spans), max(last for _, last in spans)
+                first, last = enclosing(spans)
                 edges.update((segment.bags[0].start, first + 1, last))
         inside = sorted(edge for edge in edges if window.start <= edge <= window.stop)
         return [TimeWindow(start, stop) for start, stop in pairwise(inside)]

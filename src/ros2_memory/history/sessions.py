@@ -30,6 +30,7 @@ from ros2_memory.columns.transforms import STATICS, Pair, Statics, pairs_in, sta
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
+from ros2_memory.core.spans import enclosing
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.history.context import READING_S, Note
@@ -516,12 +517,6 @@ def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
             large |= small
             component.update(dict.fromkeys(small, large))
     return component
-
-
-def enclosing(spans: Iterable[Span]) -> Span:
-    """Returns the earliest begin and the latest end of spans, of which there is one at least."""
-    firsts, lasts = zip(*spans, strict=True)
-    return min(firsts), max(lasts)
 
 
 def _distance(span: Span, moment: Ns) -> Ns:

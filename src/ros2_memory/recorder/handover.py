@@ -49,6 +49,7 @@ from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import enclosing
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.recorder.policies import ClockReading, set_back
 from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
@@ -543,7 +544,7 @@ def _against_the_cut(
         spans.append((start, min(old.end, new.end)))
     if not spans:
         return of_old, of_new
-    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    first, last = enclosing(spans)
     window = TimeWindow(first - STALL_NS, last + STALL_NS + 1)
     in_old, in_new = (side.copies(window, reader, latched=latched) for side in (old, new))
     for message in in_old.keys() | in_new.keys():

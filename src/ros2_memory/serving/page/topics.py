@@ -20,6 +20,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, rounded
+from ros2_memory.core.spans import enclosing
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.counts.numbers import SUM_SCALE, Part, PieceNumbers
 from ros2_memory.history.no_data import (
@@ -150,7 +151,7 @@ def _signal_parts(
     ]
     if not inside:
         return [], None, ()
-    begin, end = min(first for first, _ in inside), max(last for _, last in inside)
+    begin, end = enclosing(inside)
     edges = np.arange(begin - begin % width + width, end + 1, width)
     numbers = PieceNumbers(view, topic, (field,), edges)
     numbers.collect(window)
