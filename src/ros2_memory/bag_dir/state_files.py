@@ -597,6 +597,11 @@ class Excluded:
     stop: Int64
     held: StrictBool = True
 
+    @property
+    def span(self) -> Span:
+        """From when to when it is."""
+        return self.start, self.stop
+
 
 @dataclass(slots=True)
 class ScreenState:

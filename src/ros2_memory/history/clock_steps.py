@@ -163,11 +163,7 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:
     """Returns the pauses that bags show in a window, and those that deleted bags showed."""
-    shown = {
-        (pause.start, pause.end): pause
-        for pause in view.snapshot.suspects
-        if window.overlaps(pause.start, pause.end)
-    }
+    shown = {pause.span: pause for pause in view.snapshot.suspects if window.overlaps(*pause.span)}
     deleted = {
         pause: Pause(*pause, (), ran_on=True)
         for pause in read_thinned(view.bag_dir).pauses
@@ -216,7 +212,7 @@ def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
     # A recording that ended before the pause tells nothing about one that began after it.
     through = set.intersection(*({bag.recording for bag in side_bags} for side_bags in bags))
     sides = [_poses(view, topic, window, through) for window in (before, after)]
-    return step_over((pause.start, pause.end), *sides)
+    return step_over(pause.span, *sides)
 
 
 def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
@@ -230,9 +226,9 @@ def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
         if view.timeline.is_log(topic):
             continue  # they have no header, and are mostly latched: their parts are many
         by_recording = _stamps(view, topic, around).values()
-        found = (delay_change((pause.start, pause.end), *stamped) for stamped in by_recording)
+        found = (delay_change(pause.span, *stamped) for stamped in by_recording)
         changes += islice((change for change in found if change is not None), 1)
-    return step_by_delays((pause.start, pause.end), changes)
+    return step_by_delays(pause.span, changes)
 
 
 def _is_late(view: View, topic: str, pause: Pause) -> bool:

@@ -237,7 +237,7 @@ def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on the intervals of a window that were excluded."""
     excluded = excluded_between(bag_dir, window.start, window.stop)
-    spans = united((stretch.start, stretch.stop) for stretch in excluded)
+    spans = united(stretch.span for stretch in excluded)
     if spans:
         named = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in spans[-MAX_NAMED:]]
         yield (

@@ -133,7 +133,7 @@ class View:
         """
         first, last = window.asked()
         bounds = (window.start, window.stop - 1) if around else (last, first)
-        pauses = [(pause.start, pause.end) for pause in self.snapshot.pauses]
+        pauses = [pause.span for pause in self.snapshot.pauses]
         touched = {(start, end) for start, end in pauses if start < bounds[0] and bounds[1] < end}
         # What is a gap follows from all bags; at most moments there is not even a pause.
         gaps = [gap for gap in self.snapshot.gaps if gap in touched] if touched else []

@@ -15,7 +15,7 @@ import numpy as np
 
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
@@ -45,6 +45,11 @@ class Pause(NamedTuple):
     end: Ns
     bags: tuple[BagFile, ...]
     ran_on: bool
+
+    @property
+    def span(self) -> Span:
+        """From when to when it is."""
+        return self.start, self.end
 
     @property
     def length(self) -> Ns:
@@ -122,7 +127,7 @@ class Rhythm:
             ]
             beside = {
                 at
-                for at in (pause.start, pause.end)
+                for at in pause.span
                 if any(first - limit <= at <= last + limit for first, last in spans)
             }
             if beside:

@@ -195,13 +195,13 @@ class Snapshot:
         dated do not count. A step forward of the clock looks alike: see `View.gaps`.
         """
         # Each bag of several that hold the same has it.
-        return sorted({(pause.start, pause.end) for pause in self._rhythm.gaps(self.pauses)})
+        return sorted({pause.span for pause in self._rhythm.gaps(self.pauses)})
 
     @cached_property
     def breaks(self) -> Sequence[Span]:
         """Those gaps after which another run of a recorder began."""
         pauses = [*self._rhythm.gaps(self.pauses)]
-        within_runs = {(pause.start, pause.end) for pause in pauses if pause.ran_on}
+        within_runs = {pause.span for pause in pauses if pause.ran_on}
         return [gap for gap in self.gaps if gap not in within_runs]
 
     @cached_property
@@ -240,7 +240,7 @@ class Snapshot:
                 pauses += self._shared_parts(pause)
             if newest is None or segment.latest > newest.end:
                 newest = segment.newest
-        return sorted(pauses, key=lambda pause: (pause.start, pause.end))
+        return sorted(pauses, key=lambda pause: pause.span)
 
     def _shared_parts(self, pause: Pause) -> Iterator[Pause]:
         """Yields the parts of a bag's pause in which no other bag has a message either."""
@@ -252,7 +252,7 @@ class Snapshot:
             if bag.file not in self.dating.misdated
             for span in without([(bag.start, bag.end)], bag.summary.schema.pauses)
         )
-        for start, end in without([(pause.start, pause.end)], others):
+        for start, end in without([pause.span], others):
             if end - start > SHORTEST_PAUSE_NS:
                 yield pause._replace(start=start, end=end)
 

@@ -72,7 +72,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         recorder = state_of(heartbeat, live=live)
     mixed = describe_mixed(memory, call)
     gaps = view.gaps(TimeWindow.everything())
-    stalls = {*gaps} & {(pause.start, pause.end) for pause in snapshot.suspects}
+    stalls = {*gaps} & {pause.span for pause in snapshot.suspects}
     moments = None
     try:
         moments = newest_moments(memory, now, MAX_MOMENTS)

@@ -472,7 +472,7 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
         if fault.kind is FaultyClock.SET_BACK
         if fault.by >= SHORTEST_STEP_NS and is_in(fault.at)
     ]
-    pauses = [(pause.start, pause.end) for pause in snapshot.suspects if is_in(pause.start)]
+    pauses = [pause.span for pause in snapshot.suspects if is_in(pause.start)]
     left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]
     since = bags[0].start if known.since is None else known.since
     if since > snapshot.scanned_at:  # by a clock that was ahead

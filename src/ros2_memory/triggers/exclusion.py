@@ -215,10 +215,10 @@ class Cut:
         self, stretches: Sequence[Excluded], before: Sequence[Excluded], latched: Collection[str]
     ) -> None:
         self._latched = frozenset(latched)
-        self._all = united((stretch.start, stretch.stop) for stretch in stretches)
+        self._all = united(stretch.span for stretch in stretches)
         known = (*before, *stretches)
-        self._known = united((stretch.start, stretch.stop) for stretch in known)
-        self._held = united((stretch.start, stretch.stop) for stretch in known if stretch.held)
+        self._known = united(stretch.span for stretch in known)
+        self._held = united(stretch.span for stretch in known if stretch.held)
 
     def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
         """Returns whether a message is deleted."""
@@ -255,11 +255,9 @@ def add_excluded(
     ]
     joined: list[Excluded] = []
     for held in (True, False):
-        spans = [
-            (stretch.start, stretch.stop) for stretch in (*known, *parts) if stretch.held is held
-        ]
+        spans = [stretch.span for stretch in (*known, *parts) if stretch.held is held]
         joined += (Excluded(*span, held=held) for span in united(spans))
-    return sorted(joined, key=lambda stretch: (stretch.start, stretch.stop))
+    return sorted(joined, key=lambda stretch: stretch.span)
 
 
 def _published(log_time: Ns, publish_time: Ns) -> Ns:
