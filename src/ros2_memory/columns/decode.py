@@ -147,14 +147,14 @@ def undecoded(
         kinds = _Kinds(reader, hashed, columns)
         kinds.look_at(channels, path, window)
         alone = reader.times_alone(path)
-        kind_of = [(channel.topic, kinds.of(channel)) for channel in channels]
-        # Copies of messages without a payload are recognised by their publish times.
-        bare = {channel.topic for channel in channels} - {
-            topic
-            for topic, kind in kind_of
-            if kind.plan is not None or (kind.is_hashed and topic not in alone)
-        }
         wanted = {channel.topic for channel in channels}
+        # Copies of messages without a payload are recognised by their publish times.
+        bare = wanted - {
+            channel.topic
+            for channel in channels
+            if (kind := kinds.of(channel)).plan is not None
+            or (kind.is_hashed and channel.topic not in alone)
+        }
         group = Group(reader, skip_undecodable)
         for batch in or_errors(reader.batches(path, wanted, window, bare=bare)):
             if isinstance(batch, BagError):
