@@ -250,7 +250,7 @@ def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> No
         found = asked(memory, tmp_path, "get_position_at", timestamp=T0 / S + at, topic="/fix")
         assert found["latitude"] == pytest.approx(48.1234567 + at * 1e-5)
         assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
-    _, fixes = fixes_in(View(memory, Call()), "/fix", TimeWindow.everything())
+    fixes = fixes_in(View(memory, Call()), "/fix", TimeWindow.everything())
     assert [at for at, _ in fixes] == [T0 + n * S for n in range(5, 9)]
 
 

@@ -394,7 +394,7 @@ class BinnedWindow:
         lasting = united(zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True))
         self.add_lengths("seconds", "duration", without(lasting, self.gaps))
         self.add_first("first", begins)
-        self.add_last("last", self._last_held(starts, stops), max(stops.tolist(), default=None))
+        self.add_last(self._last_held(starts, stops), max(stops.tolist(), default=None))
         self.usual = self.usual_of(begins)
 
     def add_first(self, column: str, times: Ints) -> None:
@@ -405,10 +405,10 @@ class BinnedWindow:
         first = [None if at == MAX_NS else at for at in of_bins]
         self.add(column, "time", first, min(times.tolist(), default=None))
 
-    def add_last(self, column: str, of_pieces: Ints, whole: Ns | None) -> None:
+    def add_last(self, of_pieces: Ints, whole: Ns | None) -> None:
         """Adds the last time in each bin, by those in pieces; `MIN_NS` where there is none."""
         of_bins = (int(of_pieces[in_bin].max(initial=MIN_NS)) for in_bin in self.bins.member.T)
-        self.add(column, "time", [None if at == MIN_NS else at for at in of_bins], whole)
+        self.add("last", "time", [None if at == MIN_NS else at for at in of_bins], whole)
 
     def _last_held(self, starts: Ints, stops: Ints) -> Ints:
         """Returns for each piece when something held there for the last time; `MIN_NS`: never."""

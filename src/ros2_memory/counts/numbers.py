@@ -506,7 +506,7 @@ def count_range(
         raise no_data_between(view, (name,), asked)
     binned.add_sums("count", "count", counts)
     binned.add_first("first", first[counts > 0])
-    binned.add_last("last", last, int(last.max()))
+    binned.add_last(last, int(last.max()))
     for field, cells in zip(names, cells_of_fields, strict=True):
         if cells[-1] is None:
             view.notes.add(f"{field} holds no number in the window")

@@ -47,10 +47,10 @@ def local_frame(origin: Geodetic) -> str:
     return f"east and north of {origin.latitude:.6f}, {origin.longitude:.6f}"
 
 
-def fixes_in(view: View, topic: str, window: TimeWindow) -> tuple[int, list[tuple[Ns, Geodetic]]]:
-    """Returns how many messages a window holds, and the fixes among `MOST_FIXES` of them."""
-    total, messages = pick(view, topic, window, MOST_FIXES)
-    return total, [*_fixes(view, messages)]
+def fixes_in(view: View, topic: str, window: TimeWindow) -> list[tuple[Ns, Geodetic]]:
+    """Returns the fixes among `MOST_FIXES` messages of a window."""
+    _, messages = pick(view, topic, window, MOST_FIXES)
+    return [*_fixes(view, messages)]
 
 
 def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotTrack] | None:
@@ -64,7 +64,7 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
     _, origin = next(_fixes(view, islice(messages, _MOST_TRIED)), (0, None))
     if origin is None:
         return None
-    _, fixes = fixes_in(view, topic, window)
+    fixes = fixes_in(view, topic, window)
     if not fixes:
         return local_frame(origin), empty_track()
     times = np.array([at for at, _ in fixes], np.int64)
