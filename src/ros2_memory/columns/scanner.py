@@ -99,12 +99,6 @@ class _Heads(NamedTuple):
         return [self.heads[nth] for nth in np.flatnonzero(is_within).tolist()]
 
 
-def _whole_days(window: TimeWindow) -> TimeWindow:
-    """Returns the days (UTC) that a window touches."""
-    first, stop = window.start // DAY_NS, -(-window.stop // DAY_NS)
-    return TimeWindow(first * DAY_NS, stop * DAY_NS).intersect(TimeWindow.everything())
-
-
 @dataclass(frozen=True, slots=True)
 class Caches:
     """What scanners read last, and what they made of it, within one capacity for all of them.
@@ -254,7 +248,7 @@ class Scanner:
         state = coverage.state
         cached = self.caches.heads.get(topic)
         if cached is None or window.intersect(cached.span) != window:
-            span = _whole_days(window)
+            span = window.aligned(DAY_NS)
             if span.stop - span.start > _FEW_DAYS_NS:
                 span = TimeWindow.everything()
             cached = None
