@@ -33,13 +33,13 @@ from ros2_memory.columns.values import (
     zone_of,
 )
 from ros2_memory.columns.walk import entries_of_codes
-from ros2_memory.core.arrays import places_among
+from ros2_memory.core.arrays import Floats, places_among
 from ros2_memory.messages.detections import Detection, detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.columns.values import Floats, Level
+    from ros2_memory.columns.values import Level
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import IntArray, Mask

@@ -15,7 +15,7 @@ from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShap
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.columns.values import Floats
+    from ros2_memory.core.arrays import Floats
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import IntArray
 

@@ -6,7 +6,7 @@ The same as `SchemaExtractor.pose` and `twist` give for each message, rounded al
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ros2_memory.columns.shown import ByType, Listing, Node, Shape, xyzw_of
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.table import Table, Texts
 from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError
-from ros2_memory.core.arrays import row_sums
+from ros2_memory.core.arrays import Floats, Vectors, row_sums
 from ros2_memory.extract import (
     FRAME,
     POSE_FRAMES,
@@ -30,10 +30,8 @@ from ros2_memory.extract import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.values import Floats
     from ros2_memory.storage.base import IntArray
 
-    Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
 _ABOUT_UNIT: Final = 1e-2
 _MOST_STEPPED: Final = 1e9

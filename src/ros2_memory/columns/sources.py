@@ -22,7 +22,8 @@ from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, SCORES, looks_
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from ros2_memory.columns.values import Floats, Values
+    from ros2_memory.columns.values import Values
+    from ros2_memory.core.arrays import Floats
     from ros2_memory.storage.base import IntArray, Mask
 
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Floats
+    from ros2_memory.core.arrays import Floats
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import IntArray, Mask

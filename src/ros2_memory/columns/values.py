@@ -18,7 +18,7 @@ from ros2_memory.analysis.frames import unit_quaternions
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import IN_PART, MAX_NUMBERS, Column, Elements, Table, Texts, Zone
 from ros2_memory.columns.zones import Zones
-from ros2_memory.core.arrays import row_sums
+from ros2_memory.core.arrays import Floats, row_sums
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.messages.conversions import ANGLES, euler_of
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.limits import Limit
     from ros2_memory.storage.base import IntArray, Mask
 
-    Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
     # Of any dtype: that of floats has the operations that all of them have.
     Numeric: TypeAlias = Floats
 
@@ -313,7 +312,7 @@ def zone_of(leaf: Leaf, zone: ZoneOf[str]) -> Zone | Zones | None:
     """
     if leaf.conversion in _ANGLES:
         most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
-        return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
+        return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG)
     source_zone = zone(leaf.level.full(leaf.sources[0]))
     if source_zone is None:
         return None

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "NDArray[np.float64]"
 Point: TypeAlias = "tuple[float, float]"
+Bounds: TypeAlias = "tuple[float, float, float, float]"
+"""The least and greatest x, and the least and greatest y."""
 
 
 class Steps(NamedTuple):
@@ -61,7 +63,7 @@ class Circle:
         return math.hypot(x - self.x, y - self.y) <= self.radius_m
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> Bounds:
         """The least and greatest x, and the least and greatest y."""
         x, y, radius = self.x, self.y, self.radius_m
         return x - radius, x + radius, y - radius, y + radius
@@ -98,7 +100,7 @@ class Rectangle:
         return self.min_x <= x <= self.max_x and self.min_y <= y <= self.max_y
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> Bounds:
         """The least and greatest x, and the least and greatest y."""
         return self.min_x, self.max_x, self.min_y, self.max_y
 
@@ -130,7 +132,7 @@ class Polygon:
         return bool(_inside(self.corners, np.array([x]), np.array([y]))[0])
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> Bounds:
         """The least and greatest x, and the least and greatest y."""
         xs, ys = zip(*self.corners, strict=True)
         return min(xs), max(xs), min(ys), max(ys)
@@ -181,7 +183,7 @@ class AnyOf:
         return any(region.contains(x, y) for region in self.regions)
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> Bounds:
         """The least and greatest x, and the least and greatest y."""
         low_x, high_x, low_y, high_y = zip(*(region.bounds for region in self.regions), strict=True)
         return min(low_x), max(high_x), min(low_y), max(high_y)
