@@ -89,7 +89,7 @@ class Dataset:
     """
 
     def __init__(
-        self, root: Path, reader: BagReader, extractor: SchemaExtractor, robot: str | None = None
+        self, root: Path, reader: BagReader, extractor: SchemaExtractor, robot: str | None
     ) -> None:
         self._root = root if robot is None else root / f"robot={quote(robot, safe=' ')}"
         self._reader = reader

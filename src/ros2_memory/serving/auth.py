@@ -197,7 +197,7 @@ class ForgeryGuard:
     `admits`: whether requests that pass are admitted, because there is no token to ask for.
     """
 
-    def __init__(self, app: ASGIApp, host: str, *, admits: bool = False) -> None:
+    def __init__(self, app: ASGIApp, host: str, *, admits: bool) -> None:
         self._app = app
         self._admits = admits
         self._refusals = LogThrottle()
