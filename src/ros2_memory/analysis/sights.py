@@ -151,8 +151,7 @@ class Sights:
     @property
     def tables(self) -> tuple[Ints, ...]:
         """All of them, as `TABLES` has their columns."""
-        tables: tuple[Ints, ...] = attrgetter(*_NAMES)(self)
-        return tables
+        return attrgetter(*_NAMES)(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -349,8 +349,7 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
 def signed(numbers: Numbers) -> Numbers:
     """Returns 0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
     signs: Numbers = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
-    halves: Numbers = np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
-    return halves
+    return np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
 
 
 def _wrapped(number: int) -> np.int64:

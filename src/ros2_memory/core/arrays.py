@@ -171,8 +171,7 @@ def narrowed(column: Ints) -> Ints:
     low, high = int(column.min(initial=0)), int(column.max(initial=0))
     kinds = (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.int64)
     kind = next(kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max)
-    narrow: Ints = column.astype(kind, copy=False)
-    return narrow
+    return column.astype(kind, copy=False)
 
 
 class Columns:

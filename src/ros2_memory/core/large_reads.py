@@ -105,8 +105,7 @@ class LargeReads:
 
     @property
     def _block_of_thread(self) -> _Block | None:
-        block: _Block | None = getattr(self._own, "block", None)
-        return block
+        return getattr(self._own, "block", None)
 
     def _end(self, block: _Block) -> None:
         if not block.has_turn:

@@ -83,13 +83,11 @@ def _ros_name(attribute: str) -> str:
 def field_of(node: object, name: str) -> object:
     """Returns a field of a message or an entry of a JSON object, unconverted; else ABSENT."""
     if isinstance(node, dict):
-        entry: object = node.get(name, ABSENT)
-        return entry
+        return node.get(name, ABSENT)
     table = field_table_of(node)
     if table is None or name not in table.attributes:
         return ABSENT
-    value: object = getattr(node, table.attributes[name], ABSENT)
-    return value
+    return getattr(node, table.attributes[name], ABSENT)
 
 
 def names_of(node: object) -> tuple[str, ...]:

@@ -138,8 +138,7 @@ _EMPTY_MESSAGE_BYTES = 8
 def _json(payload: bytes) -> object:
     if len(payload) > _MAX_JSON_BYTES:
         raise UnreadableError(f"it is longer than the {_MAX_JSON_BYTES >> 20} MiB that are read")
-    value: object = json.loads(payload)
-    return value
+    return json.loads(payload)
 
 
 def _deserialized(message_type: MessageType, payload: bytes) -> object:

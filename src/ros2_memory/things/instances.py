@@ -246,8 +246,7 @@ class Estimate:
         """
         first, last = (self.spots[rows, column] for column in (Spot.FIRST, Spot.LAST))
         inside = (first < window.stop) & (last >= window.start) & (last < before)
-        counting: Ints = rows[inside & (self.counts[rows] > 0)]
-        return counting
+        return rows[inside & (self.counts[rows] > 0)]
 
     def is_vague(self, rows: Ints) -> bool:
         """Whether the newest of some spots was seen while localisation was poor."""

@@ -527,8 +527,7 @@ def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
 
     def are_poor(first: Ints, last: Ints) -> Flags:
         before = np.searchsorted(starts, last, side="right")
-        poor: Flags = (before > 0) & (np.append(stops, 0)[before - 1] >= first)
-        return poor
+        return (before > 0) & (np.append(stops, 0)[before - 1] >= first)
 
     spots, looks = sights.spots, sights.looks
     poor_spots = are_poor(spots[:, Spot.FIRST], spots[:, Spot.LAST])

@@ -152,8 +152,7 @@ class Cells:
         )
         look_keys = self.slice[looks] * topics + self.topic[looks]
         rows, has_total = places_among(look_keys, keys)
-        totals: Ints = np.where(has_total, np.append(n, 0)[rows], 0)
-        return totals
+        return np.where(has_total, np.append(n, 0)[rows], 0)
 
     def looked_in(self, number: int) -> Ns | None:
         """Returns when the first look of a slice ended; None without any."""
@@ -185,8 +184,7 @@ class Cells:
 
     def heading(self, looks: Ints) -> Floats:
         """Returns where the detector of each look was turned to (degrees)."""
-        heading: Floats = self.yaw[looks] / 10.0 + self.pan[looks] / 10.0
-        return heading
+        return self.yaw[looks] / 10.0 + self.pan[looks] / 10.0
 
 
 def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) -> Ints:
@@ -223,8 +221,7 @@ def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) ->
         best[one] = np.maximum(best[one], rank[other])
         best[other] = np.maximum(best[other], rank[one])
     leader = np.argsort(rank, kind="stable")[best]
-    joined: Ints = np.where(leader[leader] == leader, leader, np.arange(len(cells)))
-    return joined
+    return np.where(leader[leader] == leader, leader, np.arange(len(cells)))
 
 
 def _hashed(rows: Ints, sizes: Ints) -> Ints:
@@ -408,8 +405,7 @@ _BITS: Final = 32
 
 def _keys(place: Ints, number: Ints) -> Ints:
     """Returns pairs of a place and the number of a look, a cell or a slice as one number each."""
-    keys: Ints = (place << _BITS) | number
-    return keys
+    return (place << _BITS) | number
 
 
 def _place(keys: Ints) -> Ints:
@@ -423,8 +419,7 @@ def _number(keys: Ints) -> Ints:
 def _distinct(keys: Ints) -> Ints:
     """Returns the distinct ones of keys that are mostly in order: `numpy.unique` takes longer."""
     ordered = np.sort(keys, kind="stable")
-    distinct: Ints = ordered[np.diff(ordered, prepend=-1) > 0]
-    return distinct
+    return ordered[np.diff(ordered, prepend=-1) > 0]
 
 
 def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
@@ -451,8 +446,7 @@ def _sees(cells: Cells, hit_cells: Ints, cell: Ints, hit_looks: Ints, hits: Ints
     pooled = np.bincount(place, share * weight)[place] - share * weight
     is_blocked = looks >= _MANY_LOOKS
     is_blocked &= share < _BLOCKED_SHARE * (pooled / np.maximum(others, 1))
-    sees: Flags = is_frequent & is_dense & ~is_blocked
-    return sees
+    return is_frequent & is_dense & ~is_blocked
 
 
 def _in_a_row(cell: Ints, hits: Ints, messages_before: Ints) -> Ints:

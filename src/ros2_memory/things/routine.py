@@ -88,8 +88,7 @@ class _HourlyPlaces(NamedTuple):
         return _normalised(prior * (self.around(rows, hours) / shares)), _normalised(prior)
 
     def _before(self, rows: Ints) -> Flags:
-        before: Flags = np.arange(len(self.hours)) < rows[:, None]
-        return before
+        return np.arange(len(self.hours)) < rows[:, None]
 
     def are_at(self) -> Floats:
         """Returns whether it was at each place (column), by hour: 0 or 1."""

@@ -297,8 +297,7 @@ def _extended(rows: Vectors, before: int, count: int) -> Vectors:
 def _runs(marks: Flags) -> list[list[int]]:
     """Returns the half-open ranges in which marks are set."""
     edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
-    runs: list[list[int]] = edges.reshape(-1, 2).tolist()
-    return runs
+    return edges.reshape(-1, 2).tolist()
 
 
 def _creep(places: Vectors, reach: Floats, origin: Floats, varies: Flags) -> Creep:

@@ -344,8 +344,7 @@ class _Slots:
             rows = squares[begins[which][:, None] + np.arange(count)]
             middles[which] = np.partition(rows, middle, axis=1)[:, middle]
         # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
-        deviations: Floats = np.sqrt(middles / 6 / 0.6)
-        return deviations
+        return np.sqrt(middles / 6 / 0.6)
 
     def links(self) -> Flags:
         """Returns whether the robot may have stood still from each slot to the next with poses."""
