@@ -15,8 +15,7 @@ from ros2_memory.columns import decode
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.layout import columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Texts, order_of
-from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.errors import BagError
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -138,16 +137,6 @@ def test_what_follows_long_sequences_is_read_where_it_is(
     assert fallbacks == []
 
 
-@pytest.mark.parametrize("points", [0, 1, 600, 5000])
-def test_paths_of_any_length_keep_all_their_poses(
-    tmp_path: Path, points: int, fallbacks: list[str]
-) -> None:
-    path = write_mcap(tmp_path / "a.mcap", [path_message(5, points), path_message(6, 3)])
-    decoded_alike(McapReader(), path)
-    # Many elements in few messages are decoded one by one.
-    assert fallbacks == ([] if points <= 500 else ["/plan"])
-
-
 def strings(path: Path, payloads: Sequence[bytes]) -> Table:
     """The table of strings with these payloads, each in a chunk with the others."""
     messages = [
@@ -176,20 +165,6 @@ def test_a_hostile_payload_changes_no_other_message(tmp_path: Path, bad: bytes) 
     table = strings(tmp_path / "a.mcap", [good[0], bad, *good[1:]])
     assert texts(table, "data") == [f"message {nth}" for nth in range(4)]
     assert table.log_times.tolist() == [0, 2, 3, 4]
-
-
-def test_a_definition_that_changes_between_bags_is_read_with_that_of_each(tmp_path: Path) -> None:
-    old = DrawnTypes((("State", (DrawnField("level", "int8"),)),))
-    new = DrawnTypes((("State", (DrawnField("name", "string"), DrawnField("level", "float64"))),))
-    reader = McapReader()
-    for nth, types in enumerate((old, new, old)):
-        store = types.store()
-        state = store.types[types.root]
-        message = state(7) if types is old else state("docked", 7.5)
-        payload = bytes(store.serialize_cdr(message, types.root))
-        [table] = tables_of(reader, bag_of(tmp_path / f"{nth}.mcap", types, [payload]))
-        assert set(table.columns) == ({"level"} if types is old else {"name", "level"})
-        assert numbers(table, "level") == [7 if types is old else 7.5]
 
 
 def two_publishers(path: Path) -> Path:
@@ -331,14 +306,6 @@ def test_bags_that_are_decoded_together_have_the_rows_that_each_has_alone(tmp_pa
         assert rows_by_bag(tables) == alone, seed
 
 
-def test_only_the_window_and_the_topics_asked_for_are_decoded(tmp_path: Path) -> None:
-    path, reader = write_mcap(tmp_path / "a.mcap", mixed(12)), McapReader()
-    [group] = undecoded(reader, path, TimeWindow(20, 60), topics=["/chatter"])
-    [table] = group.tables()
-    assert table.channel.topic == "/chatter"
-    assert table.log_times.tolist() == [22, 32, 42, 52]
-
-
 def image(ns: int, size: int = 3000) -> Msg:
     """An image, out of a camera."""
     made = make(
@@ -381,22 +348,6 @@ def test_large_messages_of_large_files_have_times_alone(
     }
 
 
-def test_json_and_unknown_types_have_times_alone_and_say_why(tmp_path: Path) -> None:
-    def fill(writer: Writer) -> None:
-        plain = writer.register_schema("Log", "jsonschema", b"{}")
-        odd = writer.register_schema("nowhere_msgs/msg/Oddity", "", b"")
-        for topic, encoding, schema in (("/log", "json", plain), ("/odd", "cdr", odd)):
-            channel = writer.register_channel(topic, encoding, schema)
-            writer.add_message(channel, 3, b"{}", 3)
-
-    path = raw_mcap(tmp_path / "a.mcap", fill)
-    [tables] = groups_of(path)
-    reasons = {table.channel.topic: table.left_out[""] for table in tables}
-    assert "json" in reasons["/log"]
-    assert "no definition" in reasons["/odd"]
-    assert all(table.log_times.tolist() == [3] for table in tables)
-
-
 def test_an_array_longer_than_any_message_has_no_columns(tmp_path: Path) -> None:
     text = f"uint8 known\nfloat64[{10**18}] endless\n".encode()
 
@@ -427,9 +378,3 @@ def test_what_a_damaged_chunk_loses_is_raised_and_all_the_rest_follows(
     assert ("cannot be decoded" in table.left_out.get("", "")) is bool(broken)
     assert set(table.log_times.tolist()) == {*range(len(messages))} - {*range(first, last + 1)}
     assert list(groups) == []
-
-
-def test_a_bag_that_is_gone_has_vanished_when_it_is_asked_for(tmp_path: Path) -> None:
-    groups = groups_of(tmp_path / "gone.mcap")
-    with pytest.raises(BagVanishedError):
-        next(groups)

@@ -13,15 +13,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ros2_memory.analysis.motion.robot_track import partial_track
-from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, from_bytes, to_bytes
-from ros2_memory.columns.kinds import TRACKS
+from ros2_memory.columns.fragments import FragmentKind, from_bytes, to_bytes
 from ros2_memory.columns.pack import compressed
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.view import View
-from ros2_memory.storage.cache import ByteLru
 from tests.support.bags import odom, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.support.examples import examples
@@ -31,7 +28,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.store import ColumnStore
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S
@@ -60,15 +56,6 @@ def world(tmp_path: Path) -> World:
     world = World.of(tmp_path)
     world.fill()
     return world
-
-
-def part_of(store: ColumnStore) -> int:
-    [head] = store.parts("/odom")
-    return head.number
-
-
-def words_in(store: ColumnStore, settings: str = "") -> Fragments[Words]:
-    return Fragments(store, WORDS, settings, ByteLru(10**6))
 
 
 def fragments_in(file: Path) -> int:
@@ -134,29 +121,6 @@ def test_arrays_in_rows_are_the_same_once_they_were_stored(sizes: list[int | Non
     assert isinstance(found, tuple)
     for array, back in zip(stored, found, strict=True):
         np.testing.assert_array_equal(array, back)
-
-
-def test_a_robot_that_stands_takes_few_bytes() -> None:
-    times = np.arange(0, 600 * S, S // 25) + T0
-    level = np.ones(times.size)
-    track = partial_track(times, level, level, level)
-    assert len(to_bytes(track, TRACKS.classes)) < 1000
-
-
-def test_fragments_shortly_before_one_are_remembered_with_it(world: World) -> None:
-    store, parts = world.store, (part_of(world.store),)
-    keys = [FragmentKey(T0 + minute * 60 * S, "any", parts) for minute in range(4)]
-    made = words_in(store)
-    for key in keys:
-        made.put(key, Words(f"at {key.start}"))
-    made.put(keys[2]._replace(settings="other"), Words("of other settings"))
-    made.write()
-    reading = words_in(store)
-    assert reading.get(keys[2], also_before=60 * S) == Words(f"at {keys[2].start}")
-    store.close()
-    known = [key for key in keys if reading.get(key) == Words(f"at {key.start}")]
-    assert known == keys[1:3]
-    assert reading.get(keys[2]._replace(settings="other")) is None
 
 
 @pytest.mark.parametrize("data", [b"\0", compressed(b"[]\n"), compressed(b"[0]"), b""])

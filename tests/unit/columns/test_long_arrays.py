@@ -32,12 +32,9 @@ if TYPE_CHECKING:
 
 T0: Final = 1_790_000_000 * NS_PER_S
 LENGTHS: Final = {
-    "short": [5] * 20,
     "the longest that are held": [MAX_NUMBERS] * 20,
     "one more": [MAX_NUMBERS + 1] * 20,
-    "long": [360] * 20,
     "some short, some long": [5, 40] * 10,
-    "few are short": [3, *[40] * 19],
     "empty ones among them": [0, 40] * 10,
 }
 

@@ -41,19 +41,6 @@ def cut(bag_dir: Path, cuts: list[int], count: int = 40, each: int = 50 * S) -> 
             os.utime(write_mcap(path, messages[begin:end]), ns=(T0, T0))
 
 
-@pytest.mark.parametrize("newest_first", [False, True])
-def test_tables_come_in_the_order_of_time(tmp_path: Path, newest_first: bool) -> None:
-    cut(tmp_path, [10, 30, 31, 60])
-    world = World.of(tmp_path)
-    world.fill()
-    view = View(world.memory, Call())
-    found = scan(view, "/odom", EVERYTHING, newest_first=newest_first)
-    firsts = [int(rows.times[0]) for rows in found]
-    assert len(firsts) > 1
-    assert firsts == sorted(firsts, reverse=newest_first)
-    assert check_rows(world, "/odom", newest_first=newest_first) == 40
-
-
 def test_columns_of_a_bag_that_take_too_much_are_not_held_and_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
 import pytest
 
-from ros2_memory.columns.pack import pack, unpack
 from ros2_memory.columns.steps import (
     DEGREES,
     METRES,
@@ -85,16 +81,3 @@ def test_steps_follow_the_type_of_the_message(path: str, step: Step) -> None:
 )
 def test_steps_follow_names_where_there_is_no_definition(path: str, step: Step) -> None:
     assert step_of(path) == step
-
-
-def test_rotations_come_back_within_a_tenth_of_a_milliradian() -> None:
-    drawn = np.random.default_rng(7).normal(size=(4, 5_000))
-    given = drawn / np.sqrt((drawn**2).sum(axis=0))
-    back = np.zeros_like(given)
-    for nth, column in enumerate(given):
-        packed = pack(column, QUATERNION)
-        back[nth] = unpack(packed.codec, packed.count, packed.zone.least, packed.data)
-    back /= np.sqrt((back**2).sum(axis=0))
-    # The rotation between two unit quaternions is by 2 asin(|a - b| / 2) * 2 for small distances.
-    apart = np.sqrt(((given - back) ** 2).sum(axis=0))
-    assert 4 * math.asin(float(apart.max()) / 2) <= 1e-4

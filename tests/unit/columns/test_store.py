@@ -8,16 +8,12 @@ import sqlite3
 from contextlib import closing
 from typing import TYPE_CHECKING, NoReturn
 
-import numpy as np
 import pytest
 
 from ros2_memory.columns.pack import FORMAT, Packed, decompressed
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
-from ros2_memory.columns.table import Column, Table
 from ros2_memory.columns.units import GoneError
-from ros2_memory.columns.writing import Level, ReadBag
-from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import (
     battery,
     boolean,
@@ -117,18 +113,6 @@ def stored_rows(file: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def test_what_follows_from_parts_is_the_same_when_they_are_read_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hashes = set[str]()
-    for name, held_bytes in (("held", 16 << 20), ("few", 2_000), ("none", 0)):
-        monkeypatch.setattr("ros2_memory.columns.scanner._WRITTEN_BYTES", held_bytes)
-        write_all_that_is_derived(tmp_path / name)
-        World.of(tmp_path / name).fill()
-        hashes.add(stored_rows(store_file(tmp_path / name)))
-    assert len(hashes) == 1
-
-
 def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None:
     write_all_that_is_derived(tmp_path)
     world = World.of(tmp_path)
@@ -140,53 +124,6 @@ def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None
         "the store has other rows of the same bags than before: raise FORMAT in columns/pack.py, "
         "so that stores are filled anew, and pin the new number and hashes here"
     )
-
-
-def test_columns_of_the_same_bytes_are_stored_once(tmp_path: Path) -> None:
-    poses = [odom(T0 + n * S, n / 7, n / 7) for n in range(50)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
-    world = World.of(tmp_path)
-    world.fill()
-    with closing(sqlite3.connect(store_file(tmp_path))) as base:
-        stored = "SELECT path, same, data IS NULL FROM part_column WHERE path LIKE '%.position._'"
-        assert sorted(base.execute(stored)) == [
-            ("pose.pose.position.x", None, 0),
-            ("pose.pose.position.y", "pose.pose.position.x", 1),
-        ]
-    assert check_all(world) > 0
-
-
-def test_columns_of_every_kind_come_back(tmp_path: Path) -> None:
-    """Numbers that SQLite has no type for, constants, one text, no element at all."""
-    [path] = write_bags(tmp_path, 1)
-    world = World.of(tmp_path)
-    [bag] = world.memory.index.snapshot().bags
-    numbers: dict[str, Column] = {
-        "huge": np.full(3, 2**64 - 1, np.uint64),
-        "hugest": np.array([2**63, 2**64 - 1, 5], np.uint64),
-        "zero": np.full(3, 0.0),
-        "nan": np.full(3, np.nan),
-        "infinite": np.array([np.inf, -np.inf, 0.0]),
-        "low": np.full(3, -(2**63), np.int64),
-        "yes": np.full(3, True),
-    }
-    times = bag.start + np.arange(3)
-    channel = Channel("/kinds", "cdr", Schema("a_msgs/msg/Kinds"))
-    table = Table(channel, times, times, np.arange(3), numbers)
-    stored = [ReadBag(world.filling._key(bag), bag)]
-    assert world.store.put(stored, [table], Level.HOUR).bags == 1
-    timeline = world.memory.index.snapshot().timeline
-    scanner = Scanner(world.store, tmp_path)
-    coverage = scanner.coverage(timeline)
-    assert coverage is not None
-    [head] = world.store.parts("/kinds")
-    unit = scanner.part(head, coverage)
-    assert unit is not None
-    for name, column in numbers.items():
-        found = np.asarray(unit.table.columns[name])
-        assert found.dtype == np.asarray(column).dtype
-        assert repr(found.tolist()) == repr(np.asarray(column).tolist()), name
-    assert path.exists()
 
 
 @pytest.mark.parametrize(

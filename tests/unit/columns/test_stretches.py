@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -15,15 +13,13 @@ from ros2_memory.columns import scan
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history import sessions
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import joined_back, open_scan
-from ros2_memory.history.scan import scan as scan_rows
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_in
 from ros2_memory.serving import backfill
 from tests.support.bags import McapLayout, Msg, boolean, odom, tf, transform, write_mcap
-from tests.support.column_worlds import World, store_file
+from tests.support.column_worlds import World
 from tests.unit.columns.test_fragments import WORDS, Words
 
 if TYPE_CHECKING:
@@ -31,7 +27,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.scan import Stretch
-    from ros2_memory.columns.units import Rows
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S
@@ -153,22 +148,6 @@ def test_what_was_made_in_time_is_told_before_the_time_is_over(world: World) -> 
     assert found[-1] == newest.window.start
 
 
-def test_tracks_by_transforms_alone_are_joined_too(tmp_path: Path) -> None:
-    for number in range(30):
-        start = T0 + number * 100 * S
-        messages = [
-            tf(start + n * S, transform(start + n * S, "map", "base_link", (n / 10, 0, 0)))
-            for n in range(100)
-        ]
-        fixed = transform(start, "base_link", "camera", (0.1, 0, 0.3))
-        messages.insert(0, tf(start, fixed, topic="/tf_static"))
-        write_mcap(tmp_path / "rec" / f"{number}.mcap", messages)
-    World.of(tmp_path).fill()
-    with closing(sqlite3.connect(store_file(tmp_path))) as base:
-        query = "SELECT count(*) FROM fragment WHERE kind LIKE 'track-joined %'"
-        assert base.execute(query).fetchone()[0] == 2
-
-
 def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Path) -> None:
     for number in range(40):
         start = T0 + number * 100 * S
@@ -184,27 +163,3 @@ def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Pat
         assert not view.notes.complete
         [said] = [one for one in view.notes.sentences() if "could not be decoded" in one]
         assert said.startswith("messages of /tf_static could not be decoded: ")
-
-
-def test_static_transforms_of_many_sessions_are_found_together_also_beside_the_active_bag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(20):
-        start = T0 + number * 100 * S
-        fixed = transform(start, "map", "odom", (number, 0, 0))
-        messages = [tf(start, fixed, topic="/tf_static"), odom(start + S, number, 0.1)]
-        write_mcap(tmp_path / f"rec_{number}" / "0.mcap", messages)
-    World.of(tmp_path).fill()
-    scanned: list[object] = []
-
-    def counted(*given: Any, **how: Any) -> Iterator[Rows]:
-        scanned.append(given)
-        return scan_rows(*given, **how)
-
-    monkeypatch.setattr(sessions, "scan", counted)
-    view = View(World.of(tmp_path).memory, Call())
-    view.call.used_active = True
-    for number in range(20):
-        [found] = view.sessions.static(view.sessions.of(tmp_path / f"rec_{number}"))
-        assert found.transform.translation[0] == number
-    assert len(scanned) < 10

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from random import Random
@@ -12,20 +11,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.columns.fill import Batch, Filling, StoreLimits
-from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.store import ColumnStore
-from ros2_memory.columns.writing import Level
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
 from tests.support.bags import Msg, battery, make, odom, write_mcap, write_splits
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.tables import table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,23 +32,6 @@ S = 10**9
 BEGIN = 1_783_998_000 * S
 HOUR = 3600
 LATEST = QuerySettings(now="latest")
-
-
-def storing(memory: Memory, folder: Path, draw: Random, *, part: float = 1.0) -> Memory:
-    """The memory with a store that has some of the bags, in any order."""
-    store = ColumnStore([folder / ".columns" / "columns.sqlite"], memory.reader.definition)
-    scanner = Scanner(store, folder)
-    filling = Filling(scanner, memory.reader, folder, memory.clock, StoreLimits(max_share=10.0))
-    timeline = memory.index.snapshot().timeline
-    bags = filling.waiting(timeline)
-    draw.shuffle(bags)
-    stop = round(part * len(bags))
-    for bag in bags[:stop]:
-        filling.fill(Batch([bag], Level.BAG), timeline)
-    for batch in filling.batches(timeline):
-        if not {*batch.bags} & {*bags[stop:]}:
-            filling.fill(batch, timeline)
-    return replace(memory, scanner=scanner)
 
 
 def noisy(draw: Random, count: int = 900, every: int = 10 * S) -> list[Msg]:
@@ -85,7 +64,7 @@ def test_only_bags_that_may_hold_an_extreme_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path, noisy(Random(7)))
-    stored = storing(memory_of(tmp_path, limits=LATEST), tmp_path, Random(7))
+    stored = with_store(memory_of(tmp_path, limits=LATEST), tmp_path, share=10.0)
     read: list[str] = []
     tables = BagAccess.tables
 
@@ -215,6 +194,8 @@ def write_numbers(bag_dir: Path, *values: tuple[str, float]) -> None:
     [
         ("Int64", [2**53 + 1, 2**53 + 3, 2**53 + 2]),
         ("UInt64", [2**63 + 1, 2**64 - 3, 2**64 - 1, 2**64 - 2]),
+        ("UInt64", [2**64 - 1] * 3),
+        ("Int64", [-(2**63)] * 3),
         ("Byte", [3, 200, 100]),
     ],
 )
@@ -227,7 +208,6 @@ def test_the_least_and_greatest_of_whole_numbers_are_exact(
     extremes = asked(memory, tmp_path, "get_topic_in_range", **given)["extremes"]["value"]
     assert (extremes["min"], extremes["max"]) == (min(numbers), max(numbers))
     assert extremes["max_at"] == T0 + numbers.index(max(numbers))
-    counted = asked(memory, tmp_path, "get_topic_in_range", **given, by="hour")
-    row = dict(zip(counted["columns"], counted["rows"][0], strict=True))
+    row = table(asked(memory, tmp_path, "get_topic_in_range", **given, by="hour"))["all"]
     assert (row["value.min"], row["value.max"]) == (min(numbers), max(numbers))
     assert row["value.max_at_unix"] == extremes["max_at"]

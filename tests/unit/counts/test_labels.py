@@ -29,6 +29,7 @@ from tests.support.bags import (
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
+from tests.support.tables import table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -36,13 +37,6 @@ if TYPE_CHECKING:
 
 
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
-
-
-def rows_of(reply: Any) -> dict[str, dict[str, Any]]:
-    names = reply["columns"][1:]
-    rows = {row[0]: dict(zip(names, row[1:], strict=True)) for row in reply["rows"]}
-    assert len(rows) == len(reply["rows"])
-    return rows | {"all": dict(zip(names, reply["all"], strict=True))}
 
 
 def expected(
@@ -92,7 +86,7 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
         reply = asked(memory, bags, "find_matches", min_score=least, **where, **ANY)
     seconds = [nth for nth in range(120) if not rooms or world.room(nth) in rooms]
     truth = {label: expected(world, seconds, label, least) for label in PLACES}
-    rows = rows_of(reply)
+    rows = table(reply)
     whole = rows.pop("all")
     assert {label: shown(row) for label, row in rows.items()} == {
         label: pytest.approx(row) for label, row in truth.items() if row is not None
@@ -155,7 +149,7 @@ def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) 
     write_mcap(folder / "run" / "run_0.mcap", ordered)
     condition = {"topic": topic, "start": T, "end": T + 300, "by": "day", **given}
     reply = asked(memory_of(folder), folder, "find_matches", **condition)
-    return dict(zip(reply["columns"][1:], reply["all"], strict=True))
+    return table(reply)["all"]
 
 
 def test_a_boolean_in_a_list_counts_beside_one_that_is_in_none(tmp_path: Path) -> None:
@@ -211,8 +205,7 @@ def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
     window = {"topic": "/on", "start": T, "end": T + 198}
     on = {**window, "condition_type": "contains", "value": "true"}
     found = asked(memory, tmp_path, "find_matches", **on, limit=20)
-    counted = asked(memory, tmp_path, "find_matches", **on, by="day")
-    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    whole = table(asked(memory, tmp_path, "find_matches", **on, by="day"))["all"]
     assert found["total"] == 10
     assert (whole["count"], whole["seconds"]) == (10, 100)
     changes = asked(memory, tmp_path, "get_topic_in_range", **window, changes=True)

@@ -8,6 +8,7 @@ import pytest
 
 from tests.support.bags import McapLayout, Msg, battery, boolean, odom, text, write_mcap
 from tests.support.memories import asked, each_way, memory_of
+from tests.support.tables import table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,7 +63,7 @@ def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_windo
     bag_dir: Path, topic: str, first: int, last: int, held: int, began: int, *, recalls: bool
 ) -> None:
     counted = matches(bag_dir, topic, first, last, by="day", recalls=recalls)
-    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    whole = table(counted)["all"]
     assert (whole["seconds"], whole["count"]) == (held, began)
 
 
@@ -98,10 +99,10 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     assert [row["robot"]["x"] for row in found["sightings"]] == [8.5, 8.0, 4.0, 2.0]
     assert (found["total"], "notes" in found) == (4, False)
     counted = asked(memory, tmp_path, "find_matches", **auto, by="day")
-    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    whole = table(counted)["all"]
     assert (whole["seconds"], whole["count"]) == (35, 1)
     later = asked(memory, tmp_path, "find_matches", **auto, by="day", start=T0 / S + 25)
-    assert dict(zip(later["columns"][1:], later["all"], strict=True))["seconds"] == 30
+    assert table(later)["all"]["seconds"] == 30
     place = {"x": [1.0, 3.0], "y": [-1, 1]}
     inside = asked(memory, tmp_path, "find_matches", **{**auto, "while": [bumped]}, where=place)
     assert [row["first_seen"] for row in inside["sightings"]] == [T0 / S + 20]
@@ -115,7 +116,7 @@ def test_a_latched_boolean_in_a_scope_is_counted_by_when_it_held(
     for bumped, seconds in ((True, 250), (False, 300)):
         during = {"while": {"topic": BUMPER, "condition_type": "equals", "value": bumped}}
         answer = matches(bag_dir, DOCKED, 0, 950, recalls=recalls, by="day", **during)
-        whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
+        whole = table(answer)["all"]
         assert (whole["seconds"], whole["count"]) == (seconds, 1)
         assert "notes" not in answer
 
@@ -132,7 +133,7 @@ def test_what_a_slow_topic_states_lasts_to_the_end_of_a_scope(
     end = T0 / S + 402
     answer = asked(memory, bag_dir, "find_matches", start=T0 / S, end=end, **given)
     if by:
-        assert dict(zip(answer["columns"][1:], answer["all"], strict=True))["seconds"] == 102
+        assert table(answer)["all"]["seconds"] == 102
     else:
         assert [each["duration_s"] for each in answer["sightings"]] == [2, 100]
 
@@ -156,7 +157,7 @@ def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
     recorded_s = 200 - 10 - 3.1
     for by in ("hour", "value"):
         answer = asked(memory, tmp_path, "find_matches", **is_true, by=by)
-        whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
+        whole = table(answer)["all"]
         assert (whole["seconds"], whole["count"]) == (recorded_s, 1)
     answers = [
         asked(memory, tmp_path, "find_matches", **is_true),
@@ -171,4 +172,4 @@ def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
     answer = asked(
         memory, tmp_path, "find_matches", **later, field="percentage", by="hour", **while_true
     )
-    assert dict(zip(answer["columns"][1:], answer["all"], strict=True))["seconds"] > 180
+    assert table(answer)["all"]["seconds"] > 180

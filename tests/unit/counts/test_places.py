@@ -6,7 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -17,6 +17,7 @@ from ros2_memory.history.view import TimeRange
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.tables import table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,12 +42,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def memory(world: Path) -> Memory:
     return in_places(with_store(memory_of(world), world), WEST, EAST, START)
-
-
-def table(reply: Any) -> dict[str, dict[str, Any]]:
-    names = reply["columns"][1:]
-    rows = {row[0]: dict(zip(names, row[1:], strict=True)) for row in reply["rows"]}
-    return {**rows, "all": dict(zip(names, reply["all"], strict=True))}
 
 
 def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(

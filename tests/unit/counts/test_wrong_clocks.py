@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -10,6 +10,7 @@ from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of
+from tests.support.tables import table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,10 +35,6 @@ def memory(tmp_path: Path) -> Memory:
     return memory_of(tmp_path, clock=FixedClock((TRUE + 600) * S), limits=QuerySettings())
 
 
-def all_of(reply: Any) -> dict[str, object]:
-    return dict(zip(reply["columns"][1:], reply["all"], strict=True))
-
-
 def whole(by: str = "hour") -> dict[str, object]:
     return {"start": 0, "end": AHEAD + 10, "by": by}
 
@@ -46,26 +43,26 @@ def test_labels_of_a_wrong_clock_do_not_count(memory: Memory, tmp_path: Path) ->
     seen = {"topic": CUPS, "condition_type": "contains", "value": "cup", "by": "label"}
     for window in ({}, {"start": 0, "end": AHEAD + 10}):
         reply = asked(memory, tmp_path, "find_matches", **seen, **window)
-        found = all_of(reply)
+        found = table(reply)["all"]
         assert (found["count"], found["seconds"]) == (1, 5.0)
         assert found["first_unix"] == pytest.approx(TRUE, abs=0.001)
         assert found["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
         assert not any("recorded only" in note for note in reply["notes"])
     reply = asked(memory, tmp_path, "find_matches", **seen, start=UNSET - 5, end=UNSET + 60)
-    assert all_of(reply)["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
+    assert table(reply)["all"]["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
     assert not any("recorded only" in note for note in reply["notes"])
 
 
 def test_no_value_holds_from_one_clock_to_the_next(memory: Memory, tmp_path: Path) -> None:
     """The robot was idle at the end of 1970, and at the beginning of today."""
     reply = asked(memory, tmp_path, "get_topic_in_range", topic="/chatter", **whole("value"))
-    rows = {row[0]: dict(zip(reply["columns"][1:], row[1:], strict=True)) for row in reply["rows"]}
-    assert {value: row["count"] for value, row in rows.items()} == {"idle": 1, "busy": 1}
+    rows = table(reply)
+    assert {value: row["count"] for value, row in rows.items()} == {"idle": 1, "busy": 1, "all": 2}
     assert rows["idle"]["first_unix"] == pytest.approx(TRUE, abs=0.001)
     assert rows["busy"]["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
     of_1970 = {"start": UNSET - 5, "end": UNSET + 60, "by": "value"}
     reply = asked(memory, tmp_path, "get_topic_in_range", topic="/chatter", **of_1970)
-    assert all_of(reply)["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
+    assert table(reply)["all"]["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
 
 
 @pytest.mark.parametrize(("begin", "count"), [(UNSET, 2), (AHEAD, 1)])
@@ -74,7 +71,7 @@ def test_a_window_inside_of_a_bag_of_a_wrong_clock_counts_what_is_there(
 ) -> None:
     window = {"start": begin - 5, "end": begin + 60}
     reply = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", by="hour", **window)
-    assert all_of(reply)["count"] == count
+    assert table(reply)["all"]["count"] == count
     condition = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
     reply = asked(memory, tmp_path, "find_matches", **condition, **window)
     assert reply["searched_from"] == begin

@@ -117,18 +117,7 @@ def test_an_open_bag_of_a_recording_that_the_heartbeat_names_is_active_however_s
     assert RepeatedScan(tmp_path).run(path, age_s=age_s, names={"."}) is FileState.ACTIVE
 
 
-def test_a_growth_that_was_seen_counts_whatever_the_mtime_says(
-    scan: RepeatedScan, tmp_path: Path
-) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert scan.run(path, age_s=-86_400) is FileState.INCOMPLETE
-    grow(path, 2)
-    assert scan.run(path, age_s=-86_400) is FileState.ACTIVE
-    assert scan.run(path, now=NOW + THREE_SPLITS) is FileState.ACTIVE
-    assert scan.run(path, now=NOW + THREE_SPLITS + 1) is FileState.INCOMPLETE
-
-
-def test_the_growth_of_a_file_is_not_that_of_the_one_put_in_its_place(
+def test_a_growth_that_was_seen_counts_for_three_splits_and_not_for_a_file_put_in_its_place(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
@@ -137,6 +126,8 @@ def test_the_growth_of_a_file_is_not_that_of_the_one_put_in_its_place(
     assert scan.run(path, age_s=3600) is FileState.INCOMPLETE
     grow(path, 2)
     assert scan.run(path, age_s=3600) is FileState.ACTIVE
+    assert scan.run(path, now=NOW + THREE_SPLITS) is FileState.ACTIVE
+    assert scan.run(path, now=NOW + THREE_SPLITS + 1) is FileState.INCOMPLETE
     plain(tmp_path / "other", [1, 2, 3, 4, 5], closed=False).rename(path)
     assert scan.run(path, age_s=3600) is FileState.INCOMPLETE
 
@@ -160,41 +151,12 @@ def test_a_bag_left_open_before_its_first_message_is_damaged(
     assert "no message in it counts; ros2-memory recover" in scan.reason()
 
 
-def test_a_file_of_a_kind_that_is_not_read_names_the_storage_that_reads_it(
-    tmp_path: Path,
-) -> None:
-    scan = RepeatedScan(tmp_path, ".mcap")
-    path = plain(tmp_path / "rec_0.db3", [1])
-    assert scan.run(path, age_s=0) is FileState.UNREAD
-    assert (
-        scan.reason() == "this storage does not read .db3 files: choose storage=rosbag2, which does"
-    )
-    assert scan.reader.closings.total() == 0
-    assert not scan.is_watched()
-
-
 def test_a_name_in_capitals_is_not_read_and_says_what_to_do(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "REC_0.MCAP", [1])
     assert scan.run(path, age_s=0) is FileState.UNREAD
     assert "must end in .mcap, in lower case: rename it" in scan.reason()
-
-
-@pytest.mark.parametrize("age_s", [0, 1.9, -1.9])
-def test_what_was_read_of_a_file_younger_than_2_s_is_read_again(
-    scan: RepeatedScan, tmp_path: Path, age_s: float
-) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [11])
-    scan.run(path, age_s=age_s)
-    assert scan.is_watched()
-    plain(path, [22])
-    os.utime(path, ns=(NOW - round(age_s * S),) * 2)  # the same size in the same tick
-    scan.run(path, now=NOW + 10 * S)
-    assert scan.classification is not None
-    assert scan.classification.bag is not None
-    assert scan.classification.bag.start == 22
-    assert not scan.is_watched()
 
 
 def test_a_damaged_file_is_tried_again_when_it_changed_or_after_ten_minutes(

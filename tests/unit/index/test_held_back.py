@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.layout import SCREENED_FILE
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, QuerySettings
@@ -82,16 +81,6 @@ def test_what_is_announced_while_a_directory_is_read_is_held_back(
 
     monkeypatch.setattr(index, "_context", slow)
     assert names(index.snapshot()) == []
-
-
-def test_without_a_readable_state_no_recording_is_served(tmp_path: Path) -> None:
-    bags = ScreenedBags(tmp_path / "bags")
-    bags.split(bags.begin(0), [mode(-2, value=False), *words(0, 10)])
-    bags.end()
-    index = index_of(bags)
-    assert len(names(index.snapshot())) == 1
-    (bags.bag_dir / SCREENED_FILE).write_text("{")
-    assert names(index_of(bags).snapshot()) == []
 
 
 def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> None:

@@ -166,14 +166,6 @@ def test_wherever_the_file_ends_all_whole_chunks_answer_and_nothing_that_is_not_
             assert {**live, "notes": None} == {**whole, "notes": None}
 
 
-def test_by_default_the_split_being_written_does_not_answer(tmp_path: Path) -> None:
-    tail = Tail(tmp_path, include_active=False)
-    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
-    assert tail.states() == []
-    [aside] = tail.memory.index.snapshot().active
-    assert (aside.reason, aside.answers) == ("still being written", False)
-
-
 @pytest.mark.parametrize("recall", [False, True], ids=["plain", "catalogue"])
 def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, recall: bool) -> None:
     content, ends = split(LAYOUTS[0])

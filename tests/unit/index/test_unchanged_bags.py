@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.index.bag_table import BagTable
-from ros2_memory.index.file_state import ScanContext
-from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import FixedClock
 from tests.support.plain_text_bags import PlainReader, plain
@@ -23,7 +20,6 @@ if TYPE_CHECKING:
 S = 10**9
 NOW = 1_800_000_000 * S
 LONG_AGO = NOW - 3600 * S
-KINDS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
 
 class Start:
@@ -43,25 +39,19 @@ class Start:
 
     def remember(self) -> None:
         """Knows from then on all bags as they are."""
-        index, _ = self.index(knowing=False)
-        self.known = [segment.bags for segment in index.refresh().timeline.segments]
+        timeline = self.index(knowing=False).refresh().timeline
+        self.known = [segment.bags for segment in timeline.segments]
 
-    def index(self, *, knowing: bool = True) -> tuple[IndexManager, PlainReader]:
-        """An index that has scanned nothing yet, and its reader."""
-        reader = PlainReader(*KINDS)
-        index = IndexManager(
+    def index(self, *, knowing: bool = True) -> IndexManager:
+        """An index that has scanned nothing yet."""
+        return IndexManager(
             self.bag_dir,
-            reader,
+            PlainReader(".mcap", ".db3", ".mcap.zstd", ".db3.zstd"),
             FixedClock(NOW),
             refresh_s=5.0,
             split_duration_s=10.0,
             known=lambda: self.known if knowing else [],
         )
-        return index, reader
-
-    def read(self) -> Snapshot:
-        """The snapshot of an index that reads everything."""
-        return self.index(knowing=False)[0].refresh()
 
 
 @pytest.fixture
@@ -71,36 +61,12 @@ def start(tmp_path: Path) -> Start:
     return begun
 
 
-def test_of_old_bags_an_index_keeps_rows_alone_and_of_young_ones_once_they_are_old(
-    start: Start,
-) -> None:
-    young = start.bag_dir / "rec" / "rec_5.mcap"
-    os.utime(young, ns=(NOW - 5 * S, NOW - 5 * S))
-    table = BagTable(start.bag_dir, PlainReader(*KINDS))
-
-    def scan(now: int) -> tuple[set[str], int]:
-        table.update(ScanContext(start.bag_dir, now, 30 * S), patrolling=True)
-        known = table.known((), now)
-        assert known.files.keys() == known.counted.keys()
-        assert len(table.snapshot(now).bags) == 6
-        return {*known.files}, len({path for path, _ in known.tree.stamps} - known.files.keys())
-
-    assert scan(NOW) == ({str(young)}, 5)
-    assert scan(NOW + 60 * S) == (set(), 6)
-    plain(young, [50, 51, 52])
-    os.utime(young, ns=(NOW + 55 * S, NOW + 55 * S))
-    assert scan(NOW + 60 * S) == ({str(young)}, 5)
-    young.unlink()
-    table.update(ScanContext(start.bag_dir, NOW + 70 * S, 30 * S), patrolling=True)
-    assert len(table.snapshot(NOW).bags) == 5
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_whatever_happens_to_known_bags_the_index_is_that_of_one_that_read_them(
     start: Start, seed: int
 ) -> None:
     chance = random.Random(seed)
-    (index, _), (other, _) = start.index(), start.index(knowing=False)
+    index, other = start.index(), start.index(knowing=False)
     assert index.refresh() == other.refresh()
     for step in range(6):
         number = chance.randrange(8)

@@ -14,6 +14,7 @@ from ros2_memory.places.visits import visits
 from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.tables import table
 
 PLACES = (
     Place("corner", "map", Circle(4.0, 3.0, 0.5)),
@@ -111,12 +112,10 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
     hello = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
 
     def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
-        reply = asked(memory, tmp_path, tool, **given)
-        rows = {each[0]: each[1:] for each in reply["rows"]} | {"all": reply["all"]}
-        return dict(zip(reply["columns"][1:], rows[row], strict=True))
+        return table(asked(memory, tmp_path, tool, **given))[row]
 
-    table = asked(memory, tmp_path, "visits")["places"]
-    assert [(row["place"], row["exits"], row["minutes"]) for row in table] == [
+    places = asked(memory, tmp_path, "visits")["places"]
+    assert [(row["place"], row["exits"], row["minutes"]) for row in places] == [
         ("here", 1, 0.5),
         ("there", 1, 0.5),
     ]

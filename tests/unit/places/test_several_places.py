@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
@@ -34,6 +34,7 @@ from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S, write_moving_map
 from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, runs_of, write
+from tests.support.tables import table
 
 SECONDS = 400
 HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
@@ -55,13 +56,6 @@ def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def memory(folder: Path) -> Memory:
     return asked_of(folder, stored=True)
-
-
-def table(reply: Any) -> dict[str, dict[str, Any]]:
-    names = reply["columns"][1:]
-    return {row[0]: dict(zip(names, row[1:], strict=True)) for row in reply["rows"]} | {
-        "all": dict(zip(names, reply["all"], strict=True))
-    }
 
 
 @settings(max_examples=examples(8), suppress_health_check=[HealthCheck.too_slow])
@@ -258,17 +252,6 @@ def test_conditions_that_are_none_are_named(
     assert said in reply["detail"]
 
 
-CUPS = "/vision/scene/scene_objects"
-PLACES = (
-    Place("corner", "map", Circle(4.0, 3.0, 0.5)),
-    Place("room", "map", Rectangle(-1, 5, -1, 4)),
-)
-
-
-def in_places(memory: Memory) -> Memory:
-    return replace(memory, limits=replace(memory.limits, places=PLACES))
-
-
 @pytest.mark.parametrize("changes", [False, True], ids=["each second", "on change"])
 @each_way
 def test_matches_count_while_another_topic_meets_a_condition(
@@ -324,7 +307,7 @@ def test_the_frame_of_the_robot_is_the_map_or_the_one_asked_for(tmp_path: Path) 
     memory = memory_of(tmp_path)
 
     def robot(**given: Any) -> str:
-        [found] = find_matches(memory, Call(), CUPS, "contains", "cup", limit=1, **given).sightings
+        [found] = find_matches(memory, Call(), SEEN, "contains", "cup", limit=1, **given).sightings
         assert found.robot is not None
         return found.robot.frame_id
 

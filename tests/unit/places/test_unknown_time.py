@@ -17,6 +17,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from tests.support.bags import Msg, boolean, odom, text, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
+from tests.support.tables import table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -46,11 +47,6 @@ def life(seconds: int, silent: Mapping[str, Sequence[tuple[float, float]]] | Non
         for one in messages
         if not any(a <= one.log_time / S - T0 < b for a, b in quiet.get(one.topic, ()))
     ]
-
-
-def cells(reply: Any) -> dict[str, Any]:
-    """The row of all bins, by column."""
-    return dict(zip(reply["columns"][1:], reply["all"], strict=True))
 
 
 def test_pauses_of_the_recording_are_no_unknown_time(tmp_path: Path) -> None:
@@ -101,7 +97,7 @@ def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: 
             by_hour = asked(
                 memory, bag_dir, "find_matches", **PRESSED, **given, **window, by="hour"
             )
-            assert cells(by_hour).get("unknown_s", 0) == pytest.approx(expected, abs=0.06)
+            assert table(by_hour)["all"].get("unknown_s", 0) == pytest.approx(expected, abs=0.06)
             if name == "/odom":
                 visited = asked(memory, bag_dir, "visits", **HERE, **window)
                 assert visited.get("unknown_s", 0) == found.get("unknown_s", 0)

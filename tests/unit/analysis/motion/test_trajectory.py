@@ -58,13 +58,6 @@ def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
 # Distance and speed
 
 
-def test_a_known_path_has_its_length_duration_and_mean_speed() -> None:
-    square: list[Vector3] = [(0, 0, 0), (3, 0, 0), (3, 4, 0), (0, 4, 0), (0, 0, 0)]
-    found = summarise(driven(square, 2 * S))
-    assert (found.totals.distance_m, found.totals.duration_s, found.poses) == (14.0, 8.0, 5)
-    assert (found.avg_speed, found.max_speed, found.max_speed_from) == (1.75, 2.0, "positions")
-
-
 # Of these none is at the origin, where odometry may have begun anew.
 elsewhere = points.map(lambda point: (abs(point[0]) + 10, point[1], point[2]))
 
