@@ -56,38 +56,7 @@ def test_more_detections_than_the_limit_are_thinned_with_a_note_and_whole_for_co
     assert len(exact["detections"]) == 80
 
 
-def test_a_path_is_shown_by_its_poses() -> None:
-    path = bags.make(
-        "nav_msgs/msg/Path",
-        header=bags.header(NS, "map"),
-        poses=[pose_stamped(bags.quaternion(0.0), bags.point(n, 0)) for n in range(212)],
-    )
-    extracted = EXTRACTOR.shown(path, "nav_msgs/msg/Path")
-    assert extracted.notes == ("poses: 50 of 212 values, evenly spaced",)
-    assert isinstance(extracted.value, dict)
-    assert extracted.value["frame_id"] == "map"
-    assert isinstance(extracted.value["poses"], list)
-    assert extracted.value["poses"][-1] == {
-        "position": {"x": 211, "y": 0, "z": 0},
-        "orientation": {"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 0},
-    }
-
-
 # Types without an entry, and JSON
-
-
-def test_a_type_without_an_entry_is_shown_with_all_its_fields() -> None:
-    body = bags.make(
-        "sensor_msgs/msg/Temperature",
-        header=bags.header(1_500_000_000, "engine"),
-        temperature=21.5,
-        variance=0.0,
-    )
-    assert shown(body, "sensor_msgs/msg/Temperature") == {
-        "header": {"stamp": 1.5, "frame_id": "engine"},
-        "temperature": 21.5,
-        "variance": 0,
-    }
 
 
 def test_a_type_named_as_before_2019_is_found_in_the_map() -> None:

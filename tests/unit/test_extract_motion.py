@@ -7,33 +7,11 @@ from typing import Any
 
 from ros2_memory.core.model import Pose, Twist
 from tests.support import bags
-from tests.unit.test_extract import EXTRACTOR, NS, ODOMETRY, decoded, odometry
+from tests.unit.test_extract import EXTRACTOR, NS, ODOMETRY, decoded
 
 
 def quaternion(x: float, y: float, z: float, w: float) -> object:
     return bags.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-
-def test_the_pose_of_odometry_is_in_its_headers_frame_and_its_twist_in_the_childs() -> None:
-    assert EXTRACTOR.pose(odometry(), ODOMETRY) == Pose(
-        (1.23456, -2.0, 0.0), (0.0, 0.0, math.sin(0.25), math.cos(0.25)), "odom"
-    )
-    assert EXTRACTOR.twist(odometry(), ODOMETRY) == Twist(
-        (0.3, 0.0, 0.0), (0.0, 0.0, 0.1), "base_link"
-    )
-
-
-def test_a_twist_is_in_its_headers_frame_or_in_none() -> None:
-    twist = bags.twist(1.0, 0.0)
-    assert EXTRACTOR.twist(twist, "geometry_msgs/msg/Twist") == Twist(
-        (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), ""
-    )
-    stamped = bags.make(
-        "geometry_msgs/msg/TwistStamped", header=bags.header(NS, "base_link"), twist=twist
-    )
-    found = EXTRACTOR.twist(stamped, "geometry_msgs/msg/TwistStamped")
-    assert found is not None
-    assert found.frame_id == "base_link"
 
 
 def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> None:
@@ -55,24 +33,6 @@ def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> Non
 
 def tf_message(*transforms: object) -> object:
     return decoded(bags.tf(NS, *transforms))
-
-
-def test_the_transforms_of_a_message_keep_stamp_and_log_time() -> None:
-    message = tf_message(
-        bags.transform(NS, "odom", "base_link", (1.0, 2.0, 0.0), 0.5),
-        bags.transform(NS + 5, "/base_link", "/laser", (0.1, 0.0, 0.2)),
-    )
-    first, second = EXTRACTOR.transforms(message, NS + 9, static=True)
-    assert (first.parent, first.child, first.stamp, first.log_time, first.static) == (
-        "odom",
-        "base_link",
-        NS,
-        NS + 9,
-        True,
-    )
-    assert first.transform.translation == (1.0, 2.0, 0.0)
-    assert first.transform.rotation == (0.0, 0.0, math.sin(0.25), math.cos(0.25))
-    assert (second.parent, second.child, second.stamp) == ("base_link", "laser", NS + 5)
 
 
 def test_transforms_that_tf_refuses_are_left_out() -> None:

@@ -5,7 +5,6 @@ That one the tests write: without the shared bags there is no other of its lengt
 
 from __future__ import annotations
 
-import json
 import math
 import random
 from collections import defaultdict
@@ -34,7 +33,7 @@ from tests.support.closed_form import (
     yaw_deg,
 )
 from tests.support.memories import memory_of
-from tests.support.shared_bags import RECORDED, needs_recorded
+from tests.support.shared_bags import needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -177,18 +176,6 @@ def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Ses
         assert again.sample.time == sample.time
 
 
-def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> None:
-    rows = {row.topic: row for row in queries.list_recorded_topics(memory, Call())}
-    with Reader(session.folder) as reader:
-        expected = {topic: info.msgcount for topic, info in reader.topics.items()}
-    assert {topic: row.count for topic, row in rows.items()} == {
-        topic: count for topic, count in expected.items() if count
-    }
-    for topic, row in rows.items():
-        times = log_times(session.folder)[topic]
-        assert (row.first, row.last) == (times[0], times[-1])
-
-
 @long_ones
 def test_the_bumper_was_last_pressed_half_a_second_before_it_was_released(
     memory: Memory, session: Session
@@ -217,33 +204,3 @@ def test_the_battery_when_the_bumper_was_pressed(memory: Memory) -> None:
     assert answer.value is not None
     value: Any = answer.value.sample.value
     assert value["percentage"] == pytest.approx(0.775, abs=1e-4)
-
-
-@needs_recorded
-@pytest.mark.parametrize("name", ["session_killed", "session_killed_chunk64k"])
-def test_a_killed_session_is_read_as_far_as_it_can_be(name: str) -> None:
-    memory = memory_of(RECORDED / name)
-    # what the kill left was written long before this test
-    memory_range = queries.data_time_range(memory, Call())
-    rows = {row.topic: row.count for row in queries.list_recorded_topics(memory, Call())}
-    t0 = json.loads((RECORDED / f"{name}.truth.json").read_text())["t0_ns"]
-    assert memory_range.latest is not None
-    reached = (memory_range.latest - t0) / 1e9
-    if name == "session_killed":
-        assert 19.9 < reached < 20.5
-        assert [each.path.name for each in memory_range.damaged] == ["session_killed_2.mcap"]
-    else:
-        assert 24.0 < reached < 25.0
-        assert [each.path.name for each in memory_range.incomplete] == [
-            "session_killed_chunk64k_2.mcap"
-        ]
-        assert rows["/odom"] > 480
-
-
-@needs_recorded
-def test_static_frames_of_three_broadcasters_are_all_known() -> None:
-    memory = memory_of(RECORDED / "extra" / "tfs")
-    found = queries.frames(memory, Call())
-    # Their publishers named no parent: known are all three, and none is an edge to tf2.
-    assert found.edges == ()
-    assert [note for note in found.notes if note.endswith("a frame has no name: 3")]

@@ -262,18 +262,6 @@ def test_what_does_not_answer_is_listed_with_reasons(tmp_path: Path) -> None:
     assert odometry.notes[0].startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
 
 
-def test_what_a_wrong_clock_dated_is_found_by_its_times_and_reported_so(tmp_path: Path) -> None:
-    write_splits(tmp_path, 2)
-    write_mcap(tmp_path / "boot" / "boot_0.mcap", [odom(0, 0, 0), odom(5 * S, 1, 0)])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    found = asked(memory, tmp_path, "get_position_at", timestamp=5.0)
-    assert found["x"] == 1.0
-    [told] = found["notes"]
-    assert told.startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
-    window = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", start=0, end=at(30))
-    assert not any("the memory begins" in note for note in window["notes"])
-
-
 def test_a_match_from_the_future_has_no_age(tmp_path: Path) -> None:
     write_splits(tmp_path, 2)
     write_mcap(tmp_path / "ahead" / "ahead_0.mcap", [boolean(T0 + 9 * HOUR, True, "/late")])
@@ -285,14 +273,6 @@ def test_a_match_from_the_future_has_no_age(tmp_path: Path) -> None:
     assert "dated 28800 s after now: when it was is unknown" in found["notes"]
 
 
-def test_now_of_replayed_bags_is_not_the_year_2262(tmp_path: Path) -> None:
-    write_splits(tmp_path, 2)
-    write_mcap(tmp_path / "max" / "max_0.mcap", [odom(T0, 0, 0), odom(T0, 1, 0, log_time=2**62)])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=QuerySettings(now="latest"))
-    found = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=1)
-    assert found["timestamp"] == at(18)
-
-
 def test_simulated_times_are_no_fault(tmp_path: Path) -> None:
     for number in range(2):
         moments = [number * 10 * S + second * S for second in range(10)]
@@ -302,14 +282,3 @@ def test_simulated_times_are_no_fault(tmp_path: Path) -> None:
     assert (told["earliest"], told["latest"], told["clock_faults"]) == (0.0, 19.0, [])
     found = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=4)
     assert (found["timestamp"], found.get("notes")) == (15.0, None)
-
-
-def test_a_clock_set_back_in_a_recording_is_listed(tmp_path: Path) -> None:
-    for number, start_s in enumerate([100, 110, 40, 50]):
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages(start_s))
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    [fault] = asked(memory, tmp_path, "data_time_range")["clock_faults"]
-    assert fault == {
-        "file": "rec/rec_2.mcap",
-        "reason": "the clock was set back by 79 s after rec_1.mcap was begun",
-    }

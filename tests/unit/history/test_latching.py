@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,7 +13,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory, QuerySettings
 from ros2_memory.history.view import AtTime
-from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.queries import position, topic_value, value_when
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
@@ -86,28 +86,6 @@ def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
     return shown
 
 
-@pytest.mark.parametrize(
-    ("messages", "span_s", "length_s", "rare"),
-    [
-        (1, 0.0, 3.0, True),  # a map, published once, in a recording however short
-        (12, 11 * 4.9, 60.0, False),
-        (12, 11 * 5.0, 60.0, True),
-        (12, 11 * 5.1, 60.0, True),
-        (3, 2 * 4.9, 14.6, False),
-        (3, 2 * 5.1, 15.2, True),
-        (2, 0.4, 600.0, True),  # twice when its node started
-        (2, 0.4, 3.0, False),
-        (2300, 23.0, 30.0, False),
-        (2300, 23.0, 1e7, False),  # telemetry that fell silent is no map
-    ],
-)
-def test_a_topic_is_rare_by_its_pace_over_its_recording(
-    messages: int, span_s: float, length_s: float, rare: bool
-) -> None:
-    latched = TopicTotals(T0, T0 + round(span_s * S), messages)
-    assert Pace(latched, T0, T0 + round(length_s * S)).is_rare is rare
-
-
 @each_way
 def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls: bool) -> None:
     telemetry = every(0.01, 7, TELEMETRY)
@@ -119,15 +97,25 @@ def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls
     assert set(reply(memory, TELEMETRY, T0 + 365 * 86_400 * S)) == {"error"}
 
 
-@pytest.mark.parametrize(("period_s", "holds"), [(4.9, False), (5.1, True), (60.0, True)])
+@pytest.mark.parametrize(
+    ("latched_s", "drive_s", "holds"),
+    [
+        ([0], 3, True),  # a map, published once, in a recording however short
+        ([n * 4.9 for n in range(24)], 130, False),
+        ([n * 5.1 for n in range(23)], 130, True),
+        ([0, 60], 130, True),
+        ([0, 4.9, 9.8], 14, False),
+        ([0, 0.4], 130, True),  # twice when its node started
+        ([0, 0.4], 3, False),
+    ],
+    ids=count(),
+)
 def test_what_is_published_every_five_seconds_or_less_often_holds(
-    tmp_path: Path, period_s: float, holds: bool
+    tmp_path: Path, latched_s: list[float], drive_s: int, holds: bool
 ) -> None:
-    latched = every(period_s, 120, MAP)
-    record(tmp_path / "rec", [*latched, *drive(T0, T0 + 130 * S)])
-    memory = remembered(tmp_path)
-    at = latched[-1].log_time + 3 * S
-    found = reply(memory, MAP, at)
+    latched = [text(T0 + round(at * S), "office", MAP) for at in latched_s]
+    record(tmp_path / "rec", [*latched, *drive(T0, T0 + drive_s * S)])
+    found = reply(remembered(tmp_path), MAP, latched[-1].log_time + 3 * S)
     assert ("error" not in found) is holds
     if holds:
         assert (found["latched"], found["age_s"]) == (True, 3.0)

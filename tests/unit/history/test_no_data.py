@@ -194,30 +194,3 @@ def test_never_before_the_memory_began_is_no_data(memory: Memory, bag_dir: Path,
     assert found["timestamp"] == T0_S
     never = BEFORE[tool] | {"value": False}
     assert asked(memory, bag_dir, tool, **never) is None
-
-
-@pytest.mark.parametrize("tool", WINDOWED)
-def test_a_window_that_is_recorded_in_part_says_how_much(
-    memory: Memory, bag_dir: Path, tool: str
-) -> None:
-    told = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 149)
-    window = f"between {T0_S}.000000 and {T0_S + 149}.000000"
-    assert f"recorded only 48 of 149 s {window}" in told["notes"]
-    whole = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39)
-    assert not any("recorded" in note for note in whole.get("notes", ()))
-
-
-@pytest.mark.parametrize("window", [each for each, _ in NOTHING])
-def test_recap_and_compare_say_first_that_nothing_was_recorded(
-    memory: Memory, bag_dir: Path, window: tuple[int, int]
-) -> None:
-    start, end = (T0_S + each for each in window)
-    note = f"nothing was recorded between {start}.000000 and {end}.000000"
-    assert asked(memory, bag_dir, "recap", start=start, end=end)["notes"][0] == note
-    other = {"with_start": T0_S, "with_end": T0_S + 30}
-    reply = asked(memory, bag_dir, "compare", start=start, end=end, **other)
-    assert reply["notes"][0] == note
-    assert "things are not compared: there is nothing to compare them with" in reply["notes"]
-    assert (reply["things"], reply["things_unchanged"]) == ({}, 0)
-    [error] = reply["errors"].values()
-    assert (error["this"], error["with"]) == (None, 1)

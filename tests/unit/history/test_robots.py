@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory
@@ -258,15 +257,6 @@ def test_recordings_without_messages_of_their_own_on_a_topic_are_not(
     memory = memory_of(tmp_path)
     assert differing(memory) == [(("a", "b"), None)]
     assert warned(memory) == []
-
-
-def test_what_a_handover_joins_is_not(tmp_path: Path) -> None:
-    first, second = "rec_20231114T221320Z", "rec_20231114T221340Z"
-    write_mcap(tmp_path / first / f"{first}_0.mcap", drive(0.0))
-    write_mcap(tmp_path / second / f"{second}_0.mcap", drive(1.0, begin=20))
-    write_handover(tmp_path / first, Handover(next=second))
-    write_handover(tmp_path / second, Handover(previous=first))
-    assert differing(memory_of(tmp_path)) == []
 
 
 def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:

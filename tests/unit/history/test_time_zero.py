@@ -11,7 +11,6 @@ from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, each_way, memory_of, replied
-from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -101,24 +100,6 @@ def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
     bag_dir: Path, recalls: bool, now: Now
 ) -> None:
     hold(memory_at(bag_dir, recalls, now), bag_dir, "/odom")
-
-
-@needs_real
-@pytest.mark.parametrize(
-    ("folder", "storage", "topic", "now"),
-    [
-        ("rosbag2_time0_mcap", "mcap", "/test_topic", "wall"),
-        ("ait_time0_images_db3", "rosbag2", "/image", "wall"),
-        ("rosbag2_wbag_5split_mcap", "mcap", "AAA", "latest"),
-    ],
-)
-def test_no_reply_about_public_bags_from_time_zero_does(
-    folder: str, storage: str, topic: str, now: Now
-) -> None:
-    [bag_dir] = REAL.glob(f"**/{folder}")
-    memory = memory_of(bag_dir, storage=storage, limits=QuerySettings(now=now))
-    topics = [row["topic"] for row in asked(memory, bag_dir, "list_recorded_topics")]
-    hold(memory, bag_dir, topic if topic in topics else topics[0])
 
 
 @each_way

@@ -26,7 +26,7 @@ from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, log_entry, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -177,18 +177,6 @@ def test_the_same_copies_are_left_out_newest_first_and_of_columns(
         expected = np.sort(np.concatenate(counting)).tolist()
         assert times(view, "/bumper") == expected
         assert times(view, "/bumper", newest_first=True) == expected[::-1]
-
-
-@each_way
-def test_messages_without_a_publish_time_are_no_copies(tmp_path: Path, recalls: bool) -> None:
-    """Some writers state 0 for a publish time that they do not know."""
-    for nth, robot in enumerate(("ann", "bob")):
-        alike = [boolean(S + n * S // 10 + nth * MS, data=False) for n in range(20)]
-        unknown = [replace(message, publish_time=0) for message in alike]
-        write_mcap(tmp_path / robot / f"{robot}_0.mcap", unknown)
-    memory = memory_of(tmp_path, recalls=recalls)
-    [bumper] = asked(memory, tmp_path, "list_recorded_topics")
-    assert bumper["count"] == 40
 
 
 TOPIC = "/rosout"

@@ -301,9 +301,3 @@ def test_an_answer_that_no_step_is_in_does_not_name_it(tmp_path: Path) -> None:
     for tool, more in (("recap", {}), ("find_matches", FLAG), ("visits", {"x": 0.0, "y": 0.0})):
         reply = asked(memory, tmp_path, tool, start=BEGIN + 100, end=BEGIN + 150, **more)
         assert not ahead_notes(reply)
-
-
-def test_bins_have_their_times_in_unix_seconds_too(tmp_path: Path) -> None:
-    reply = asked(recorded(tmp_path), tmp_path, "find_matches", **FLAG, by="day")
-    at = reply["columns"].index("last_unix")
-    assert reply["rows"][-1][at] == reply["all"][at - 1] == pytest.approx(BEGIN + 199, abs=1e-5)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.facts import FLAG, MOST
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
@@ -30,10 +29,8 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
-from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
-from tests.support.shared_bags import needs_recorded
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -353,30 +350,3 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["avg_speed"] <= path["max_speed"]
     assert path["duration_s"] == pytest.approx(7219.9)
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
-
-
-@needs_recorded
-def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path) -> None:
-    session = SESSIONS["session_mcap"]
-    for bag in session.folder.glob("*.mcap"):
-        (tmp_path / bag.name).write_bytes(bag.read_bytes())
-    memory = memory_of(tmp_path)
-    answer = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
-    assert answer.distance_m == pytest.approx(58 * SPEED, rel=0.002)
-    assert answer.stood == 0
-    assert answer.throughout == ("table",)
-    expected = [
-        ("cup in view", 5, 24),
-        ("scissors in view", 12, 5),
-        ("/bumper became true", 25, 1),
-        ("/bumper became false", 26, None),
-        ("scissors in view", 40, 5),
-    ]
-    assert [each.text for each in answer.events] == [text for text, _, _ in expected]
-    for event, (_, start, length) in zip(answer.events, expected, strict=True):
-        assert abs(session.since(unix_from_ns(event.start)) - start) < 0.05
-        if length is None:
-            assert event.end is None
-        else:
-            assert event.end is not None
-            assert abs(unix_from_ns(event.end - event.start) - length) < 0.05

@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -14,9 +13,6 @@ from ros2_memory.insights.sightings import find_matches
 from tests.support.bags import Msg, make, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of, with_store
-
-if TYPE_CHECKING:
-    pass
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

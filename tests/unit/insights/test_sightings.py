@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import math
 import random
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.timebase import Deadline, unix_from_ns
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -41,12 +40,10 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import FixedClock
-from tests.support.closed_form import SESSIONS, position
 from tests.support.examples import examples
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.random_histories import write_history
-from tests.support.shared_bags import needs_recorded
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -55,32 +52,6 @@ if TYPE_CHECKING:
 S = 10**9
 BEGIN = 1_784_000_000 * S
 OBJECTS = "/vision/scene/scene_objects"
-PLACES = {"table": (1.5, 3.5, 0.4), "cup": (1.4, 3.6, 0.8), "scissors": (-2.5, 1.0, 0.75)}
-
-
-@needs_recorded
-@pytest.mark.parametrize(
-    ("label", "seen"),
-    [("scissors", [(40, 45), (12, 17)]), ("cup", [(5, 29)]), ("table", [(0, 64)])],
-)
-def test_sightings_of_a_recorded_session_are_the_closed_form(
-    label: str, seen: list[tuple[int, int]]
-) -> None:
-    session = SESSIONS["session_mcap"]
-    answer = find_matches(
-        memory_of(session.folder), Call(), "/vision/*/scene_objects", "contains", label
-    )
-    assert not answer.more
-    assert len(answer.sightings) == len(seen)
-    for sighting, (first, last) in zip(answer.sightings, seen, strict=True):
-        assert abs(session.since(unix_from_ns(sighting.first)) - first) < 0.05
-        assert abs(session.since(unix_from_ns(sighting.last)) - last) < 0.05
-        assert sighting.messages == last - first + 1
-        assert sighting.robot is not None
-        assert sighting.thing is not None
-        assert math.dist(sighting.robot.position[:2], position(last)) < 0.05
-        assert sighting.thing.frame_id == "odom"
-        assert math.dist(sighting.thing.position, PLACES[label]) < 0.05
 
 
 def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:

@@ -212,24 +212,6 @@ def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> Non
         )
 
 
-def test_a_visit_that_was_under_way_says_so(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, line((20, 0.5), (20, -0.5), (20, 0.5)))
-    whole = asked(memory, tmp_path, "visits", x=0.0, y=0.0, radius_m=1.0)
-    begin = BEGIN / S
-    [again, first] = whole["visits"]
-    assert first["already_inside"]
-    assert first["arrived"] == begin
-    assert not {"already_inside", "still_inside"} & again.keys()
-    assert whole["total"] == 2
-    window = {"start": begin + 1, "end": begin + 40}
-    cut = asked(memory, tmp_path, "visits", x=0.0, y=0.0, radius_m=1.0, **window)
-    [last, first] = cut["visits"]
-    assert (first["already_inside"], first["arrived"]) == (True, begin + 1)
-    assert (last["still_inside"], last["departed"]) == (True, begin + 40)
-    assert last["arrived"] == again["arrived"]
-    assert (cut["total"], cut["entries"], cut["exits"]) == (2, 1, 1)
-
-
 @each_way
 @pytest.mark.parametrize("nth", [3, -1])
 def test_a_pose_that_cannot_be_decoded_hides_no_visit(

@@ -531,11 +531,3 @@ def test_things_are_the_same_in_one_file_and_in_many(
     assert [each is not None for each in missed_by] == [back, back]
     if back:  # by when is known to a split, or a slice of one
         assert abs(missed_by[0] - missed_by[1]) <= max(split_s, 15.0)
-
-
-def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
-    write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
-    table = Place("table", "map", Circle(3.0, 0.0, 1.0))
-    reply = ask(tmp_path, QuerySettings(places=(KITCHEN, table)))
-    [mug] = reply["things"]
-    assert (mug["in"], mug["also_in"]) == ("table", ["kitchen"])

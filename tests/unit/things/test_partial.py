@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
@@ -17,7 +17,6 @@ from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
 from ros2_memory.things.find import find_things
-from ros2_memory.things.instances import Estimate, estimate
 from tests.support.bags import write_splits
 from tests.support.memories import memory_of, with_store
 from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked
@@ -26,12 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
     from pathlib import Path
 
-    from ros2_memory.columns.sights import JoinedSights
-
 
 T = TypeVar("T")
 
-TOPIC = "/vision/scene/scene_objects"
 APART_S = 600
 """Each bag is in ten minutes of its own, which are gathered together."""
 THINGS = [(f"thing {number}", 3.0 + number % 3, number / 3) for number in range(8)]
@@ -158,22 +154,3 @@ def test_of_a_window_before_what_was_compared_what_was_seen_until_its_end_is_com
             assert f"until {begin_of(nth) + 600}" in note
     labels, [note] = labels_and_notes(crowded)
     assert labels == {label for label, *_ in THINGS[5:]}
-
-
-def test_what_came_after_a_window_is_not_compared_where_it_is_too_much(
-    crowded: Memory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An answer about the first day takes no longer because of the year that followed."""
-    monkeypatch.setattr(known, "_MOST_SPOTS", 3)
-    compared: list[int] = []
-
-    def estimated(sights: JoinedSights, *others: Any) -> Estimate:
-        compared.append(len(sights.epochs))
-        return estimate(sights, *others)
-
-    monkeypatch.setattr(known, "estimate", estimated)
-    begin = float(begin_of(0))
-    for _ in range(2):  # the second time it is known
-        found = find_things(crowded, Call(Deadline.after(60)), start_s=begin, end_s=begin + 599)
-        assert [thing.label for thing in found.things] == ["thing 0"]
-    assert compared == [1]
