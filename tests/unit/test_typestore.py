@@ -108,13 +108,6 @@ class TestOrder:
 
 
 class TestTexts:
-    @pytest.mark.parametrize(
-        "message", [odom(1, 2.0, 3.0, 0.5), text(1, "héllo"), detections(1, ["a", "b"])]
-    )
-    def test_texts_as_the_recorder_writes_them(self, message: Msg) -> None:
-        found = lookup(message.type, definition(message.type))
-        assert repr(decoded(found, message.payload)) == oracle(message)
-
     def test_every_standard_type_is_the_same_after_its_text_was_written(self) -> None:
         stores = Typestores()
         for name in get_typestore(Stores.LATEST).fielddefs:

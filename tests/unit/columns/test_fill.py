@@ -207,17 +207,6 @@ def test_nothing_is_stored_while_messages_are_taken_out(
 # Retention
 
 
-def test_nothing_is_deleted_where_the_bag_directory_is_empty(tmp_path: Path) -> None:
-    bag_dir = tmp_path / "bags"
-    write_bag(bag_dir, 0)
-    world = World.of(bag_dir, file=tmp_path / "cache" / "columns.sqlite")
-    world.fill()
-    bag_dir.rename(tmp_path / "away")
-    bag_dir.mkdir()
-    world.prune()
-    assert count(world, "bag") == 1
-
-
 def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     for number in range(40):

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
-from random import Random
 from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.counts.robot import count_path
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import TimeRange
-from tests.support.bags import odom, write_mcap
+from ros2_memory.history.context import Memory
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.tables import table
@@ -61,23 +56,3 @@ def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path)
     assert "give where in place of x and y" in two["detail"]
     none = asked(in_places(memory), world, "visits", by="day")
     assert "no place is named" in none["detail"]
-
-
-HOUR = 1_784_001_600 * S  # a whole hour of UTC
-
-
-def test_hours_without_a_recording_have_no_row_whatever_was_driven_before(tmp_path: Path) -> None:
-    drawn = Random(5)
-    x = 0.0
-    for recording in range(3):
-        messages = []
-        for step in range(200):
-            x += drawn.random() * 0.05
-            at = HOUR + recording * 5 * 3600 * S + 1234 * S + step * S // 10
-            messages.append(odom(at, x, drawn.random() * 0.01))
-        write_mcap(tmp_path / f"{recording}.mcap", messages)
-    span = TimeRange(HOUR / S, HOUR / S + 50_000)
-    found = count_path(memory_of(tmp_path), Call(), span, "hour")
-    begins = [HOUR / S + 1234 + 5 * 3600 * nth for nth in range(3)]
-    hours = [datetime.fromtimestamp(at, UTC).astimezone().strftime("%H:00") for at in begins]
-    assert [name[-5:] for name, _ in found.rows] == hours

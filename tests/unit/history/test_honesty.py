@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, Memory
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -271,14 +271,3 @@ def test_a_match_from_the_future_has_no_age(tmp_path: Path) -> None:
     )
     assert "age_s" not in found
     assert "dated 28800 s after now: when it was is unknown" in found["notes"]
-
-
-def test_simulated_times_are_no_fault(tmp_path: Path) -> None:
-    for number in range(2):
-        moments = [number * 10 * S + second * S for second in range(10)]
-        write_mcap(tmp_path / "sim" / f"sim_{number}.mcap", [odom(at, 0, 0) for at in moments])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=QuerySettings(now="latest"))
-    told = asked(memory, tmp_path, "data_time_range")
-    assert (told["earliest"], told["latest"], told["clock_faults"]) == (0.0, 19.0, [])
-    found = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=4)
-    assert (found["timestamp"], found.get("notes")) == (15.0, None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 from dataclasses import replace
 from itertools import pairwise
@@ -30,6 +31,7 @@ from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
+    from pathlib import Path
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9
@@ -336,3 +338,26 @@ def test_what_was_an_original_no_longer_matters_once_its_recording_is_gone(tmp_p
     (tmp_path / "a" / "a_0.mcap").unlink()
     memory.index.refresh()
     assert (before, errors()) == ([1_001], [2_001])
+
+
+def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(
+    tmp_path: Path,
+) -> None:
+    messages = [boolean(T0 + n * S, n == 5) for n in range(60)]
+    path = write_mcap(tmp_path / "a" / "a_0.mcap", messages)
+    memory = memory_of(tmp_path)
+
+    def scanned(view: View) -> list[int]:
+        return [
+            int(at) for rows in scan(view, "/bumper", TimeWindow.everything()) for at in rows.times
+        ]
+
+    assert len(scanned(View(memory, Call()))) == 60
+    shorter, deleted = View(memory, Call()), View(memory, Call())
+    changed = path.stat().st_mtime_ns + S
+    write_mcap(path, [boolean(T0, True)])
+    os.utime(path, ns=(changed, changed))
+    assert scanned(shorter) == [T0]
+    path.unlink()
+    assert scanned(deleted) == []
+    assert "a/a_0.mcap was deleted before it could be read" in deleted.notes.sentences()[0]

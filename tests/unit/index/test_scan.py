@@ -45,16 +45,8 @@ def _names(scanned: ScanResult) -> list[str]:
         ("rec_0.db3.zstd", ".db3.zstd"),
         ("REC_0.MCAP", ".mcap"),
         (".rec_0.mcap", None),
-        ("metadata.yaml", None),
         ("rec_0.db3-wal", None),
         ("rec_0.mcap.tmp", None),
-        (".rec_0.mcap.repair", None),
-        (".carried.mcap.tmp", None),
-        ("recorder.qos.yaml", None),
-        ("rec_0.zstd", None),
-        ("mcap", None),
-        (".mcap", None),
-        (".db3.zstd", None),
     ],
 )
 def test_a_bag_is_known_by_the_end_of_its_name(name: str, kind: str | None) -> None:

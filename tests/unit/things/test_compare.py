@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 from tests.support.bags import Msg, write_splits
@@ -185,11 +184,3 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
     until_its_end = ask(tmp_path, **{**within, "end": BEGIN + 89})
     assert labels(until_its_end) == {"appeared": ["book"]}
     assert not any("things" in each for each in until_its_end["notes"])
-
-
-def test_a_thing_that_was_detected_without_a_place_is_not_missed(tmp_path: Path) -> None:
-    lost = ("mug", math.nan, math.nan)
-    reply = compared(tmp_path, [*looked(0, 20, HERE, MUG), *looked(60, 90, HERE, lost)])
-    assert labels(reply) == {"not_looked_at": ["mug"]}
-    [note] = reply["notes"]
-    assert "could not be placed: mug (30 times" in note

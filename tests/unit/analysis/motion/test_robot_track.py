@@ -104,18 +104,6 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
     assert same(track_by(*joined_tracks([stretches])), whole)
 
 
-def test_recordings_of_some_hours_keep_few_vertices_once_they_are_settled() -> None:
-    times = np.arange(0, 3600 * S, S // 5) + START
-    level = np.zeros(300)
-    parts = [
-        partial_track(some, level, level, level)._replace(recording=f"run {nth // 3}")
-        for nth, some in enumerate(np.split(times, len(times) // 300))
-    ]
-    tracks = settled_tracks(parts)
-    assert len(tracks) == len(parts) // 3
-    assert sum(len(track.times) for track in tracks) < sum(len(part.times) for part in parts) / 5
-
-
 def test_turns_on_the_spot_add_up() -> None:
     seconds = np.arange(0, 60, 0.1)
     times = START + (seconds * S).astype(np.int64)
@@ -129,14 +117,3 @@ def test_a_robot_that_stands_has_two_vertices_in_ten_seconds() -> None:
     times = START + np.arange(0, 100 * S, 40 * MS)
     level = np.ones(len(times))
     assert len(track_of(times, level, level, level).times) == 20
-
-
-def test_of_poses_of_one_time_the_first_counts_in_one_table_and_in_two() -> None:
-    times = np.array([0, 1, 1, 2], np.int64) * S + START
-    x = np.array([0.0, 1.0, 5.0, 2.0])
-    still = np.zeros(4)
-    assert track_of(times, x, still, still).x.tolist() == [0.0, 2.0]
-    parts = [
-        partial_track(times[rows], x[rows], still[rows], still[rows]) for rows in ([0, 1], [2, 3])
-    ]
-    assert same(track_by(*joined_tracks([parts])), track_of(times, x, still, still))
