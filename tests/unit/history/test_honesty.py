@@ -271,3 +271,14 @@ def test_a_match_from_the_future_has_no_age(tmp_path: Path) -> None:
     )
     assert "age_s" not in found
     assert "dated 28800 s after now: when it was is unknown" in found["notes"]
+
+
+def test_a_clock_set_back_in_a_recording_is_listed(tmp_path: Path) -> None:
+    for number, start_s in enumerate([100, 110, 40, 50]):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages(start_s))
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    [fault] = asked(memory, tmp_path, "data_time_range")["clock_faults"]
+    assert fault == {
+        "file": "rec/rec_2.mcap",
+        "reason": "the clock was set back by 79 s after rec_1.mcap was begun",
+    }

@@ -12,12 +12,9 @@ import pytest
 
 from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError, NoDataReason
-from ros2_memory.core.model import Transform
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.coverage import seconds
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.results import TransformAt
-from ros2_memory.tools.replies import as_json
 from tests.support.bags import boolean, detections, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of, with_store
@@ -77,16 +74,6 @@ def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
         with pytest.raises(NoDataError) as caught:
             queries.transform(memory, Call(), parent, child, after(later))
         assert caught.value.reason is reason
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reported(
-    tmp_path: Path, sign: float
-) -> None:
-    turned = Transform((1.0, 2.0, 3.0), (0.0, 0.0, sign * 0.6, sign * 0.8))
-    reply = as_json(TransformAt("odom", "base_link", T0, turned, "stamp"), tmp_path)
-    assert isinstance(reply, dict)
-    assert reply["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
 
 
 @pytest.mark.parametrize(

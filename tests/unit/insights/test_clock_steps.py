@@ -225,17 +225,6 @@ def test_a_step_back_that_several_bags_show_is_listed_once(tmp_path: Path) -> No
     assert -20 <= step["step_s"] <= -19
 
 
-def test_a_clock_that_was_set_back_is_listed_with_a_negative_step(tmp_path: Path) -> None:
-    memory = recorded(tmp_path, shown=lambda t: t - 30.0 * (t >= 100))
-    [step] = steps(memory, tmp_path)
-    assert step == {"at": BEGIN + 70, "step_s": pytest.approx(-29.9, abs=0.01)}
-    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 160)
-    assert reply["duration_s"] == 160.0
-    [note, of_path] = [each for each in reply["notes"] if "set back" in each]
-    assert note.startswith("the clock was set back by 29.9 s or more at ")
-    assert of_path.endswith("the path there is that of files from before")
-
-
 WHEN = 54.95
 FLAG = {"topic": "/bumper", "condition_type": "equals", "value": False}
 

@@ -17,7 +17,6 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.results import Event, Recap
 from tests.support.bags import (
-    STATUS_FLAGS,
     Msg,
     boolean,
     detections,
@@ -94,18 +93,6 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
         assert sum(stood) == pytest.approx(whole.stood or 0, abs=0.02 * S)
 
 
-def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
-    """The status of a vehicle after so many seconds, with these of its 40 booleans true."""
-    body = make(
-        "px4_msgs/msg/VehicleStatus",
-        timestamp=round(at * 1e6),
-        arming_state=1,
-        gcs_connection_lost_counter=0,
-        **{name: name in set_flags for name in STATUS_FLAGS},
-    )
-    return Msg(topic, "px4_msgs/msg/VehicleStatus", BEGIN + round(at * S), body)
-
-
 def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:
     type_name = "px4_msgs/msg/ManyFlags"
     body = make(type_name, **{f"flag_{nth:03}": False for nth in range(600)})
@@ -117,19 +104,6 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> Non
     more = 600 - MOST[FLAG]
     assert note == (
         f"/many has too many booleans or things in one message: {more} more are not followed"
-    )
-
-
-def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path) -> None:
-    """All 40 booleans flip four times in one bag."""
-    messages = [_status(at, *(STATUS_FLAGS if at in {1, 3} else ())) for at in range(5)]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    memory = memory_of(tmp_path)
-    answer = over(memory, 0, 10)
-    assert dict(answer.counts) == {"on/off changes": 4 * 40}
-    assert any(
-        f"left out, because there are too many: {4 * 40 - 25} on/off changes" in note
-        for note in answer.notes
     )
 
 
