@@ -4,16 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import traceback
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.config import Settings, load_settings
+from ros2_memory.bootstrap import query_settings_of
+from ros2_memory.config import (
+    Settings,
+    exit_on_config_error,
+    load_labels,
+    load_message_schemas,
+    load_settings,
+    unused_config,
+)
+from ros2_memory.config_sources import Sources
 from ros2_memory.core.errors import ConfigError
-from tests.support.config_folders import MCAP, NONE, ROS2BAG, ROSBAG2, refusal
+from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, copied, edit, refusal
 from tests.support.examples import examples
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
     codec="utf-8", exclude_characters="\0"
@@ -244,3 +258,222 @@ class TestAdapters:
     def test_an_argument_that_it_does_not_take_is_refused(self) -> None:
         said = refusal("storage.unpack_max_mb=3")
         assert said.startswith("storage.unpack_max_mb: unknown key; use one of: _target_ (")
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("override", "fragments"),
+        [
+            ("datas.now=wall", ["datas: unknown key", "recording, data, reader"]),
+            ("data.nwo=wall", ["data.nwo: unknown key", "now, tf_clock"]),
+            ("storage.cache=1", ["storage.cache: unknown key", "_target_"]),
+            ("~data.now", ["data.now: missing"]),
+            ("~nothing", ["'nothing' does not exist"]),
+            ("server=3", ["server: 3 is not allowed", "must hold keys"]),
+            ("data.now=walls", ["data.now: 'walls'", "wall, latest"]),
+            ("recording.split_duration_s=-10", ["recording.split_duration_s: -10", "than 0"]),
+            ("recording.split_duration_s=2.5", ["2.5", "must be a whole number"]),
+            ("recording.clear_on_startup=perhaps", ["'perhaps'", "boolean"]),
+            ("recording.bag_dir=''", ["recording.bag_dir: ''", "must name a path"]),
+            ("recording.bag_dir=7", ["recording.bag_dir: 7", "must be a path"]),
+            ("recording.bag_dir='~nobody-here/x'", ["recording.bag_dir", "can be found"]),
+            ("data.time_tolerance_s=true", ["data.time_tolerance_s: True", "valid number"]),
+            ("data.time_tolerance_s=-0.1", ["-0.1", "greater than or equal to 0"]),
+            ("data.max_plausible_speed_mps=nan", ["nan", "finite"]),
+            ("data.pose_topic=''", ["data.pose_topic: ''", "must not be empty"]),
+            ("data.tf_topics=/tf", ["data.tf_topics: '/tf'", "must be a list"]),
+            ("data.tf_topics=[1]", ["data.tf_topics.0: 1", "valid string"]),
+            ("retention.max_total_gb='2GB'", ["'2GB'", "must be a number in GB, such as 2"]),
+            ("recorder.setup_files=[/a", ["is not a setting", "needs quotes as a whole"]),
+            ("server.max_reply_chars=10", ["server.max_reply_chars: 10", "1000"]),
+            ("data.now=${nothing}", ["data.now: ", "'nothing' not found"]),
+            ("server.host=${oc.env:NO_SUCH_VARIABLE}", ["server.host: ", "NO_SUCH_VARIABLE"]),
+            ("data.now=???", ["data.now: ", "issing"]),
+            ("storage=parquet", ["storage: 'parquet'", "mcap, rosbag2"]),
+            ("storage=null", ["storage: None", "mcap, rosbag2"]),
+            ("storage=[mcap,rosbag2]", ["storage: ['mcap', 'rosbag2']", "mcap, rosbag2"]),
+            ("server.port", ["'server.port' is not a setting", "key=value"]),
+            ("/bags/monday", ["is not a setting", "recording.bag_dir=/bags/monday"]),
+            ("data.now='wall", ["is not a setting", "key=value"]),
+            ("=3", ["'=3' is not one value for one key"]),
+            ("data.now=wall,latest", ["is not one value for one key", "key=[a,b]"]),
+        ],
+    )
+    def test_name_the_key_the_value_and_what_is_allowed(
+        self, override: str, fragments: list[str]
+    ) -> None:
+        message = refusal(override)
+        assert "\n" not in message
+        for fragment in fragments:
+            assert fragment in message
+
+    @pytest.mark.parametrize(
+        "override",
+        [
+            "server={token: s3cret",
+            "lake.properties={s3.secret-access-key: s3cret",
+            "lake.password=s3cret,other",
+            "server.api_token=s3cret",
+            "+api_token=[s3cret",
+            "API_TOKEN='s3cret",
+        ],
+    )
+    def test_show_no_secret_of_what_is_no_setting(self, override: str) -> None:
+        variables = [{"MEMORY_CONFIG_OVERRIDES": text} for text in (override, f"'{override}")]
+        for overrides, env in (([override], {}), *(((), variable) for variable in variables)):
+            with pytest.raises(ConfigError) as caught:
+                load_settings(overrides, env)
+            assert "s3cret" not in "".join(traceback.format_exception(caught.value))
+            assert re.search("secret|shell|token", str(caught.value))
+
+
+class TestExit:
+    def test_a_refused_configuration_is_explained_on_stderr_with_exit_code_2(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with pytest.raises(SystemExit) as caught, exit_on_config_error("ros2-memory-server"):
+            load_settings(["data.now=walls"], {})
+        assert caught.value.code == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.splitlines() == [
+            "ros2-memory-server cannot start, its configuration is refused:",
+            "data.now: 'walls' is not allowed; use one of: wall, latest (set on the command line)",
+        ]
+
+
+class TestConfigFolder:
+    def test_one_beside_is_named_as_unused_unless_it_says_the_same(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.delenv("MEMORY_CONFIG_DIR", raising=False)
+        monkeypatch.chdir(copied(tmp_path).parent)
+        assert unused_config() is None
+        edit(Path("config/config.yaml"), "name: episodic", "name: mine")
+        assert "is not used" in (unused_config() or "")
+
+
+def labels(text: str, tmp_path: Path) -> object:
+    path = tmp_path / "labels.yaml"
+    path.write_text(text)
+    return load_labels(load_settings([f"data.labels_file='{path}'"], {}))
+
+
+def schemas(text: str, tmp_path: Path) -> object:
+    path = tmp_path / "schemas.yaml"
+    path.write_text(text)
+    return load_message_schemas(load_settings([f"reader.schemas_file='{path}'"], {}))
+
+
+def require_refused(
+    load: Callable[[str, Path], object], tmp_path: Path, text: str, *fragments: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(text, tmp_path)
+    assert [each for each in fragments if each not in str(caught.value)] == []
+
+
+class TestMessageSchemas:
+    @pytest.mark.parametrize(
+        ("text", "fragment"),
+        [
+            ("schemas: {nav_msgs/Odometry: {position: pose}}", "nav_msgs/msg/Odometry"),
+            ("schemas: {a/msg/B: {position: pose..position}}", "schemas.a/msg/B.position"),
+            ("schemas: {a/msg/B: {position: 3}}", "schemas.a/msg/B.position: 3"),
+            ("schemas: {a/msg/B: position}", "schemas.a/msg/B: 'position'"),
+            ("schemas:\n  a/msg/C: {x: y}\n  a/msg/B:\n    x.y: 3", "schemas.yaml, line 4,"),
+            ("schemas: {a/msg/B: {'': position}}", "must not be empty"),
+            ("schemas: {a/msg/B: {x: y}, a/msg/B: {x: z}}", "duplicate key a/msg/B"),
+            ("schema: {}", "schema: unknown key"),
+            ("schemas: [", "line 1"),
+            ("- a list", "['a list'] is not allowed"),
+            ("", "schemas: missing"),
+        ],
+    )
+    def test_a_wrong_file_is_refused_by_file_and_key(
+        self, text: str, fragment: str, tmp_path: Path
+    ) -> None:
+        named = str(tmp_path / "schemas.yaml"), "reader.schemas_file"
+        require_refused(schemas, tmp_path, text, fragment, *named)
+
+
+class TestLabels:
+    def test_are_spellings_by_the_name_that_is_shown(self, tmp_path: Path) -> None:
+        text = "labels: {mug: [coffee mug, Mug], remote control: [tv-remote]}\n"
+        assert labels(text, tmp_path) == {
+            "mug": ("coffee mug", "Mug"),
+            "remote control": ("tv-remote",),
+        }
+
+    def test_reach_the_queries(self, tmp_path: Path) -> None:
+        path = tmp_path / "labels.yaml"
+        path.write_text("labels: {mug: [coffee mug]}")
+        settings = load_settings([f"data.labels_file='{path}'", "data.min_score=0.3"], {})
+        limits = query_settings_of(settings)
+        assert limits.labels == {"mug": ("coffee mug",)}
+        assert limits.min_score == 0.3
+
+    @pytest.mark.parametrize(
+        ("text", "fragment"),
+        [
+            ("labels: {mug: [cup], Glass: [CUP]}", "'CUP' is under 'mug' (as 'cup') and 'Glass'"),
+            ("labels: {mug: [tea_cup], cup: [Tea cup]}", "is under 'mug' (as 'tea_cup') and 'cup'"),
+            ("labels: {mug: [cups], glass: [cup]}", "is under 'mug' (as 'cups') and 'glass'"),
+            ("labels: {mug: [], Mugs: []}", "'Mugs' is under 'mug' (as 'mug') and 'Mugs'"),
+            ("labels: {sofa: [couches], seat: [Couch]}", "plurals do not count"),
+            ("labels: {mug: [cup], cup: []}", "'cup' is under 'mug' and 'cup'"),
+            ("labels: {mug: cup}", "labels.mug: 'cup' is not allowed; must be a list"),
+            ("labels: {mug: [3]}", "labels.mug.0: 3 is not allowed"),
+            ("labels: {mug: ['']}", "must not be empty"),
+            ("labels: {mug: [' ']}", "empty spelling, as under 'mug'"),
+            ("labels: {mug: [], mug: [cup]}", "duplicate key mug"),
+            ("labels: [mug]", "labels: ['mug'] is not allowed; must hold keys"),
+            ("label: {}", "label: unknown key; use one of: labels"),
+            ("", "labels: missing"),
+        ],
+    )
+    def test_a_wrong_file_is_refused_by_file_and_key(
+        self, text: str, fragment: str, tmp_path: Path
+    ) -> None:
+        named = str(tmp_path / "labels.yaml"), "data.labels_file"
+        require_refused(labels, tmp_path, text, fragment, *named)
+
+    def test_the_shipped_examples_are_valid(self, tmp_path: Path) -> None:
+        shipped = (ROOT / "config/labels.yaml").read_text()
+        _, commented = shipped.split("labels: {}\n\n")
+        uncommented = "".join(line.removeprefix("# ") for line in commented.splitlines(True))
+        assert labels(uncommented, tmp_path) == {
+            "mug": ("coffee mug", "tea cup"),
+            "sofa": ("couch", "settee"),
+            "remote control": ("remote", "tv controller"),
+        }
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return copied(tmp_path)
+
+
+def test_a_preset_that_builds_on_itself_ends(folder: Path) -> None:
+    (folder / "config.yaml").write_text("defaults:\n  - deployment: loop\n")
+    (folder / "deployment" / "loop.yaml").write_text("defaults: [loop]\ndata: {now: latest}\n")
+    assert Sources(folder, (), {})("data.now") == f"in {folder}"
+
+
+def test_a_file_of_the_operators_stands_for_the_keys_that_it_sets(folder: Path) -> None:
+    text = (folder / "config.yaml").read_text().replace("deployment: null", "deployment: mine")
+    (folder / "config.yaml").write_text(text)
+    (folder / "deployment" / "mine.yaml").write_text(
+        "# @package _global_\nserver:\n  name: robin\n"
+    )
+    source = Sources(folder, (), {})
+    assert source("server.name") == f"in {folder / 'deployment' / 'mine.yaml'}"
+    assert source("server.port") == f"in {folder / 'config.yaml'}"
+    assert source.choice("deployment") == ("mine", f"in {folder / 'config.yaml'}")
+
+
+@pytest.mark.parametrize("content", ["[", "- 1", "", "data: 7", "defaults: 7", "\x00"])
+def test_of_files_that_make_no_sense_the_folder_is_named(folder: Path, content: str) -> None:
+    (folder / "config.yaml").write_text(content)
+    assert Sources(folder, (), {})("data.now") == f"in {folder}"
+    assert Sources(folder, (), {}).choice("storage") == (None, f"in {folder / 'config.yaml'}")

@@ -65,12 +65,6 @@ def test_a_type_named_as_before_2019_is_found_in_the_map() -> None:
     assert shown(odometry(), "nav_msgs/Odometry") == shown(odometry(), ODOMETRY)
 
 
-@pytest.mark.parametrize("message", [{"level": 2, "q": {"x": 0, "w": 1}}, [1, "a"], "text", None])
-def test_json_is_extracted_unchanged(message: object) -> None:
-    assert shown(message, "foxglove.Log") == message
-    assert EXTRACTOR.exact(message, "foxglove.Log") == message
-
-
 def test_fields_that_a_message_lacks_are_null_with_a_note() -> None:
     extracted = EXTRACTOR.shown({"status": "on", "skill": "scene"}, DETECTIONS)
     assert extracted.value == {"skill": "scene", "detections": None}

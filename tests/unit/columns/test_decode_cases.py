@@ -21,6 +21,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
     Msg,
+    definition,
     detections,
     header,
     make,
@@ -167,26 +168,20 @@ def test_a_hostile_payload_changes_no_other_message(tmp_path: Path, bad: bytes) 
     assert table.log_times.tolist() == [0, 2, 3, 4]
 
 
-def two_publishers(path: Path) -> Path:
+def two_publishers(writer: Writer) -> None:
     """A topic with a channel for each of two publishers."""
-    types = DrawnTypes((("State", (DrawnField("level", "int64"),)),))
-    store = types.store()
-
-    def fill(writer: Writer) -> None:
-        schema = writer.register_schema(types.root, "ros2msg", types.msg().encode())
-        channels = [writer.register_channel("/state", "cdr", schema) for _ in range(2)]
-        for time in range(9):
-            payload = store.serialize_cdr(store.types[types.root](time), types.root)
-            writer.add_message(channels[time % 2], time, bytes(payload), time)
-
-    return raw_mcap(path, fill, profile="ros2")
+    kind = "std_msgs/msg/String"
+    schema = writer.register_schema(kind, "ros2msg", definition(kind).encode())
+    channels = [writer.register_channel("/said", "cdr", schema) for _ in range(2)]
+    for time in range(9):
+        writer.add_message(channels[time % 2], time, text(time, f"{time}").payload, time)
 
 
 def test_publishers_and_encodings_may_share_a_topic(tmp_path: Path, fallbacks: list[str]) -> None:
     big_endian = struct.pack(">4sI", b"\0\0\0\0", 4) + b"big\0"
     odd = [Msg("/chatter", "std_msgs/msg/String", 60 + nth, big_endian) for nth in range(2)]
     odd_bag = write_mcap(tmp_path / "odd.mcap", [*mixed(5), *odd])
-    for path in (odd_bag, two_publishers(tmp_path / "two.mcap")):
+    for path in (odd_bag, raw_mcap(tmp_path / "two.mcap", two_publishers, profile="ros2")):
         decoded_alike(McapReader(), path)
     assert set(fallbacks) == {"/chatter"}
 

@@ -13,7 +13,6 @@ import pytest
 from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.coverage import seconds
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import boolean, detections, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
@@ -74,14 +73,6 @@ def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
         with pytest.raises(NoDataError) as caught:
             queries.transform(memory, Call(), parent, child, after(later))
         assert caught.value.reason is reason
-
-
-@pytest.mark.parametrize(
-    ("length_s", "reply"),
-    [(0.0493, "0.0493 s"), (2.0, "2 s"), (99.96, "100 s"), (515_219.9, "515220 s")],
-)
-def test_a_duration_is_reported_without_powers_of_ten(length_s: float, reply: str) -> None:
-    assert seconds(round(length_s * S)) == reply
 
 
 @pytest.mark.parametrize("older_s", [12.631, 59.891])

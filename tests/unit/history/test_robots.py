@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
@@ -169,18 +168,6 @@ def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
     memory = memory_of(tmp_path)
     assert differing(memory) == [(("run_1", "run_2"), "/odom")]
     told = asked(memory, tmp_path, "trajectory_summary", start=0, end=61)
-    assert told["reason"] == "mixed"
-
-
-@pytest.mark.parametrize(
-    "asks", [{}, {"where": {"x": 0, "y": 0, "radius_m": 9}}, {"by": "hour"}, {"by": "place"}]
-)
-def test_metres_of_both_robots_are_not_counted(both: Path, asks: dict[str, object]) -> None:
-    memory = memory_of(both)
-    memory = replace(
-        memory, limits=replace(memory.limits, places=(Place("a", "odom", Circle(0, 0, 1)),))
-    )
-    told = asked(memory, both, "trajectory_summary", start=T0_S, end=T0_S + 60, **asks)
     assert told["reason"] == "mixed"
 
 

@@ -30,6 +30,7 @@ from tests.support.bags import (
 )
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.unit.analysis.motion.test_standstills import world
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -42,26 +43,6 @@ def over(memory: Memory, begin: float, end: float) -> Recap:
 
 def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
     return [(each.text, (each.start - BEGIN) / S) for each in events if each.kind == kind]
-
-
-def _drive(
-    bag_dir: Path, legs: list[tuple[float, float]], *, begin: float = 0.0, hz: int = 50
-) -> list[tuple[float, float]]:
-    """Legs of (seconds, metres per second) from `begin` on, in bags of 7.3 s; when it stood."""
-    edges, places = [begin], [0.0]
-    for length, speed in legs:
-        edges.append(edges[-1] + length)
-        places.append(places[-1] + length * speed)
-    messages: list[Msg] = []
-    leg = 0
-    for nth in range(int((edges[-1] - begin) * hz) + 1):
-        time = begin + nth / hz
-        while leg + 1 < len(legs) and time >= edges[leg + 1]:
-            leg += 1
-        x = places[leg] + (time - edges[leg]) * legs[leg][1]
-        messages.append(odom(BEGIN + round(time * S), x, 0.0, 0.0))
-    write_splits(bag_dir, messages, 7.3)
-    return [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
 
 
 @settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -82,7 +63,8 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
         driven = [(2.0, 0.5)]
         for stands, drives in legs:
             driven += [(stands, 0.0), (drives, 0.5)]
-        _drive(bag_dir, driven)
+        poses = world(driven, begin=0.0).poses
+        write_splits(bag_dir, [odom(BEGIN + at, x, 0.0, 0.0) for at, (x, *_) in poses], 7.3)
         memory = memory_of(bag_dir, recalls=recalls)
         end = sum(length for length, _ in driven)
         # No part is so short that no pose is in it.

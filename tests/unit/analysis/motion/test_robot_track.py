@@ -111,9 +111,3 @@ def test_turns_on_the_spot_add_up() -> None:
     track = track_of(times, still, still, heading)
     assert track.heading[-1] - track.heading[0] == pytest.approx(59.9, abs=1e-5)
     assert len(track.times) < 20
-
-
-def test_a_robot_that_stands_has_two_vertices_in_ten_seconds() -> None:
-    times = START + np.arange(0, 100 * S, 40 * MS)
-    level = np.ones(len(times))
-    assert len(track_of(times, level, level, level).times) == 20
