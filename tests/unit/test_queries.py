@@ -98,6 +98,19 @@ def test_a_field_that_one_type_of_a_topic_has_is_shown_of_its_messages(tmp_path:
     assert told["error"] == "invalid_arguments"
 
 
+def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [odom(T0 + n * S, n, 0.0) for n in range(3)])
+    memory = memory_of(tmp_path)
+    inside = queries.topic_range(memory, Call(), "/odom", span(0, 2))
+    assert inside.notes == ()
+    wider = queries.topic_range(memory, Call(), "/odom", span(-5, 900))
+    assert [note.partition(" at ")[0] for note in wider.notes] == [
+        f"recorded only 2 of 905 s between {T0 // S - 5}.000000 and {T0 // S + 900}.000000",
+        "the memory begins",
+        "the memory ends",
+    ]
+
+
 @pytest.mark.parametrize(
     ("at", "reason"),
     [
