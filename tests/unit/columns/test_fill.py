@@ -20,12 +20,11 @@ from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.fill import Progress, StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.walk import LevelColumns, walked
-from ros2_memory.columns.writing import Level, ReadBag
+from ros2_memory.columns.writing import ReadBag
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap import bulk
 from tests.support.bags import McapLayout, odom, text, write_db3, write_mcap
-from tests.support.clocks import SettableClock
 from tests.support.column_worlds import World, check_all, store_file, times
 
 if TYPE_CHECKING:
@@ -92,37 +91,6 @@ def test_copies_of_a_long_bag_are_recognised_before_it_is_stored_again(tmp_path:
     ]
     write_mcap(tmp_path / "rec_b" / "rec_b_0.mcap", again)
     assert check_all(world) == 300
-
-
-def test_larger_parts_take_the_place_of_smaller_ones_as_time_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writing, "PART_NS", 3600 * S)
-    for number in range(11):
-        write_bag(tmp_path, number)
-    older = write_mcap(tmp_path / "rec" / "older.mcap", [odom(T0 - 7200 * S, 0.0, 0.0)])
-    os.utime(older, ns=(T0, T0))
-    clock = SettableClock(T0 + 660 * S)
-    world = World.of(tmp_path, clock=clock)
-    batches = world.filling.batches(world.memory.index.snapshot().timeline)
-    levels = [batch.level for batch in batches]
-    assert levels == [Level.BAG, Level.TEN_MINUTES, Level.HOUR]
-    older.unlink()
-    world = World.of(tmp_path, clock=clock)
-    by_level = "SELECT level, count(DISTINCT bags) FROM part GROUP BY level"
-
-    def stored() -> list[tuple[int, int]]:
-        world.fill()
-        check_all(world)
-        with closing(sqlite3.connect(store_file(tmp_path))) as base:
-            return base.execute(by_level).fetchall()
-
-    assert stored() == [(Level.BAG, 1), (Level.TEN_MINUTES, 1)]
-    clock.at = T0 + 1200 * S
-    assert stored() == [(Level.TEN_MINUTES, 2)]
-    clock.at = T0 // (3600 * S) * 3600 * S + 3600 * S
-    assert stored() == [(Level.HOUR, 1)]
-    assert world.fill() == 0
 
 
 def test_a_topic_with_many_messages_has_several_parts_and_those_of_one_time_are_in_one(

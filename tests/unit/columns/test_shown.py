@@ -148,19 +148,6 @@ def test_numbers_of_a_field_are_those_of_each_message(drawn: Drawn, random: Rand
             assert own == pytest.approx(expected, abs=found.error, rel=0.0), field
 
 
-def test_numbers_of_arrays_that_are_not_held_are_left_to_the_bag() -> None:
-    drawn = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))])
-    assert numbers(drawn.table, "pose.covariance", EXTRACTOR) is None
-    kind = "sensor_msgs/msg/JointState"
-    joints = message(kind, Random(1), is_odd=False)
-    joints.position = np.arange(3.0)  # type: ignore[attr-defined]
-    found = numbers(drawn_of(kind, [joints]).table, "positions", EXTRACTOR)
-    assert found is not None
-    assert found.numbers.tolist() == [0.0, 1.0, 2.0]
-    joints.position = np.arange(12.0)  # type: ignore[attr-defined]
-    assert numbers(drawn_of(kind, [joints]).table, "positions", EXTRACTOR) is None
-
-
 @given(st.lists(st.integers(MIN_NS, MAX_NS) | st.integers(-(2**54), 2**54), min_size=1))
 def test_seconds_are_rounded_as_those_of_each_message(times: list[int]) -> None:
     found = seconds(np.array(times, np.int64))

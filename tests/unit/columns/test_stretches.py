@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -55,33 +54,6 @@ def world(length_of_stretches: None, tmp_path_factory: pytest.TempPathFactory) -
     world = World.of(folder)
     world.fill()
     return world
-
-
-@pytest.fixture
-def copied(world: World, tmp_path: Path) -> World:
-    """The same, for tests that delete bags of it."""
-    shutil.copytree(world.bag_dir, tmp_path, dirs_exist_ok=True)
-    return World.of(tmp_path)
-
-
-def stretches(world: World, window: TimeWindow = WINDOW) -> list[Stretch]:
-    return open_scan(View(world.memory, Call()), "/odom", window).stretches()
-
-
-def starts_of_settled(world: World, window: TimeWindow = WINDOW) -> list[int]:
-    return [one.window.start for one in stretches(world, window) if one.parts is not None][::-1]
-
-
-@pytest.mark.parametrize("how", ["gone", "changed"])
-def test_a_stretch_without_one_of_its_bags_is_none(copied: World, tmp_path: Path, how: str) -> None:
-    assert len(starts_of_settled(copied)) == 4
-    bag = tmp_path / "rec_0" / "13.mcap"  # in the second stretch
-    if how == "gone":
-        bag.unlink()
-    else:
-        write_mcap(bag, [odom(T0 + 1301 * S, 0, 0)])
-    again = World.of(tmp_path)
-    assert starts_of_settled(again) == [T0, T0 + 2 * LENGTH, T0 + 3 * LENGTH]
 
 
 @pytest.fixture

@@ -92,9 +92,10 @@ FIELDS: Final = {
 }
 
 
-def questions(draw: Random, world: World, moments: Sequence[int], most: int) -> list[Question]:
+def questions(
+    draw: Random, topics: Sequence[str], moments: Sequence[int], most: int
+) -> list[Question]:
     """Some questions to each tool that scans columns, at times when something happened."""
-    topics = world.topics()
     found: list[Question] = [(name, {}) for name in ("list_recorded_topics", "memory_status")]
     for topic, conditions in CONDITIONS.items():
         if topic in topics or "*" in topic:
@@ -106,6 +107,8 @@ def questions(draw: Random, world: World, moments: Sequence[int], most: int) -> 
             window["fields"] = FIELDS[topic]
         found.append(("get_topic_in_range", {**window, "max_samples": 7}))
         found.append(("get_topic_in_range", {**window, "by": draw.choice(["hour", "day"])}))
+        at = {"timestamp": (draw.choice(moments) + draw.choice([0, S // 3])) / S}
+        found.append(("get_topic_at_time", {"topic": topic, "tolerance_s": 2.0, **at}))
     found += [*_about_the_robot(draw, moments)]
     some = found if LONG else draw.sample(found, min(most, len(found)))
     return [("data_time_range", {}), *some]
@@ -134,7 +137,8 @@ def _about_the_robot(draw: Random, moments: Sequence[int]) -> Iterator[Question]
     at = {"timestamp": draw.choice(moments) / S}
     yield "get_position_at", at
     yield "get_velocity_at", at
-    yield "get_transform_at", {"parent": "base_link", "child": "cam", **at}
+    for pair in (("base_link", "cam"), ("odom", "laser"), ("odom", "base_link")):
+        yield "get_transform_at", {**dict(zip(("parent", "child"), pair, strict=True)), **at}
     yield "list_frames", {}
     place = {"x": round(draw.gauss(0, 1), 2), "y": 0, "radius_m": draw.choice([0.3, 1.0])}
     for more in ({}, _window(draw, moments)):
@@ -386,7 +390,7 @@ def arrive(bag_dir: Path, splits: Splits, draw: Random) -> World:
         fill_some(world, draw)
         if draw.random() < 0.3:
             moments = [T0, *(message.log_time for message in halves[name])]
-            check_stored(world, questions(draw, world, moments, most=2))
+            check_stored(world, questions(draw, world.topics(), moments, most=2))
         if fates[name] == "goes":
             (bag_dir / name).unlink()
         else:
@@ -409,7 +413,7 @@ def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[flo
         write(whole, cut(recordings, []))
         uncut, world = memory_of(whole), arrive(bag_dir, splits, draw)
         check_all(world)
-        asking = questions(draw, world, moments, most=10)
+        asking = questions(draw, world.topics(), moments, most=10)
         for (name, given_), reply in zip(asking, check_stored(world, asking), strict=True):
             expected = alike(asked(uncut, whole, name, **given_))
             assert_same_counts(alike(reply), expected, of_means=0.02)
@@ -444,13 +448,13 @@ def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(see
         for _ in range(draw.randint(1, 5)):
             fill_some(world, draw)
             check_all(world)
-            check_stored(world, questions(draw, world, moments, most=4))
+            check_stored(world, questions(draw, world.topics(), moments, most=4))
             change_something(bag_dir, aside, draw)
         world.fill()
         check_all(world)
         again = World.of(bag_dir)
         check_all(again)
-        check_stored(again, questions(draw, again, moments, most=10))
+        check_stored(again, questions(draw, again.topics(), moments, most=10))
         begin = draw.choice(moments)
         window = TimeWindow(begin, begin + draw.randrange(1, 40) * S)
         for topic in again.topics():

@@ -204,25 +204,6 @@ def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
                 assert_same_counts(asked(stored, bag_dir, name, **given_, **SPAN), expected)
 
 
-@pytest.mark.parametrize("last", [3, 6])
-def test_of_one_log_time_the_first_recording_by_name_speaks_first(
-    tmp_path: Path, last: int
-) -> None:
-    """Not that of which the bag, or the part that has several of its bags, ends first."""
-    said = {"a": [(0, "cup"), (1, "dog"), (last, "dog")], "b": [(1, "cup"), (2, "dog"), (4, "cat")]}
-    recordings = {
-        name: [text(T0 + at * S, word, "/chatter") for at, word in words]
-        for name, words in said.items()
-    }
-    assert sightings(recordings) == (2, 2.0)
-    for name, messages in recordings.items():
-        for nth, message in enumerate(messages):
-            write_mcap(tmp_path / name / f"{name}_{nth}.mcap", [message])
-    plain = memory_of(tmp_path)
-    for memory in (plain, with_store(plain, tmp_path), with_store(plain, tmp_path, part=0.5)):
-        assert counted(memory, tmp_path) == (2, 2.0)
-
-
 @pytest.mark.parametrize("recalls", [False, True], ids=["bags", "store"])
 def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool

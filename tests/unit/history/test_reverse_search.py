@@ -229,24 +229,6 @@ def test_a_search_that_runs_out_of_time_has_searched_what_it_says(bag_dir: Path)
     assert min(each for each in reached if each is not None) > T0 + 31 * NS_PER_S
 
 
-@pytest.mark.parametrize("tool", ["find_last_match", "find_matches"])
-def test_a_search_of_many_short_topics_reads_each_where_it_has_messages(
-    tmp_path: Path, tool: str
-) -> None:
-    count = 60
-    write_mcap(
-        tmp_path / "bag.mcap",
-        [boolean(T0 + nth * NS_PER_S, True, topic=f"/door_{nth:02}") for nth in range(count)],
-    )
-    reader = NotingReader()
-    memory = memory_of(tmp_path, reader=reader)
-    if tool == "find_last_match":
-        assert queries.find_last_match(memory, Call(), "/*", "equals", False).found is None
-    else:
-        assert not find_matches(memory, Call(), "/*", "equals", False).sightings
-    assert sum(len(topics) for _, topics in reader.asked) <= 2 * count
-
-
 S = 10**9
 BEGIN = 1_784_030_400  # 12:00 UTC
 HOUR = 3600
