@@ -33,7 +33,7 @@ from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S, write_moving_map
-from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, write
+from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, runs_of, write
 from tests.support.tables import table
 
 SECONDS = 400
@@ -119,6 +119,16 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
             expected = sum(run.messages for run in world.runs_in(room))
             assert rows[room]["seconds"] == pytest.approx(expected, abs=len(world.runs_in(room)))
         assert rows["(elsewhere)"]["seconds"] > 0
+
+
+def test_a_place_may_be_given_with_its_name_alone(
+    memory: Memory, folder: Path, world: World
+) -> None:
+    where = {"corner": {"x": 1.25, "y": 0.0, "radius_m": 0.6}}
+    reply = asked(memory, folder, "visits", where=where, limit=100)
+    inside = [nth for nth in range(SECONDS) if abs(world.x[nth] - 1.25) <= 0.6]
+    assert (reply["where"], reply["total"]) == ("corner", len(runs_of(inside)))
+    assert all(row["closest_m"] == 0 for row in reply["visits"])
 
 
 def test_metres_in_places_by_hour_add_up_to_those_in_them(
