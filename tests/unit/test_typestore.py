@@ -362,3 +362,11 @@ def test_the_cache_of_definitions_is_bounded_by_their_length() -> None:
         assert isinstance(stores.lookup("a_msgs/msg/A", "ros2msg", each.encode()), MessageType)
         assert sum(map(len, cached_texts(stores))) <= MAX_CACHED_BYTES
     assert cached_texts(stores)
+
+
+def test_a_definition_longer_than_the_cache_is_refused_and_not_cached() -> None:
+    stores = Typestores()
+    stores.lookup("a_msgs/msg/A", "ros2msg", b"uint8 x\n")
+    found = stores.lookup("a_msgs/msg/A", "ros2msg", b"#" * (MAX_CACHED_BYTES + 1))
+    assert "larger than" in reason(found)
+    assert cached_texts(stores) == [b"uint8 x\n"]
