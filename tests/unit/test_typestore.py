@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import shutil
 import threading
+from itertools import count
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -205,41 +206,43 @@ module a_msgs {{ module msg {{ struct B {{ octet value; string name; }}; }}; }};
         assert reason(lookup("a_msgs/msg/Nothing", "", ""))
 
 
-class TestHostileDefinitions:
-    def test_a_definition_that_contains_itself(self) -> None:
-        assert "contains itself" in reason(lookup("a_msgs/msg/A", "A inner\n"))
-        loop = f"B b\n{RULE}\nMSG: a_msgs/B\nC[] c\n{RULE}\nMSG: a_msgs/C\nA a\n"
-        assert "contains itself" in reason(lookup("a_msgs/msg/A", loop))
+def nested(depth: int) -> str:
+    """A definition of so many types, each in the one before it."""
+    parts = [f"{RULE}\nMSG: a_msgs/A{n}\nA{n + 1} a\n" for n in range(depth)]
+    return "A0 a\n" + "".join(parts) + f"{RULE}\nMSG: a_msgs/A{depth}\nuint8 x\n"
 
-    def test_a_definition_that_nests_without_end(self) -> None:
-        parts = [f"{RULE}\nMSG: a_msgs/A{n}\nA{n + 1} a\n" for n in range(3000)]
-        whole = "A0 a\n" + "".join(parts) + f"{RULE}\nMSG: a_msgs/A3000\nuint8 x\n"
-        assert f"more than {MAX_NESTING} levels" in reason(lookup("a_msgs/msg/A", whole))
+
+def of_many_parts() -> str:
+    """A definition of parts that are not too long each, but have too many fields in all."""
+    fields = "\n".join(f"uint8 f{n}" for n in range(MAX_STATEMENTS // 2))
+    count = 2 * MAX_MEMBERS // MAX_STATEMENTS + 1
+    parts = [f"{RULE}\nMSG: a_msgs/B{n}\n{fields}\n" for n in range(count)]
+    return "".join(f"B{n} b{n}\n" for n in range(count)) + "".join(parts)
+
+
+class TestHostileDefinitions:
+    @pytest.mark.parametrize(
+        ("whole", "said"),
+        [
+            ("A inner\n", "contains itself"),
+            (f"B b\n{RULE}\nMSG: a_msgs/B\nC[] c\n{RULE}\nMSG: a_msgs/C\nA a\n", "contains itself"),
+            (nested(3000), f"more than {MAX_NESTING} levels"),
+            ("#" * (MAX_TEXT_BYTES + 1), "larger than"),
+            ("\n".join(f"uint8 f{n}" for n in range(20_000)), "too many"),
+            (of_many_parts(), f"more than {MAX_MEMBERS} fields"),
+            ("string[2000000000] s\n", "fixed arrays"),
+            (f"Point[1000000] p\n{RULE}\nMSG: a_msgs/Point\nfloat64 x\n", "fixed arrays"),
+            *((f"wstring{each} x\n", "which is not decoded") for each in ("", "[]", "[2]")),
+        ],
+        ids=count(),
+    )
+    def test_a_definition_without_an_end_or_larger_than_any_is_refused(
+        self, whole: str, said: str
+    ) -> None:
+        assert said in reason(lookup("a_msgs/msg/A", whole))
 
     def test_nesting_up_to_the_bound_is_read(self) -> None:
-        depth = MAX_NESTING - 1
-        parts = [f"{RULE}\nMSG: a_msgs/A{n}\nA{n + 1} a\n" for n in range(depth)]
-        whole = "A0 a\n" + "".join(parts) + f"{RULE}\nMSG: a_msgs/A{depth}\nuint8 x\n"
-        assert isinstance(lookup("a_msgs/msg/A", whole), MessageType)
-
-    def test_a_definition_larger_than_any(self) -> None:
-        assert "larger than" in reason(lookup("a_msgs/msg/A", "#" * (MAX_TEXT_BYTES + 1)))
-
-    def test_a_definition_of_more_lines_than_any(self) -> None:
-        whole = "\n".join(f"uint8 f{n}" for n in range(20_000))
-        assert "too many" in reason(lookup("a_msgs/msg/A", whole))
-
-    def test_a_definition_of_many_parts_with_more_fields_in_all_than_any(self) -> None:
-        fields = "\n".join(f"uint8 f{n}" for n in range(MAX_STATEMENTS // 2))
-        count = 2 * MAX_MEMBERS // MAX_STATEMENTS + 1
-        parts = [f"{RULE}\nMSG: a_msgs/B{n}\n{fields}\n" for n in range(count)]
-        whole = "".join(f"B{n} b{n}\n" for n in range(count)) + "".join(parts)
-        assert f"more than {MAX_MEMBERS} fields" in reason(lookup("a_msgs/msg/A", whole))
-
-    @pytest.mark.parametrize("field", ["string[2000000000] s", "Point[1000000] p"])
-    def test_fixed_arrays_that_would_be_spelled_out(self, field: str) -> None:
-        whole = f"{field}\n{RULE}\nMSG: a_msgs/Point\nfloat64 x\n"
-        assert "fixed arrays" in reason(lookup("a_msgs/msg/A", whole))
+        assert isinstance(lookup("a_msgs/msg/A", nested(MAX_NESTING - 1)), MessageType)
 
     def test_a_large_array_of_numbers_costs_nothing_until_a_payload_contains_it(self) -> None:
         found = lookup("a_msgs/msg/A", "float64[2000000000] x\n")
@@ -247,26 +250,23 @@ class TestHostileDefinitions:
         with pytest.raises(Exception, match="deserialize"):
             found.deserialize(CDR + bytes(16))
 
-    @pytest.mark.parametrize("kind", ["wstring", "wchar", "sequence<wstring>", "wstring<5>"])
-    def test_wide_characters(self, kind: str) -> None:
-        whole = f"module a_msgs {{ module msg {{ struct A {{ {kind} x; }}; }}; }};"
-        assert "which is not decoded" in reason(lookup("a_msgs/msg/A", whole, "ros2idl"))
-
-    @pytest.mark.parametrize("kind", ["wstring", "wstring[]", "wstring[2]"])
-    def test_wide_characters_of_msg_files(self, kind: str) -> None:
-        assert "which is not decoded" in reason(lookup("a_msgs/msg/A", f"{kind} x\n"))
-
     @pytest.mark.parametrize(
-        "statement",
+        ("inside", "said"),
         [
-            "const long X = ((((((1))))));",
-            "const long X = 1 << 99999999999;",
-            "struct A { sequence<sequence<sequence<sequence<long>>>> x; };",
+            *(
+                (f"struct A {{ {kind} x; }};", "which is not decoded")
+                for kind in ("wstring", "wchar", "sequence<wstring>", "wstring<5>")
+            ),
+            # The parser would not come to an end.
+            ("const long X = ((((((1))))));", "is not supported"),
+            ("const long X = 1 << 99999999999;", "is not supported"),
+            ("struct A { sequence<sequence<sequence<sequence<long>>>> x; };", "is not supported"),
         ],
+        ids=count(),
     )
-    def test_idl_on_which_the_parser_would_not_come_to_an_end(self, statement: str) -> None:
-        whole = f"module a_msgs {{ module msg {{ {statement} struct A {{ long y; }}; }}; }};"
-        assert "is not supported" in reason(lookup("a_msgs/msg/A", whole, "ros2idl"))
+    def test_idl_that_cannot_be_read_is_refused(self, inside: str, said: str) -> None:
+        whole = f"module a_msgs {{ module msg {{ {inside} struct B {{ long y; }}; }}; }};"
+        assert said in reason(lookup("a_msgs/msg/A", whole, "ros2idl"))
 
     @pytest.mark.parametrize(
         "text", ["/* " * 200_000, '"' + r"\"" * 200_000, "@a(" * 200_000], ids=["/*", '"', "@"]

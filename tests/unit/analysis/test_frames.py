@@ -190,24 +190,6 @@ def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> No
 # What is left out
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        edge("base", "/base", 103 * S + 1),
-        edge("base", "/base", 103 * S + 1, static=True),
-        edge("", "base", 103 * S + 1),
-        edge("", "odom", 103 * S + 1, static=True),
-        edge("odom", "/", 103 * S + 1),
-        # A leading slash is no part of a name.
-        edge("/odom", "/base", 103 * S + 1, 3.0),
-    ],
-)
-def test_an_invalid_transform_is_left_out(bad: StampedTransform) -> None:
-    tree = Tree([*moving(), bad])
-    assert "there are: base, odom" in refusal(tree, "odom", "zzz", 103 * S).detail
-    assert shift(tree, "odom", "base", 103 * S + 1) == pytest.approx(3.0)
-
-
 # Refusals
 
 

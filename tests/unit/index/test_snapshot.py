@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.index import timeline as timelines
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
+from ros2_memory.index.timeline import Timeline
 from tests.support.listed_bags import odom_bag
 
 S = 10**9
@@ -32,23 +31,6 @@ def _bag(
         silent=silent,
     )
     return BagFile(name, 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
-
-
-def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> None:
-    bags = [
-        _bag(f"rec/rec_{nth}.mcap", ("/odom", nth, nth))._replace(
-            size=nth, state=BagState.INCOMPLETE if nth % 3 == 0 else BagState.CLOSED
-        )
-        for nth in range(SEGMENT_BAGS + 10)
-    ]
-    carried = _bag(f"{CARRY_FOLDER}/{CARRY_FILE}", ("/tf_static", -5, -5))._replace(size=7)
-    whole = Timeline.of([carried, *bags])
-    snapshot = Snapshot(whole)
-    left_open = sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags)
-    assert snapshot.timeline.disk_use == (sum(bag.size for bag in snapshot.bags), left_open)
-    assert len(snapshot.bags) == len(bags)
-    assert Timeline.of([carried]).disk_use == (7, 0)
-    assert Timeline().disk_use == (0, 0)
 
 
 def test_what_is_absent_within_a_bag_leaves_the_other_topics_of_it_alone() -> None:
