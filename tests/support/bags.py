@@ -195,7 +195,11 @@ def mcap_content(
 
 
 def write_splits(
-    bag_dir: Path, messages: Iterable[Msg], split_s: float = 10.0, name: str = "rec"
+    bag_dir: Path,
+    messages: Iterable[Msg],
+    split_s: float = 10.0,
+    name: str = "rec",
+    layout: McapLayout | None = None,
 ) -> None:
     """Writes a recording in splits of so many seconds, numbered from 1,784,000,000 s on."""
     splits: dict[int, list[Msg]] = {}
@@ -203,7 +207,7 @@ def write_splits(
         number = int((each.log_time / 1e9 - 1_784_000_000) // split_s)
         splits.setdefault(number, []).append(each)
     for number, some in splits.items():
-        write_mcap(bag_dir / name / f"{name}_{number}.mcap", some)
+        write_mcap(bag_dir / name / f"{name}_{number}.mcap", some, layout)
 
 
 def write_db3(

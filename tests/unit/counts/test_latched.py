@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.support.bags import McapLayout, Msg, battery, boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, battery, boolean, odom, text, write_splits
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
 
@@ -19,10 +19,6 @@ DOCKED, BUMPER = "/docked", "/bumper"
 TOGGLES = ((0, False), (100, True), (400, False), (700, True))
 
 
-def at_log_time(message: Msg) -> int:
-    return message.log_time
-
-
 @pytest.fixture(scope="module")
 def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """1000 s of a robot that says latched when it docks, and every 4 s whether it bumped."""
@@ -30,11 +26,7 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     messages = [odom(T0 + at * S, 0.0, 0.0) for at in range(0, 1001, 2)]
     messages += [boolean(T0 + at * S, value, DOCKED) for at, value in TOGGLES]
     messages += [boolean(T0 + at * S, at >= 700, BUMPER) for at in range(0, 1001, 4)]
-    messages.sort(key=lambda each: each.log_time)
-    for nth in range(2):
-        some = [each for each in messages if (each.log_time - T0) // (600 * S) == nth]
-        layout = McapLayout(latched=frozenset({DOCKED}))
-        write_mcap(folder / "rec" / f"rec_{nth}.mcap", some, layout)
+    write_splits(folder, messages, 600, layout=McapLayout(latched=frozenset({DOCKED})))
     return folder
 
 
@@ -85,8 +77,7 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     said = ((0, "auto"), (45, "manual"), (70, "auto 2"), (85, "auto 3"))
     messages += [text(T0 + at * S, words, "/mode") for at, words in said]
     messages += [odom(T0 + at * S, at / 10, 0.0) for at in range(101)]
-    layout = McapLayout(latched=frozenset({"/mode"}))
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", sorted(messages, key=at_log_time), layout)
+    write_splits(tmp_path, messages, 600, layout=McapLayout(latched=frozenset({"/mode"})))
     memory = memory_of(tmp_path, recalls=recalls)
     bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
     auto = {"topic": "/mode", "condition_type": "contains", "value": "auto", "while": bumped}
@@ -146,11 +137,8 @@ def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
     beats = [odom(T0 + at * S // 10, 0.0, 0.0) for at in (*range(1000), *range(1030, 2001))]
     beats += [battery(T0 + at * S + 1, 0.5) for at in (*range(100), *range(103, 200))]
     said = [boolean(T0 + at * S, value, DOCKED) for at, value in ((0, False), (10, True))]
-    messages = sorted([*beats, *said], key=at_log_time)
     layout = McapLayout(latched=frozenset({DOCKED}))
-    for nth in range(4):
-        split = [each for each in messages if min((each.log_time - T0) // (50 * S), 3) == nth]
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", split, layout)
+    write_splits(tmp_path, [*beats, *said], 50, layout=layout)
     memory = memory_of(tmp_path, recalls=recalls)
     window = {"topic": DOCKED, "start": T0 / S, "end": T0 / S + 200}
     is_true = {**window, "condition_type": "equals", "value": True}

@@ -23,7 +23,7 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock
 from tests.support.column_worlds import World
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, memory_of
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -201,6 +201,20 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_pa
     assert named["file"] == "rec/rec_2.mcap"
     rows = queries.list_recorded_topics(memory, Call())
     assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
+
+
+def test_a_chunk_that_is_lost_of_a_closed_bag_is_reported_in_windows_that_touch_the_bag(
+    tmp_path: Path,
+) -> None:
+    paths = write_splits(tmp_path, 3)
+    spoil_chunk(paths[1], 3)
+    os.utime(paths[1], ns=(T0 + 20 * S,) * 2)
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    window = {"topic": "/odom", "start": at(2), "end": at(25)}
+    told = notes_of(asked(memory, tmp_path, "get_topic_in_range", **window))
+    assert any(note.startswith("rec/rec_1.mcap could not be read whole: ") for note in told)
+    recalled = with_store(memory, tmp_path)
+    assert told == notes_of(asked(recalled, tmp_path, "get_topic_in_range", **window))
 
 
 @pytest.mark.parametrize("last", [9, 30], ids=["other topics go on", "the topic goes on"])

@@ -24,7 +24,7 @@ from tests.support.bags import (
     odom,
     stamp,
     text,
-    write_mcap,
+    write_splits,
 )
 from tests.support.housekeepers import keeper_of
 from tests.support.memories import each_way, memory_of
@@ -62,14 +62,8 @@ def every(period_s: float, seconds: float, topic: str, begin: int = T0) -> list[
     return [text(begin + round(n * period_s * S), str(n), topic) for n in range(count)]
 
 
-def record(folder: Path, messages: list[Msg], layout: McapLayout = TRANSIENT) -> None:
-    """In splits of ten seconds."""
-    folder.mkdir(parents=True, exist_ok=True)
-    by_split: dict[int, list[Msg]] = {}
-    for each in sorted(messages, key=lambda message: message.log_time):
-        by_split.setdefault((each.log_time - T0) // (10 * S), []).append(each)
-    for nth, some in by_split.items():
-        write_mcap(folder / f"{folder.name}_{nth}.mcap", some, layout)
+def record(bag_dir: Path, messages: list[Msg]) -> None:
+    write_splits(bag_dir, messages, layout=TRANSIENT)
 
 
 def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
@@ -89,7 +83,7 @@ def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
 @each_way
 def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls: bool) -> None:
     telemetry = every(0.01, 7, TELEMETRY)
-    record(tmp_path / "rec", [*telemetry, *drive(T0, T0 + 60 * S)])
+    record(tmp_path, [*telemetry, *drive(T0, T0 + 60 * S)])
     memory = remembered(tmp_path, recalls=recalls)
     assert reply(memory, TELEMETRY, T0 + 3 * S)["timestamp"] == unix_from_ns(T0 + 3 * S)
     assert "latched" not in reply(memory, TELEMETRY, T0 + 3 * S)
@@ -114,7 +108,7 @@ def test_what_is_published_every_five_seconds_or_less_often_holds(
     tmp_path: Path, latched_s: list[float], drive_s: int, holds: bool
 ) -> None:
     latched = [text(T0 + round(at * S), "office", MAP) for at in latched_s]
-    record(tmp_path / "rec", [*latched, *drive(T0, T0 + drive_s * S)])
+    record(tmp_path, [*latched, *drive(T0, T0 + drive_s * S)])
     found = reply(remembered(tmp_path), MAP, latched[-1].log_time + 3 * S)
     assert ("error" not in found) is holds
     if holds:
@@ -123,7 +117,7 @@ def test_what_is_published_every_five_seconds_or_less_often_holds(
 
 def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) -> None:
     telemetry = every(0.1, 7, TELEMETRY)
-    record(tmp_path / "rec", [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
+    record(tmp_path, [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
     latching = Latching(include=("/fmu/*",), exclude=(MAP,))
     memory = remembered(tmp_path, latching=latching)
     assert reply(memory, TELEMETRY, T0 + 59 * S)["latched"] is True
@@ -134,7 +128,7 @@ def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) 
 
 def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None:
     bump = boolean(T0 + 20 * S, True)
-    record(tmp_path / "rec", [text(T0, "office", MAP), bump, *drive(T0, T0 + 60 * S)])
+    record(tmp_path, [text(T0, "office", MAP), bump, *drive(T0, T0 + 60 * S)])
     memory = remembered(tmp_path)
     found = value_when(memory, Call(), MAP, "/bumper", condition_type="equals", value=True)
     shown = json.loads(Replies(tmp_path, 24_000).answer(found).text)
@@ -142,7 +136,7 @@ def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None
 
 
 def test_a_pose_that_is_latched_says_so(tmp_path: Path) -> None:
-    record(tmp_path / "rec", [odom(T0, 1.0, 2.0), text(T0 + 60 * S, "later", "/words")])
+    record(tmp_path, [odom(T0, 1.0, 2.0), text(T0 + 60 * S, "later", "/words")])
     memory = remembered(tmp_path, latching=Latching(include=("/odom",)))
     found = position(memory, Call(), AtTime(unix_from_ns(T0 + 30 * S)))
     assert [note for note in found.notes if "/odom is latched" in note and "30" in note]
@@ -154,7 +148,7 @@ def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
     """However often it is published; and then it is no more latched than before."""
     telemetry = every(0.01, 7, TELEMETRY)
     messages = [text(T0, "office", MAP), log_line(T0 + S), *telemetry, *drive(T0, T0 + 30 * S)]
-    record(tmp_path / "rec", messages)
+    record(tmp_path, messages)
     keeper_of(tmp_path, max_bytes=1).apply()
     carried = tmp_path / "latched/carried.mcap"
     topics = [TELEMETRY, MAP, ROSOUT]

@@ -16,15 +16,13 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.heartbeat import (
     HEARTBEAT_FILE,
-    Heartbeat,
-    RecorderState,
-    write_heartbeat,
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
+from tests.support.heartbeats import beat
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 if TYPE_CHECKING:
@@ -161,10 +159,7 @@ class World:
 
     def _beat(self, path: Path, number: int) -> None:
         recordings = FOLDERS[1 : number + 1]
-        beat = Heartbeat(
-            1, self.clock.at, RecorderState.RECORDING, recordings, NOW, 0, (), (), None, 2.0
-        )
-        write_heartbeat(self.root, beat)
+        beat(self.root, self.clock.at, recordings=recordings, since=NOW)
 
     def _stamp(self, path: Path) -> None:
         """The file system's clock is the test's: it stamps what was touched."""

@@ -23,7 +23,6 @@ from ros2_memory.bag_dir.handover_file import (
     Overlap,
     write_handover,
 )
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
@@ -33,6 +32,7 @@ from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
 
@@ -116,10 +116,7 @@ class Tail:
 
     def beat(self, *recordings: str) -> None:
         """A live recorder says that it writes these recordings alone."""
-        at = self.clock.at
-        state = RecorderState.RECORDING
-        beat = Heartbeat(1, at, state, recordings, at, 0, (), (), None, interval_s=2.0)
-        write_heartbeat(self.bag_dir, beat)
+        beat(self.bag_dir, self.clock.at, recordings=recordings)
 
     def ticks(self, view: View | None = None) -> list[int]:
         """Which messages a question about all of time finds, by their publish times."""

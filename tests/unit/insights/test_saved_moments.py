@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
     PendingRequest,
@@ -33,6 +33,7 @@ from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 from tests.support.housekeepers import keeper_of, recorder_at_work
 from tests.support.memories import asked, memory_of
 
@@ -60,10 +61,6 @@ def remembering(bag_dir: Path, limits: QuerySettings = RECORDS) -> Memory:
     return memory_of(bag_dir, clock=SettableClock(NOW), limits=limits)
 
 
-def beating(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, at: int = NOW) -> None:
-    write_heartbeat(bag_dir, Heartbeat(1, at, state, (), at, 0, (), (), None, 2.0))
-
-
 def remember(memory: Memory, call: Call | None = None) -> RememberedMoment:
     return remember_moment(
         memory, call or Call(), "charger found", seconds_before=30, seconds_after=0
@@ -87,7 +84,7 @@ def requests(bag_dir: Path) -> list[Path]:
 
 def test_a_moment_is_kept_by_the_recorder_and_then_listed(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path)
+    beat(tmp_path, NOW)
     with recorder_at_work(tmp_path, SettableClock(NOW)):
         told = remember(memory)
     assert (told.label, told.start, told.end) == ("charger found", T0 + 30 * S, NOW)
@@ -119,7 +116,7 @@ def test_a_moment_is_kept_by_the_recorder_and_then_listed(tmp_path: Path) -> Non
 
 def test_what_the_recorder_refuses_is_reported_with_its_reason(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path)
+    beat(tmp_path, NOW)
     (tmp_path / MOMENTS_FOLDER).symlink_to(tmp_path)
     with recorder_at_work(tmp_path, SettableClock(NOW)):
         assert "symbolic link" in refusal(memory)
@@ -137,7 +134,7 @@ def test_a_recorder_that_does_not_run_is_not_asked(
 ) -> None:
     memory = remembering(tmp_path)
     assert "start ros2-memory-recorder" in refusal(memory)
-    beating(tmp_path, state, at)
+    beat(tmp_path, at, state)
     assert "start ros2-memory-recorder" in refusal(memory)
     assert requests(tmp_path) == []
 
@@ -146,7 +143,7 @@ def test_a_recorder_that_does_not_answer_is_not_waited_for_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path)
+    beat(tmp_path, NOW)
     monkeypatch.setattr(saved_moments, "ANSWER_TIMEOUT_S", 0.0)
     assert "did not answer" in refusal(memory)
     assert requests(tmp_path) == []
@@ -154,7 +151,7 @@ def test_a_recorder_that_does_not_answer_is_not_waited_for_for_ever(
 
 def test_a_call_that_is_over_withdraws_its_request(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path)
+    beat(tmp_path, NOW)
     assert "did not answer" in refusal(memory, Call(Deadline.after(-1)))
     assert requests(tmp_path) == []
 
@@ -163,7 +160,7 @@ def test_a_request_that_was_begun_just_in_time_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path)
+    beat(tmp_path, NOW)
     house = keeper_of(tmp_path, clock=SettableClock(NOW))
     withdraw = PendingRequest.withdraw
 
@@ -178,7 +175,7 @@ def test_a_request_that_was_begun_just_in_time_is_waited_for(
 
 def test_a_server_that_may_not_write_there_says_where(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path)
+    beat(tmp_path, NOW)
     (tmp_path / ".episodic").write_text("in the way")
     assert ".episodic/requests" in refusal(memory)
 

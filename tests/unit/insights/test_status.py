@@ -8,7 +8,7 @@ import pytest
 from mcap.writer import Writer
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.state_files import (
     SCREENED,
     Excluded,
@@ -29,6 +29,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
@@ -58,22 +59,6 @@ def remembering(
     return memory_of(folder, clock=clock, limits=QuerySettings(kept=kept))
 
 
-def beating(folder: Path, state: RecorderState, at: float, **more: Any) -> None:
-    beat = Heartbeat(
-        pid=1,
-        updated=BEGIN + round(at * S),
-        state=state,
-        recordings=(),
-        since=BEGIN,
-        bytes_written=0,
-        subscribed=("/a", "/b"),
-        silent=("/b",),
-        last_error=None,
-        interval_s=2.0,
-    )
-    write_heartbeat(folder, replace(beat, **more))
-
-
 def shown(memory: Memory, folder: Path) -> dict[str, Any]:
     reply: dict[str, Any] = asked(memory, folder, "memory_status")
     return reply
@@ -85,7 +70,7 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     splits = [log_entry(BEGIN + t * S, 20, "rosbag2_recorder", "opened") for t in range(0, 60, 10)]
     memory = remembering(tmp_path, [*driven, *splits])
     assert shown(memory, tmp_path)["newest_age_s"] == 10.0  # of whoever recorded this
-    beating(tmp_path, RecorderState.RECORDING, 59)
+    beat(tmp_path, BEGIN + 59 * S)
     told = shown(memory, tmp_path)
     assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
     assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["doubts"]
@@ -98,7 +83,7 @@ def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole
     tmp_path: Path,
 ) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path, RecorderState.RECORDING, 59, lost={"/odom": 7})
+    beat(tmp_path, BEGIN + 59 * S, lost={"/odom": 7})
     append_losses(
         tmp_path,
         [
@@ -132,7 +117,7 @@ def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Pat
         messages = [odom(BEGIN + t * S // 2, 0.0, 0.0, 0.0) for t in seconds]
         write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
     memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 36 * S))
-    beating(tmp_path, RecorderState.RECORDING, 35)
+    beat(tmp_path, BEGIN + 35 * S)
     assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
     append_losses(tmp_path, [Loss("*", BEGIN + 9 * S, BEGIN + 24 * S, 0, "hung")])
     assert shown(memory, tmp_path)["doubts"] == (
@@ -166,7 +151,7 @@ def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_p
 
 def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
-    beating(tmp_path, RecorderState.RECORDING, 59, held_back="1 split is not served")
+    beat(tmp_path, BEGIN + 59 * S, held_back="1 split is not served")
     SCREENED.write(tmp_path, ScreenState(excluded=[Excluded(0, 10**9)]))
     told = shown(memory, tmp_path)
     assert told["doubts"] == "1 split is not served"
@@ -181,7 +166,7 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
 ) -> None:
     memory = remembering(tmp_path, seconds=1e6)
     memory = replace(memory, limits=replace(memory.limits, now=now))
-    beating(tmp_path, RecorderState.RECORDING, 1)
+    beat(tmp_path, BEGIN + 1 * S)
     reply = shown(memory, tmp_path)
     assert (reply["recorder"], reply["recorder_alive"]) == told
     assert ("the recorder died" in reply["doubts"]) == (now == "wall")
@@ -212,10 +197,10 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
 
 def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
     memory = remembering(tmp_path, kept=RetentionLimits(10**6, 7 * DAY))
-    beating(tmp_path, RecorderState.RECORDING, 59, counted_bytes=4_900_000, state_bytes=4_700_000)
+    beat(tmp_path, BEGIN + 59 * S, counted_bytes=4_900_000, state_bytes=4_700_000)
     budget = shown(memory, tmp_path)["budget"]
     assert (budget["used_gb"], budget["state_gb"]) == (0.0049, 0.0047)
-    beating(tmp_path, RecorderState.RECORDING, 59, counted_bytes=200_000, state_bytes=50_000)
+    beat(tmp_path, BEGIN + 59 * S, counted_bytes=200_000, state_bytes=50_000)
     budget = shown(memory, tmp_path)["budget"]
     assert (budget["used_gb"], budget["state_gb"]) == (0.0002, 0.00005)
 
@@ -288,8 +273,7 @@ class TestWhatIsMissingIsNamedAndCounted:
         assert young not in doubts(memory)
         # So is one that a live recorder names.
         assert young in doubts(memory_of(tmp_path, clock=clock))
-        named = {"updated": clock.now(), "recordings": ("rec",)}
-        beating(tmp_path, RecorderState.RECORDING, 0, **named)
+        beat(tmp_path, clock.now(), recordings=("rec",))
         assert young not in doubts(memory_of(tmp_path, clock=clock))
 
     def test_files_that_are_not_read(self, tmp_path: Path) -> None:
@@ -347,14 +331,14 @@ class TestWhatIsMissingIsNamedAndCounted:
         listed = [(f"rec_{n}.mcap", 5) for n in range(-3, 3)]
         self.recording(tmp_path / "rec", *listed)
         assert "lists 4 missing files" in self.doubts(tmp_path)
-        beating(tmp_path, RecorderState.STOPPED, 59)
+        beat(tmp_path, BEGIN + 59 * S, RecorderState.STOPPED)
         assert "lists 1 missing file and 5 messages" in self.doubts(tmp_path)
 
     def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
         self, tmp_path: Path
     ) -> None:
         self.recording(tmp_path / "rec", *((f"rec_{n}.mcap", 5) for n in range(-3, 3)))
-        beating(tmp_path, RecorderState.STOPPED, 59)
+        beat(tmp_path, BEGIN + 59 * S, RecorderState.STOPPED)
         own = tmp_path / ".episodic" / "recordings.jsonl"
         own.parent.mkdir()
         inode = (tmp_path / "rec").stat().st_ino
