@@ -20,9 +20,8 @@ from tests.support.bags import (
     McapLayout,
     Msg,
     boolean,
-    make,
+    log_entry,
     odom,
-    stamp,
     text,
     write_splits,
 )
@@ -37,20 +36,6 @@ S = 10**9
 T0 = 1_790_000_000 * S
 MAP, TELEMETRY, ROSOUT = "/map_name", "/fmu/out/vehicle_status", "/rosout"
 TRANSIENT = McapLayout(latched=frozenset({MAP, TELEMETRY, ROSOUT, "/tf_static"}))
-
-
-def log_line(at: int) -> Msg:
-    body = make(
-        "rcl_interfaces/msg/Log",
-        stamp=stamp(at),
-        level=20,
-        name="nav",
-        msg="hello",
-        file="",
-        function="",
-        line=1,
-    )
-    return Msg(ROSOUT, "rcl_interfaces/msg/Log", at, body)
 
 
 def drive(start: int, stop: int) -> list[Msg]:
@@ -147,7 +132,12 @@ def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
 ) -> None:
     """However often it is published; and then it is no more latched than before."""
     telemetry = every(0.01, 7, TELEMETRY)
-    messages = [text(T0, "office", MAP), log_line(T0 + S), *telemetry, *drive(T0, T0 + 30 * S)]
+    messages = [
+        text(T0, "office", MAP),
+        log_entry(T0 + S, 20, "nav", "hello"),
+        *telemetry,
+        *drive(T0, T0 + 30 * S),
+    ]
     record(tmp_path, messages)
     keeper_of(tmp_path, max_bytes=1).apply()
     carried = tmp_path / "latched/carried.mcap"
