@@ -215,7 +215,6 @@ def write_db3(
     messages: Iterable[Msg],
     *,
     definitions: bool = True,
-    latched: Collection[str] = ("/tf_static",),
 ) -> Path:
     """Writes one sqlite3 split with rosbag2's schema version 4."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -243,7 +242,7 @@ def write_db3(
         key = (message.topic, message.type)
         if key not in topics:
             topics[key] = len(topics) + 1
-            qos = TRANSIENT_LOCAL if message.topic in latched else VOLATILE
+            qos = TRANSIENT_LOCAL if message.topic == "/tf_static" else VOLATILE
             base.execute(
                 "INSERT INTO topics VALUES (?,?,?,?,?,?)", (topics[key], *key, "cdr", qos, "")
             )
@@ -392,7 +391,7 @@ def diagnostics(ns: int, **levels: tuple[int, str]) -> Msg:
     return Msg("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", ns, body)
 
 
-def goals(ns: int, statuses: Mapping[int, int], topic: str = "/drive/_action/status") -> Msg:
+def goals(ns: int, statuses: Mapping[int, int]) -> Msg:
     """A GoalStatusArray with the status of each goal: 2 executing, 4 succeeded, 6 aborted."""
     listed = []
     for number, status in statuses.items():
@@ -401,7 +400,7 @@ def goals(ns: int, statuses: Mapping[int, int], topic: str = "/drive/_action/sta
         info = make("action_msgs/msg/GoalInfo", goal_id=goal_id, stamp=stamp(ns))
         listed.append(make("action_msgs/msg/GoalStatus", goal_info=info, status=status))
     body = make("action_msgs/msg/GoalStatusArray", status_list=listed)
-    return Msg(topic, "action_msgs/msg/GoalStatusArray", ns, body)
+    return Msg("/drive/_action/status", "action_msgs/msg/GoalStatusArray", ns, body)
 
 
 def battery(ns: int, percentage: float, log_time: int | None = None) -> Msg:

@@ -9,14 +9,13 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.handover import settle_handover, unsettled_handovers
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
     from pathlib import Path
 
     from ros2_memory.storage.base import BagReader
 
 
-def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) -> None:
-    """Settles what can be settled while these recordings are being written."""
+def recover_handovers(bag_dir: Path, reader: BagReader) -> None:
+    """Settles what can be settled while no recording is being written."""
     for old, new in unsettled_handovers(bag_dir):
         with suppress(RecorderError):
-            settle_handover(old, new, reader, running)
+            settle_handover(old, new, reader, ())

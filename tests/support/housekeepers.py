@@ -171,7 +171,7 @@ def lines(bag_dir: Path) -> list[dict[str, Any]]:
     return [{key: value for key, value in row.items() if key != "crc32"} for row in rows]
 
 
-def embedding(path: Path, *, start: int = 1_790_000_000 * S, size: int = 20) -> Path:
+def embedding(path: Path, *, start: int = 1_790_000_000 * S) -> Path:
     """A split as rosbag2 writes it since Iron: its metadata right behind the header."""
     text = (
         "version: 9\nstorage_identifier: mcap\nrelative_file_paths:\n"
@@ -184,7 +184,7 @@ def embedding(path: Path, *, start: int = 1_790_000_000 * S, size: int = 20) -> 
         writer.add_metadata("rosbag2", {"serialized_metadata": text})
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
         channel = writer.register_channel("/chatter", "cdr", schema, {})
-        for number in range(size):
+        for number in range(20):
             at = start + number * S // 4
             writer.add_message(channel, at, b"\0\1\0\0\2\0\0\0x\0", at, number)
         writer.finish()

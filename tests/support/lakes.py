@@ -35,9 +35,7 @@ from tests.support.memories import extractor, memory_of, with_store
 LATER: Final = (START_S + 86_400) * NS_PER_S
 
 
-def write_bag(
-    bag_dir: Path, number: int, *, at_s: int | None = None, most: int = 3, recording: str = "rec"
-) -> Path:
+def write_bag(bag_dir: Path, number: int, *, at_s: int | None = None, most: int = 3) -> Path:
     """A bag with numbered texts, one for each second, and a cup that is seen."""
     first = START_S + 10 * number if at_s is None else at_s
     messages: list[Msg] = [detections(first * NS_PER_S, ["cup"])]
@@ -45,7 +43,7 @@ def write_bag(
     own = bag_dir / LIST_FILE
     own.parent.mkdir(parents=True, exist_ok=True)
     own.touch()  # a recorder has recorded here
-    return write_mcap(bag_dir / recording / f"{recording}_{number}.mcap", messages)
+    return write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
 
 
 def robot_bags(

@@ -56,14 +56,14 @@ def spoil_chunk(path: Path, number: int) -> None:
     path.write_bytes(data)
 
 
-def change_index(path: Path, chunk: ChunkIndex, at: int, value: int, nth: int = 0) -> None:
-    """Overwrites a number of the first message index of a chunk.
+def change_index(path: Path, chunk: ChunkIndex, at: int, value: int) -> None:
+    """Overwrites a number of the first message that a chunk's index has.
 
-    `at` is 0 for a log time and 8 for a place, `nth` of which message.
+    `at` is 0 for its log time and 8 for its place.
     """
     data = bytearray(path.read_bytes())
     index_at = min(chunk.message_index_offsets.values())
-    struct.pack_into("<Q", data, index_at + 15 + 16 * nth + at, value)
+    struct.pack_into("<Q", data, index_at + 15 + at, value)
     path.write_bytes(data)
 
 

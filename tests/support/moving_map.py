@@ -39,7 +39,6 @@ def moving_map(
     draw: Random,
     seconds: int,
     *,
-    ahead_s: float = 0.3,
     noise_m: float = 0.0,
     drift_m: float = 0.004,
     rate: int = 5,
@@ -82,7 +81,7 @@ def moving_map(
         messages.append(odom(at, ox, oy, heading - turn, vx=0.0 if stands else 0.4))
         base = transform(at, "odom", "base_link", (ox, oy, 0.0), heading - turn)
         messages.append(tf(at, base))
-        ahead = at + round(ahead_s * S)
+        ahead = at + round(0.3 * S)
         correction = transform(ahead, "map", "odom", (dx, dy, 0.0), turn)
         messages.append(tf(ahead, correction, log_time=at + 3 * MS))
         if step % rate == 0:

@@ -37,10 +37,10 @@ def plain(
     return path
 
 
-def grow(path: Path, *times: int, topic: str = "/odom") -> None:
+def grow(path: Path, *times: int) -> None:
     """Appends messages to an open bag, as its recorder does."""
     with path.open("a", encoding="utf-8") as stream:
-        stream.writelines(f"{topic} nav_msgs/msg/Odometry {time}\n" for time in times)
+        stream.writelines(f"/odom nav_msgs/msg/Odometry {time}\n" for time in times)
 
 
 def close(path: Path) -> None:

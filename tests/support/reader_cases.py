@@ -56,7 +56,6 @@ class Shelf:
     write: Callable[[Path, Iterable[Msg], Collection[tuple[str, str]]], Path]
     suffix: str = ".mcap"
     keeps_publish_time: bool = True
-    writes_silent_topics: bool = True  # a chunk without messages is not written
 
     def __str__(self) -> str:
         return self.name
@@ -103,13 +102,9 @@ def _compressed(
     return path
 
 
-def _mcap_shelf(name: str, layout: McapLayout) -> Shelf:
-    silent = layout.repeat_channels or layout.chunk_size is None
-    write = partial(_mcap, layout)
-    return Shelf(f"mcap: {name}", McapReader, write, writes_silent_topics=silent)
-
-
-MCAP: Final = [_mcap_shelf(name, layout) for name, layout in LAYOUTS.items()]
+MCAP: Final = [
+    Shelf(f"mcap: {name}", McapReader, partial(_mcap, layout)) for name, layout in LAYOUTS.items()
+]
 ROSBAG2: Final = [
     Shelf("rosbag2: mcap", Rosbag2Reader, partial(_mcap, McapLayout())),
     Shelf("rosbag2: db3", Rosbag2Reader, _db3, ".db3", keeps_publish_time=False),

@@ -117,9 +117,9 @@ def asked(bag_dir: Path, label: str = "here", at: int = T0) -> PendingRequest:
     return posted
 
 
-def refuse_all(queue: RequestQueue, now: int = T0) -> int:
-    """Answers what is asked for then; returns how much that is."""
-    requests = [*queue.take(now)]
+def refuse_all(queue: RequestQueue) -> int:
+    """Answers what is asked for; returns how much that is."""
+    requests = [*queue.take(T0)]
     for request in requests:
         queue.answer(request.number, Outcome(refused="no"))
     return len(requests)
@@ -127,20 +127,6 @@ def refuse_all(queue: RequestQueue, now: int = T0) -> int:
 
 def names(bag_dir: Path) -> list[str]:
     return sorted(path.name for path in (bag_dir / REQUESTS_FOLDER).iterdir())
-
-
-def test_a_request_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> None:
-    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
-    assert queue.has_requests()
-    [request] = queue.take(T0)
-    assert request == posted.request
-    assert posted.outcome() is None
-    outcome = Outcome("20261120T050000Z-here", 3, pending=True)
-    queue.answer(request.number, outcome)
-    assert posted.outcome() == outcome
-    posted.close()
-    assert names(tmp_path) == []
-    assert not queue.has_requests()
 
 
 def test_a_request_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:

@@ -65,13 +65,6 @@ def restored(folder: Path) -> None:
     shutil.rmtree(aside)
 
 
-def test_a_disk_that_only_root_may_open_a_part_of_is_looked_through(tmp_path: Path) -> None:
-    for folder in ("rec", "lost+found", ".hidden"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "x_0.mcap").touch()
-    assert [*own_recordings.folders_with_bags(tmp_path)] == [tmp_path / "rec"]
-
-
 class TestWhatARecorderLists:
     def test_the_name_before_the_child_starts_and_its_directory_once_it_is_there(
         self, tmp_path: Path

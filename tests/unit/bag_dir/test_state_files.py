@@ -9,7 +9,6 @@ import errno
 import os
 import re
 import stat
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir import state_files
-from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog, Line
+from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog
 from ros2_memory.bag_dir.own_recordings import LIST
 from ros2_memory.bag_dir.state_files import (
     DELETED,
@@ -307,28 +306,6 @@ def test_what_a_week_of_bags_or_a_condition_that_flickers_makes_is_read_back(
 ) -> None:
     document.write(tmp_path, value)
     assert document.read(tmp_path) == value
-
-
-def test_a_file_is_read_again_once_it_has_changed_and_not_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reads: list[Path] = []
-    lines = LOST.lines
-
-    def counting(bag_dir: Path) -> Iterator[Line[Loss]]:
-        reads.append(bag_dir)
-        return lines(bag_dir)
-
-    monkeypatch.setattr(LOST, "lines", counting)
-    loss = Loss("/odom", 1, 5, 2, "stamps")
-    assert read_losses(tmp_path, 0, 9) == []
-    for number in (1, 2):
-        append_losses(tmp_path, [loss])
-        reads.clear()
-        assert [read_losses(tmp_path, 0, 9) for _ in range(3)] == [[loss] * number] * 3
-        assert len(reads) == 1
-    (tmp_path / LOST.name).unlink()
-    assert read_losses(tmp_path, 0, 9) == []
 
 
 def test_losses_are_those_of_a_window_and_the_oldest_are_dropped(

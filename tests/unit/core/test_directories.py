@@ -8,20 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.core.directories import is_folder, mode_of
+from ros2_memory.core.directories import is_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-
-def test_a_link_to_a_directory_and_a_file_are_none(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "file").touch()
-    (tmp_path / "link").symlink_to(tmp_path / "folder")
-    (tmp_path / "broken").symlink_to(tmp_path / "nowhere")
-    names = ("folder", "file", "link", "broken", "nothing", "file/below")
-    assert [name for name in names if is_folder(tmp_path / name)] == ["folder"]
-    assert [name for name in names if not mode_of(tmp_path / name)] == ["nothing", "file/below"]
 
 
 def test_what_the_disk_does_not_tell_is_not_taken_for_missing(

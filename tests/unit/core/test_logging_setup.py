@@ -56,21 +56,6 @@ def log_failure(reason: str) -> None:
         get_logger("ours").exception("scan failed")
 
 
-@pytest.mark.parametrize(
-    ("level", "logged"),
-    [("debug", ["info", "warning"]), ("info", ["warning"]), ("error", [])],
-)
-def test_the_end_of_a_request_is_no_event_and_a_warning_of_its_library_is(
-    level: Literal["debug", "info", "error"], logged: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    theirs = logging.getLogger(transport.__name__)
-    assert transport.logger is theirs
-    configure_logging(level, "json")
-    theirs.info("Terminating session: None")
-    theirs.warning("a stream was closed")
-    assert [event["level"] for event in events(capsys)] == logged
-
-
 @pytest.mark.parametrize("layout", ["json", "pretty"])
 def test_an_exception_does_not_show_local_variables(
     layout: str, capsys: pytest.CaptureFixture[str]

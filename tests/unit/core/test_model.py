@@ -29,13 +29,6 @@ def test_a_window_of_two_timestamps_holds_both_of_their_messages(first: int, spa
     assert window.contains(last)
 
 
-@pytest.mark.parametrize("start_s", [1795219200.0, 1795219200.1, 1795219200.000001, 0.0])
-def test_what_was_asked_is_echoed_to_the_microsecond(start_s: float) -> None:
-    start, end = TimeWindow.from_unix(start_s, start_s + 0.3).asked()
-    assert unix_rounded_up(start) == start_s
-    assert unix_rounded_up(end) == round(start_s + 0.3, 6)
-
-
 @given(moments, st.integers(0, 10**15))
 def test_both_ends_of_a_question_are_inclusive_with_the_slack_of_a_float(
     first: int, span: int

@@ -11,7 +11,6 @@ from ros2_memory.messages.conversions import (
     ABSENT,
     descend,
     view,
-    xyz,
 )
 from tests.support import bags
 
@@ -62,23 +61,6 @@ def test_a_point_cloud_is_its_size_and_points() -> None:
         is_dense=True,
     )
     assert view(cloud, "data") == {"bytes": 3200, "points": 200, "shape": [2, 100]}
-
-
-@pytest.mark.parametrize(
-    "node",
-    [
-        None,
-        ABSENT,
-        3.0,
-        [1.0, 2.0, 3.0],
-        {"x": 1.0, "y": 2.0},
-        {"x": "1", "y": 2.0, "z": 3.0},
-        {"x": True, "y": 2.0, "z": 3.0},
-        {"x": 10**400, "y": 2.0, "z": 3.0},
-    ],
-)
-def test_what_is_not_shaped_like_a_point_is_none(node: object) -> None:
-    assert xyz(node) is None
 
 
 def test_the_numbers_of_an_array_are_reached_by_number_and_have_no_fields() -> None:

@@ -177,30 +177,6 @@ def test_the_unusual_widths_of_floats_leave_as_numbers(kind: type[np.floating]) 
     assert shown(np.array([0.5], dtype=kind))[0] == exact(np.array([0.5], dtype=kind)) == [0.5]
 
 
-@pytest.mark.parametrize(
-    ("number", "leaves_as"),
-    [
-        (0.0, 0),
-        (-0.0, 0),
-        (3.0, 3),
-        (0.1 + 0.2, 0.3),
-        (1 / 3, 0.33333333333),
-        (52.12345678, 52.12345678),
-        (-122.41941234, -122.41941234),
-        (1752500000.123456, 1752500000.123456),
-        (1e300, 1e300),
-        (5e-324, 5e-324),
-        (math.nan, None),
-        (math.inf, None),
-        (-math.inf, None),
-    ],
-)
-def test_a_number_of_unknown_unit_leaves_short(number: float, leaves_as: object) -> None:
-    left = round_real(number)
-    assert left == leaves_as
-    assert type(left) is type(leaves_as)
-
-
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 def test_a_float32_is_read_back_from_what_leaves(number: float) -> None:
     for left in (round_real(number), round_single(np.float32(number))):

@@ -91,17 +91,6 @@ def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -
     ]
 
 
-def test_links_are_neither_followed_nor_deleted(tmp_path: Path) -> None:
-    bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
-    make(elsewhere, "a.mcap", "sub/b.mcap")
-    bags.mkdir()
-    (bags / "link.mcap").symlink_to(elsewhere / "a.mcap")
-    (bags / "folder").symlink_to(elsewhere / "sub")
-    clear_bags(bags)
-    assert left(elsewhere) == ["a.mcap", "sub", "sub/b.mcap"]
-    assert left(bags) == ["folder", "link.mcap"]
-
-
 def test_a_bag_directory_that_is_a_link_itself_is_cleared(tmp_path: Path) -> None:
     make(tmp_path, "real/a.mcap")
     (tmp_path / "bags").symlink_to(tmp_path / "real")

@@ -43,13 +43,6 @@ def folders(bag_dir: Path, *names: str) -> None:
         (bag_dir / name).mkdir()
 
 
-def test_a_kill_forgets_a_minute_at_most(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    recorded(RecordedTime(tmp_path), "a", 119)
-    recorded(RecordedTime(tmp_path), "b", 119)
-    assert 60 * S <= RecordedTime(tmp_path).since(["a"])["a"] <= 119 * S
-
-
 def test_what_was_never_seen_is_new(tmp_path: Path) -> None:
     folders(tmp_path, "a", "copied")
     time = RecordedTime(tmp_path)

@@ -43,28 +43,23 @@ def contents(path: Path) -> list[Record]:
     return list(reader.records(path, topics, TimeWindow.everything()))
 
 
-def test_a_bag_that_was_left_open_is_closed_under_its_own_name(tmp_path: Path) -> None:
+def test_a_bag_that_was_left_open_is_closed_with_its_name_rights_and_time(tmp_path: Path) -> None:
     path = left_open(tmp_path / "a_0.mcap")
+    path.chmod(0o640)
+    os.utime(path, ns=(T0, T0 + 1))
     before, size = contents(path), path.stat().st_size
     (tmp_path / ".a_0.mcap.repair").write_bytes(b"half of it, of an earlier attempt")
     repaired = repairer().repair(path)
     assert repaired is not None
     assert repaired.rewritten is not None
     assert repaired.rewritten.messages == len(before)
-    assert (repaired.was_bytes, repaired.is_bytes) == (size, path.stat().st_size)
+    status = path.stat()
+    assert (repaired.was_bytes, repaired.is_bytes) == (size, status.st_size)
+    assert (status.st_mode & 0o777, status.st_mtime_ns) == (0o640, T0 + 1)
     assert McapReader().closing(path) is Closing.CLOSED
     assert contents(path) == before
     assert files_in(tmp_path) == ["a_0.mcap"]
     assert repairer().repair(path) is None
-
-
-def test_its_rights_and_its_time_stay_as_they_were(tmp_path: Path) -> None:
-    path = left_open(tmp_path / "a_0.mcap")
-    path.chmod(0o640)
-    os.utime(path, ns=(T0, T0 + 1))
-    repairer().repair(path)
-    status = path.stat()
-    assert (status.st_mode & 0o777, status.st_mtime_ns) == (0o640, T0 + 1)
 
 
 def test_on_a_full_disk_the_original_stays_and_the_next_attempt_repairs_it(tmp_path: Path) -> None:

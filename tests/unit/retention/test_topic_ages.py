@@ -22,7 +22,6 @@ from ros2_memory.bag_dir.state_files import (
     read_losses,
     unshipped,
 )
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention import repair
@@ -85,11 +84,6 @@ def counts_of(path: Path) -> dict[str, int]:
     return {one.topic: one.count for one in McapReader().summarize(path).topics}
 
 
-def contents_of(path: Path, *topics: str) -> list[tuple[str, int, bytes]]:
-    records = McapReader().records(path, topics, TimeWindow.everything())
-    return [(one.channel.topic, one.log_time, one.payload) for one in records]
-
-
 @pytest.fixture
 def bag_dir(tmp_path: Path) -> Path:
     """Two bags that are older than a day, and one that is not."""
@@ -98,20 +92,6 @@ def bag_dir(tmp_path: Path) -> Path:
         split(folder, hour)
     own_all(folder)
     return folder
-
-
-def test_only_what_is_too_old_goes_and_all_else_stays(bag_dir: Path) -> None:
-    old, young = bag_dir / "rec_A" / "rec_A_0.mcap", bag_dir / "rec_A" / "rec_A_29.mcap"
-    others = ("/odom", "/tf_static", "/bumper")
-    before, untouched = contents_of(old, *others), young.read_bytes()
-    with capture_logs() as logs:
-        house(bag_dir, cutter_of(bag_dir)).apply()
-    assert contents_of(old, "/speech") == []
-    assert contents_of(old, *others) == before
-    assert before
-    assert young.read_bytes() == untouched
-    [told] = events(logs, "topics_cut")
-    assert (told["bags"], told["messages"]) == (2, {"/speech": 20})
 
 
 def test_answers_say_that_it_was_deleted_and_count_it(bag_dir: Path) -> None:

@@ -374,19 +374,6 @@ def started(queue: FairQueue, gates: Gates, client: str, count: int) -> list[asy
     return [asyncio.create_task(queue.run(client, gates.ask(f"{client}{n}"))) for n in range(count)]
 
 
-async def test_the_next_place_goes_to_whoever_has_the_fewest() -> None:
-    queue, gates = FairQueue("test", 3), Gates()
-    tasks = [*started(queue, gates, "a", 4), *started(queue, gates, "b", 3)]
-    await until(lambda: len(gates.begun) == 3)
-    gates.release("a0")  # a has two left running, b has none
-    await until(lambda: len(gates.begun) == 4)
-    gates.release("a1")  # one each: a waits for longer
-    await until(lambda: len(gates.begun) == 5)
-    assert gates.begun == ["a0", "a1", "a2", "b0", "a3"]
-    gates.release()
-    await asyncio.gather(*tasks)
-
-
 @pytest.mark.parametrize("has_turn", [True, False])
 async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn: bool) -> None:
     queue, gates = FairQueue("test", 1), Gates()

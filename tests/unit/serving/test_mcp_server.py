@@ -13,7 +13,6 @@ from mcp.server.apps import APP_MIME_TYPE, EXTENSION_ID
 from mcp.shared.exceptions import MCPError
 from mcp.types import (
     INVALID_PARAMS,
-    TextContent,
     TextResourceContents,
 )
 
@@ -102,22 +101,6 @@ async def test_a_resource_that_is_not_offered_is_told_with_those_that_are(tmp_pa
             assert refused.value.error.code == INVALID_PARAMS
             assert refused.value.error.message.endswith("the resources are: episodic://topics")
             assert len(refused.value.error.message) < 300
-
-
-@pytest.mark.parametrize("which", ["spec", "all"])
-@pytest.mark.parametrize(
-    ("name", "given"), [("describe_type", {"type": "nav_msgs/msg/Odometry"}), ("list_moments", {})]
-)
-async def test_what_is_only_read_is_no_tool_and_named_by_none(
-    tmp_path: Path, which: str, name: str, given: dict[str, Any]
-) -> None:
-    async with Client(server(tmp_path, f"server.tools={which}")) as client:
-        result = await client.call_tool(name, given)
-    [block] = result.content
-    assert isinstance(block, TextContent)
-    detail = json.loads(block.text)["detail"]
-    assert f'unknown tool "{name}"' in detail
-    assert name not in detail.partition(";")[2]
 
 
 async def test_no_tool_names_another_that_is_not_offered(tmp_path: Path) -> None:

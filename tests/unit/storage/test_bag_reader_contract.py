@@ -23,7 +23,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import BagReader, Batch, Closing, Record
-from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, typestore
+from tests.support.bags import Msg, boolean, odom, text, tf, transform
 from tests.support.examples import examples
 from tests.support.reader_cases import FILES, Shelf
 
@@ -171,19 +171,6 @@ def test_a_summary_counts_what_the_messages_say(shelf: Shelf, messages: list[Msg
 
 
 @on_every_shelf
-def test_a_window_includes_its_start_and_excludes_its_stop(shelf: Shelf, tmp_path: Path) -> None:
-    # A message of 100 bytes each, so that in small chunks the ends of chunks are among the bounds.
-    messages = [text(time, f"{time:0100d}") for time in range(10, 40)]
-    reader, path = shelf.stocked(tmp_path, messages)
-    for start in range(9, 41):
-        for stop in (start, start + 1, start + 2, start + 7):
-            window = TimeWindow(start, stop)
-            assert [r.log_time for r in read(reader, path, ["/chatter"], window)] == [
-                time for time in range(10, 40) if start <= time < stop
-            ]
-
-
-@on_every_shelf
 def test_topics_without_messages_are_declared_and_silent(shelf: Shelf, tmp_path: Path) -> None:
     silent = [("/quiet", STRING), ("/still", BOOL)]
     reader, path = shelf.stocked(tmp_path, [text(1, "x")], declared=silent)
@@ -207,23 +194,6 @@ def test_a_topic_offered_as_transient_local_is_latched(shelf: Shelf, tmp_path: P
         "/tf_static": True,
         "/odom": False,
     }
-
-
-@on_every_shelf
-def test_messages_decode_as_plain_rosbags_decodes_them(shelf: Shelf, tmp_path: Path) -> None:
-    messages = [
-        odom(1, 1.5, -2.5, 0.3),
-        detections(2, ["cup", "scissors"]),
-        tf(3, transform(3, "odom", "base_link", (1.0, 2.0, 0.0), 0.5)),
-        text(4, "hello"),
-    ]
-    reader, path = shelf.stocked(tmp_path, messages)
-    topics = {message.topic for message in messages}
-    records = list(reader.records(path, topics, TimeWindow.everything()))
-    for record, message in zip(records, messages, strict=True):
-        assert reader.undecodable(record.channel) is None
-        plain = typestore().deserialize_cdr(message.payload, message.type)
-        assert repr(reader.decode(record)) == repr(plain)
 
 
 @on_every_shelf
@@ -314,15 +284,6 @@ def test_a_folder_or_a_pipe_in_place_of_a_bag_is_an_error_that_names_it(
         shelf.make_reader().summarize(path)
     with pytest.raises(EpisodicError):
         shelf.make_reader().closing(path)
-
-
-@on_every_shelf
-def test_reading_leaves_no_trace_beside_the_bag(shelf: Shelf, tmp_path: Path) -> None:
-    reader, path = shelf.stocked(tmp_path, [text(time, "x") for time in range(20)])
-    before = [(file.name, file.stat().st_mtime_ns) for file in tmp_path.iterdir()]
-    reader.summarize(path)
-    read(reader, path, ["/chatter"])
-    assert [(file.name, file.stat().st_mtime_ns) for file in tmp_path.iterdir()] == before
 
 
 @on_every_shelf

@@ -16,8 +16,6 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.cache import ByteLru
-from ros2_memory.storage.mcap import bag_file
 from ros2_memory.storage.mcap.records import MESSAGE
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -79,25 +77,6 @@ class TestReadingOnlyWhatIsWanted:
         path = write_mcap(tmp_path / "a.mcap", messages, SMALL)
         spoil_chunk(path, 0)
         assert times(read(McapReader(), path, "/bumper")) == list(range(12, 40))
-
-    def test_what_was_read_is_kept_within_the_cache(
-        self, path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        reader = McapReader()
-        whole = read(reader, path)
-        for name in ("index_from_summary", "pairs_in", "chunk_data"):
-            monkeypatch.delattr(bag_file, name)
-        assert read(reader, path) == whole
-        with pytest.raises(BagError):
-            McapReader().summarize(path)
-
-    def test_a_bag_that_left_the_cache_has_the_same_messages_and_summary(self, path: Path) -> None:
-        bags = bag_file.McapBags()
-        summary = bags.summarize(path)
-        bags.indexes = ByteLru(1 << 20)
-        found = bags.records(path, ["/chatter"], EVERYTHING, newest_first=False)
-        assert [*found] == read(McapReader(), path)
-        assert bags.summarize(path) == summary
 
 
 def read_on(

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +24,12 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import Sample, SetAside
-from ros2_memory.core.reply import LocalTimes
 from ros2_memory.core.timebase import NS_PER_S, unix_rounded_up
 from ros2_memory.results import Answer
 from ros2_memory.tools.replies import Replies
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    pass
 
 BAGS = Path("bags")
 T0 = 1_784_023_200 * NS_PER_S
@@ -165,30 +163,6 @@ def test_a_range_with_fields_is_a_table() -> None:
         [1784023200.123457, None, None, None, 0.5, None],
     ]
     assert "samples" not in shown
-
-
-HOUR = 3600 * NS_PER_S
-
-
-@pytest.fixture
-def utc() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TZ", "UTC")
-        time.tzset()
-        yield
-    time.tzset()
-
-
-@pytest.mark.usefixtures("utc")
-def test_a_local_time_names_the_day_where_it_is_another() -> None:
-    local = LocalTimes(T0, T0 + 24 * HOUR)
-    assert local.text(T0) == "Tue 2026-07-14 10:00:00"
-    assert local.text(T0, T0) == local.text(T0, T0 + 1) == local.text(T0)
-    over_night = "Tue 2026-07-14 10:00:00 - Wed 2026-07-15 01:00:00"
-    assert local.text(T0, T0 + 15 * HOUR) == over_night
-    assert local.text(None, T0) == "- Tue 2026-07-14 10:00:00"
-    unknown = (LocalTimes(None, T0), LocalTimes(T0, None))
-    assert [local.text(None), *(span.text(T0) for span in unknown)] == [None] * 3
 
 
 def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:

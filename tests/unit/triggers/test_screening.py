@@ -159,20 +159,6 @@ def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected
     assert (bags.screening.failing_rules(), bags.screening.problem()) == ((), None)
 
 
-def test_the_state_carries_over_a_handover(bags: ScreenedBags) -> None:
-    old = bags.begin(0)
-    bags.split(old, [mode(0, value=False), mode(5, value=True), *words(0, 10)])
-    new = bags.begin(9)
-    bags.split(old, words(10, 13))
-    again = mode(11, value=True, published=5)
-    bags.split(new, [again, mode(15, value=False), *words(11, 20)])
-    bags.step()
-    bags.end(old)
-    bags.split(new, words(20, 30))
-    bags.end()
-    assert bags.seconds() == [*halves(0, 4), *halves(16, 30)]
-
-
 def test_a_publisher_that_does_not_come_back_is_unknown(bags: ScreenedBags) -> None:
     old = bags.begin(0)
     bags.split(old, [mode(-2, value=False), *words(0, 10)])

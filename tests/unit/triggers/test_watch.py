@@ -41,20 +41,6 @@ def seconds(begin: int, stop: int, true_at: Collection[int] = ()) -> list[Msg]:
     return [flag(n, n in true_at) for n in range(begin, stop)]
 
 
-def test_a_match_becomes_a_moment_named_after_its_rule(robot: WatchedBags) -> None:
-    robot.begin(T0)
-    for begin in (0, 10, 20):
-        robot.split(seconds(begin, begin + 10, {6}))
-    robot.clock.at = T0 + 40 * S
-    robot.look()
-    assert robot.spans() == [(1, 9)]
-    [moment] = robot.moments()
-    assert moment.folder.name.endswith("-bumper")
-    assert (moment.moment.rule, moment.moment.matches) == ("bumper", 1)
-    assert (moment.moment.pending, moment.moment.missing) == (False, ())
-    assert (robot.record().fired, robot.record().moments) == (1, 1)
-
-
 def test_what_comes_after_it_follows_when_it_is_closed(robot: WatchedBags) -> None:
     name = robot.begin(T0)
     robot.split(seconds(0, 10, {7}))
@@ -84,18 +70,6 @@ def test_what_was_never_recorded_of_it_is_said(robot: WatchedBags) -> None:
         "nothing is recorded",
         "nothing is recorded",
     ]
-
-
-def test_adjacent_matches_join_and_others_do_not(robot: WatchedBags) -> None:
-    name = robot.begin(T0)
-    robot.split(seconds(0, 30, {6, 9, 12}), name)
-    robot.clock.at = T0 + 30 * S
-    robot.look()
-    assert robot.spans() == [(1, 15)]
-    robot.split(seconds(30, 60, {32, 45}), name)
-    robot.close_all()
-    assert robot.spans() == [(1, 15), (27, 35), (40, 48)]
-    assert [each.moment.matches for each in robot.moments()] == [3, 1, 1]
 
 
 def test_a_later_match_extends_a_moment_that_is_stored(robot: WatchedBags) -> None:

@@ -19,7 +19,7 @@ from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.examples import examples
-from tests.support.mcap_surgery import SMALL, change_index, chatter, chunks_of, damaged, spoil_chunk
+from tests.support.mcap_surgery import SMALL, change_index, chatter, chunks_of, damaged
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -95,15 +95,6 @@ def test_of_a_damaged_file_batches_hold_what_records_do(seed: int, how: McapLayo
     if not contradicted:
         assert found == expected
     assert bool(errors) == bool(others)
-
-
-def test_chunks_of_bare_topics_are_not_decompressed(tmp_path: Path) -> None:
-    messages = [*chatter(12), *(boolean(time, True) for time in range(12, 40))]
-    path = write_mcap(tmp_path / "a.mcap", messages, SMALL)
-    spoil_chunk(path, 0)
-    batches = list(McapReader().batches(path, TOPICS, EVERYTHING, bare=["/chatter"]))
-    times = times_in(batches)
-    assert times == Counter(range(40))
 
 
 def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:

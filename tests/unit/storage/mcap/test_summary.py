@@ -49,17 +49,3 @@ def test_a_record_that_states_more_than_it_has_is_not_believed(
             read_summary(file)
         with pytest.raises(DoubtError, match=f"its summary section is not used .*{reason}"):
             index_from_summary(file)
-
-
-def test_what_other_bags_declare_is_not_taken_for_what_a_bag_declares(tmp_path: Path) -> None:
-    messages = [text(1, "a"), boolean(2, data=True), text(3, "b", "/more"), text(4, "c", "/last")]
-    declared = [{each.topic for each in messages[:n]} for n in range(1, 5)]
-    for n in (2, 1, 4, 3, 2, 1):
-        path = write_mcap(tmp_path / f"{n}.mcap", messages[:n])
-        with OpenFile(path) as file:
-            summary = read_summary(file)
-        assert {channel.topic for channel in summary.declared.channels.values()} == declared[n - 1]
-        assert {channel.schema.name for channel in summary.declared.channels.values()} == {
-            each.type for each in messages[:n]
-        }
-        assert summary.declared.declarations.resolved
