@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import DELETED_FILE, LIST_FILE, MOMENT_FILE, OWN_FOLDER
 from ros2_memory.bag_dir.moment_file import (
     Outcome,
@@ -31,6 +31,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -95,18 +96,13 @@ def later(seconds: int = 3600) -> SettableClock:
 
 def recording_now(bag_dir: Path, *recordings: str, clock: Clock | None = None) -> None:
     """Has a recorder say that it is writing these recordings."""
-    now = (clock or later()).now()
-    write_heartbeat(
-        bag_dir,
-        Heartbeat(1, now, RecorderState.RECORDING, recordings, now, 0, (), (), None, 2.0),
-    )
+    beat(bag_dir, (clock or later()).now(), recordings=recordings)
 
 
 def recorded_before(bag_dir: Path) -> Path:
     """A bag directory in which a recorder was at work, long ago."""
     bag_dir.mkdir(parents=True, exist_ok=True)
-    beat = Heartbeat(1, NS_PER_S, RecorderState.STOPPED, (), NS_PER_S, 0, (), (), None, 2.0)
-    write_heartbeat(bag_dir, beat)
+    beat(bag_dir, NS_PER_S, RecorderState.STOPPED)
     return bag_dir
 
 

@@ -180,9 +180,7 @@ def _spoil(bag_dir: Path, draw: Random) -> None:
 
 def _again(message: Msg, at: int) -> Msg:
     """A latched message as a later recording receives it."""
-    return Msg(
-        message.topic, message.type, max(at, message.log_time), message.body, message.published
-    )
+    return _shifted(message, max(0, at - message.log_time))
 
 
 def _shifted(message: Msg, by: int) -> Msg:

@@ -34,7 +34,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import rclpy
@@ -42,7 +42,21 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from tests.support.bags import typestore
+from tests.support.bags import (
+    Msg,
+    battery,
+    boolean,
+    command,
+    detections,
+    header,
+    make,
+    odom,
+    stamp,
+    text,
+    tf,
+    transform,
+    typestore,
+)
 from tests.support.ros_types import publisher
 
 RADIUS: Final = 2.0  # m
@@ -99,140 +113,42 @@ class Messages:
 
     def payload(self, topic: str, t: float) -> bytes:
         """The message published on `topic` t seconds after T0, as CDR."""
-        bodies: dict[str, Callable[[float], Any]] = {
-            "/clock": lambda t: _of("rosgraph_msgs/msg/Clock", clock=_time(round(t * 1e9))),
-            "/px4/position": self._local_position,
-            "/odom": self._odometry,
-            "/tf": self._transform,
-            "/tf_static": self._sensors,
-            "/cmd_vel": self._command,
-            "/bumper": lambda t: _of("std_msgs/msg/Bool", data=0.0 <= t - self.bumps_s < 1.0),
-            "/battery_state": self._battery,
-            "/vision/scene/scene_objects": self._detections,
-            "/camera/image_raw": self._image,
-            "/speech": lambda t: _of("std_msgs/msg/String", data=f"what people say at {t:.0f} s"),
+        at, (x, y, yaw) = self._t0 + round(t * 1e9), pose(t)
+        made: dict[str, Callable[[], Msg]] = {
+            "/odom": lambda: odom(at, x, y, yaw, vx=RADIUS * TURN_RATE, wz=TURN_RATE),
+            "/tf": lambda: tf(at, transform(at, "odom", "base_link", (x, y, 0.0), yaw)),
+            "/tf_static": lambda: tf(
+                at, *(transform(at, "base_link", name, place) for name, place in _SENSORS.items())
+            ),
+            "/cmd_vel": lambda: command(at, RADIUS * TURN_RATE, TURN_RATE),
+            "/bumper": lambda: boolean(at, 0.0 <= t - self.bumps_s < 1.0),
+            "/battery_state": lambda: battery(at, 0.8 - 0.001 * t),
+            "/vision/scene/scene_objects": lambda: detections(at, seen(t)),
+            "/speech": lambda: text(at, f"what people say at {t:.0f} s"),
         }
-        return bytes(typestore().serialize_cdr(bodies[topic](t), TYPES[topic]))
-
-    def _header(self, t: float, frame: str) -> Any:
-        stamp = _time(self._t0 + round(t * 1e9))
-        return _of("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-    def _odometry(self, t: float) -> Any:
-        x, y, yaw = pose(t)
-        place = _of("geometry_msgs/msg/Pose", position=_point(x, y, 0.0), orientation=_turned(yaw))
-        covariance = typestore().types["geometry_msgs/msg/PoseWithCovariance"]
-        motion = typestore().types["geometry_msgs/msg/TwistWithCovariance"]
-        zeros = np.zeros(36)
-        return _of(
-            "nav_msgs/msg/Odometry",
-            header=self._header(t, "odom"),
-            child_frame_id="base_link",
-            pose=covariance(pose=place, covariance=zeros),
-            twist=motion(twist=self._command(t), covariance=zeros),
-        )
-
-    def _local_position(self, t: float) -> Any:
-        x, y, heading = pose(t)
-        values = {"x": x, "y": y, "z": 0.0, "heading": heading}
-        return _of(TYPES["/px4/position"], timestamp=round(t * 1e6), xy_valid=True, **values)
-
-    def _stamped(self, t: float, frames: tuple[str, str], at: tuple[float, ...], yaw: float) -> Any:
-        move = _of("geometry_msgs/msg/Vector3", x=at[0], y=at[1], z=at[2])
-        transform = _of("geometry_msgs/msg/Transform", translation=move, rotation=_turned(yaw))
-        return _of(
-            "geometry_msgs/msg/TransformStamped",
-            header=self._header(t, frames[0]),
-            child_frame_id=frames[1],
-            transform=transform,
-        )
-
-    def _transform(self, t: float) -> Any:
-        x, y, yaw = pose(t)
-        return _of(
-            "tf2_msgs/msg/TFMessage",
-            transforms=[self._stamped(t, ("odom", "base_link"), (x, y, 0.0), yaw)],
-        )
-
-    def _sensors(self, t: float) -> Any:
-        transforms = [
-            self._stamped(t, ("base_link", name), at, 0.0) for name, at in _SENSORS.items()
-        ]
-        return _of("tf2_msgs/msg/TFMessage", transforms=transforms)
-
-    def _command(self, t: float) -> Any:
-        forward = _of("geometry_msgs/msg/Vector3", x=RADIUS * TURN_RATE, y=0.0, z=0.0)
-        turning = _of("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=TURN_RATE)
-        return _of("geometry_msgs/msg/Twist", linear=forward, angular=turning)
-
-    def _image(self, t: float) -> Any:
-        return _of(
-            "sensor_msgs/msg/Image",
-            header=self._header(t, "camera"),
-            height=48,
-            width=64,
-            encoding="mono8",
-            is_bigendian=0,
-            step=64,
-            data=np.zeros(48 * 64, np.uint8),
-        )
-
-    def _battery(self, t: float) -> Any:
-        return _of(
-            "sensor_msgs/msg/BatteryState",
-            header=self._header(t, ""),
-            voltage=12.0,
-            temperature=math.nan,
-            current=math.nan,
-            charge=math.nan,
-            capacity=math.nan,
-            design_capacity=math.nan,
-            percentage=0.8 - 0.001 * t,
-            power_supply_status=0,
-            power_supply_health=0,
-            power_supply_technology=0,
-            present=True,
-            cell_voltage=np.zeros(0, np.float32),
-            cell_temperature=np.zeros(0, np.float32),
-            location="",
-            serial_number="",
-        )
-
-    def _detections(self, t: float) -> Any:
-        detection = typestore().types["ros2_vision_interfaces/msg/VisionDetection"]
-        return _of(
-            TYPES["/vision/scene/scene_objects"],
-            header=self._header(t, "base_link"),
-            skill="scene",
-            detections=[
-                detection(
-                    label=name,
-                    score=0.9 - 0.1 * place,
-                    point=_point(1.0 + place, 0.0, 0.5),
-                    bbox=np.zeros(4, np.int32),
-                )
-                for place, name in enumerate(seen(t))
-            ],
-        )
-
-
-def _of(name: str, **fields: Any) -> Any:
-    return typestore().types[name](**fields)
-
-
-def _time(nanoseconds: int) -> Any:
-    seconds, rest = divmod(nanoseconds, 10**9)
-    return _of("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
-
-
-def _point(x: float, y: float, z: float) -> Any:
-    return _of("geometry_msgs/msg/Point", x=x, y=y, z=z)
-
-
-def _turned(yaw: float) -> Any:
-    return _of(
-        "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)
-    )
+        if topic in made:
+            return made[topic]().payload
+        bodies: dict[str, dict[str, object]] = {
+            "/clock": {"clock": stamp(round(t * 1e9))},
+            "/px4/position": {
+                "timestamp": round(t * 1e6),
+                "xy_valid": True,
+                "x": x,
+                "y": y,
+                "z": 0.0,
+                "heading": yaw,
+            },
+            "/camera/image_raw": {
+                "header": header(at, "camera"),
+                "height": 48,
+                "width": 64,
+                "step": 64,
+                "encoding": "mono8",
+                "is_bigendian": 0,
+                "data": np.zeros(48 * 64, np.uint8),
+            },
+        }
+        return Msg(topic, TYPES[topic], at, make(TYPES[topic], **bodies[topic])).payload
 
 
 class Robot:

@@ -10,7 +10,7 @@ import structlog
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, read_handover, write_handover
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import utc_stamp
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -22,6 +22,7 @@ from ros2_memory.triggers.rules import Rule, SplitSearch
 from ros2_memory.triggers.watch import Triggers
 from tests.support.bags import Msg, boolean, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 from tests.support.housekeepers import keeper_of
 from tests.support.memories import shipped_extractor
 
@@ -109,8 +110,7 @@ class WatchedBags:
         )
 
     def beat(self, *live: str, state: RecorderState = RecorderState.RECORDING) -> None:
-        now = self.clock.now()
-        write_heartbeat(self.bag_dir, Heartbeat(1, now, state, live, now, 0, (), (), None, 2.0))
+        beat(self.bag_dir, self.clock.now(), state, recordings=live)
 
     def begin(self, at: int) -> str:
         """Begins a recording, which is being written from now on."""

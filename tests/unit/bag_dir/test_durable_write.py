@@ -9,7 +9,6 @@ import pytest
 
 from ros2_memory.bag_dir.durable_write import (
     flush_bags,
-    write_all_durably,
 )
 
 
@@ -45,17 +44,3 @@ def test_what_cannot_be_flushed_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(faults) == 2
     assert faults[0].startswith(str(tmp_path / "a.mcap"))
     assert "power cut" in faults[0]
-
-
-def test_of_several_files_none_is_replaced_where_one_cannot_be_written(tmp_path: Path) -> None:
-    first, second = tmp_path / "a.json", tmp_path / "b.json"
-    first.write_text("before")
-    second.write_text("before")
-    (tmp_path / ".b.json.tmp").mkdir()  # in the way, as a full disk is
-    with pytest.raises(IsADirectoryError):
-        write_all_durably({first: "after", second: "after"})
-    assert (first.read_text(), second.read_text()) == ("before", "before")
-    assert not (tmp_path / ".a.json.tmp").exists()
-    (tmp_path / ".b.json.tmp").rmdir()
-    write_all_durably({first: "after", second: "after"})
-    assert (first.read_text(), second.read_text()) == ("after", "after")

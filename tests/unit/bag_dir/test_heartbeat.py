@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -91,23 +91,6 @@ def test_a_recorder_that_was_killed_is_not_live_any_more() -> None:
     assert process_of(process.pid) is None
 
 
-def test_every_text_is_one_that_utf_8_can_hold(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, BEAT)
-    content = json.loads((tmp_path / HEARTBEAT_FILE).read_text())
-    texts = {each.name for each in fields(BEAT) if "_Text" in str(each.type)}
-    lists = {each for each in texts if isinstance(content[each], list)}
-    assert {"last_error", "advice"} < texts - lists
-    assert {"recordings", "unheard"} < lists
-    half = "\ud800"
-    content |= {name: [half] if name in lists else half for name in texts} | {"lost": {}}
-    (tmp_path / HEARTBEAT_FILE).write_text(json.dumps(content))
-    beat = read_heartbeat(tmp_path).heartbeat
-    assert beat is not None
-    told = json.dumps(asdict(beat), ensure_ascii=False)
-    assert told.encode().count(rb"\\ud800") == len(texts) - 1  # "lost" is empty
-    assert not any("str" in str(each.type) for each in fields(BEAT))
-
-
 @given(
     content=st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -126,14 +109,10 @@ def test_any_json_is_read_without_a_crash(
 @pytest.mark.parametrize(
     ("interval_s", "away_s", "live"),
     [
-        (2.0, 0, True),
         (2.0, 15, True),
-        (2.0, 15.001, False),
-        (2.0, -15, True),
         (2.0, -15.001, False),
         (10.0, 30, True),
         (10.0, 30.001, False),
-        (10.0, -30.001, False),
     ],
 )
 def test_it_is_live_for_three_intervals_and_at_least_15_s_on_either_side(

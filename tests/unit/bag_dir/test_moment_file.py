@@ -129,23 +129,6 @@ def names(bag_dir: Path) -> list[str]:
     return sorted(path.name for path in (bag_dir / REQUESTS_FOLDER).iterdir())
 
 
-def test_a_request_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:
-    first, second, queue = asked(tmp_path), asked(tmp_path), RequestQueue(tmp_path)
-    assert first.withdraw()
-    assert [request.number for request in queue.take(T0)] == [second.request.number]
-    assert not second.withdraw()
-
-
-def test_a_request_that_was_taken_and_not_answered_is_taken_again(tmp_path: Path) -> None:
-    posted = asked(tmp_path)
-    assert [request.number for request in RequestQueue(tmp_path).take(T0)] == [
-        posted.request.number
-    ]
-    again = RequestQueue(tmp_path)
-    assert again.has_requests()
-    assert [request.number for request in again.take(T0 + S)] == [posted.request.number]
-
-
 def test_a_request_whose_server_died_is_forgotten(tmp_path: Path) -> None:
     posted = asked(tmp_path)
     assert list(RequestQueue(tmp_path).take(T0 + STALE_NS + 1)) == []
@@ -206,15 +189,6 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
     assert [event["event"] for event in captured] == ["request_ignored"] * 3
     assert posted.outcome() is not None
     assert not queue.has_requests()
-
-
-def test_other_files_are_left_alone(tmp_path: Path) -> None:
-    posted = asked(tmp_path)
-    (tmp_path / REQUESTS_FOLDER / "notes.txt").write_text("mine")
-    queue = RequestQueue(tmp_path)
-    assert [refuse_all(queue), refuse_all(queue)] == [1, 0]
-    posted.close()
-    assert names(tmp_path) == ["notes.txt"]
 
 
 def test_answers_that_nobody_fetched_are_swept_away(tmp_path: Path) -> None:

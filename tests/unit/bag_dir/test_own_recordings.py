@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir import own_recordings
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.bag_dir.own_recordings import LIST, ListRow, OwnRecordings
 from ros2_memory.core.directories import Identity, identity_of
@@ -25,7 +25,8 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import examples
 from tests.support.fakes import failing
-from tests.support.housekeepers import embedding, lines, made_moment, own_all
+from tests.support.heartbeats import beat
+from tests.support.housekeepers import embedding, lines, own_all
 from tests.support.log_lines import with_checks
 from tests.support.simulated_recorders import World, events, rotating
 
@@ -52,8 +53,7 @@ def begun(bag_dir: Path) -> OwnRecordings:
 
 
 def named_in_heartbeat(bag_dir: Path, *names: str) -> None:
-    beat = Heartbeat(7, 1, RecorderState.STOPPED, names, 1, 0, (), (), None, 2.0)
-    write_heartbeat(bag_dir, beat)
+    beat(bag_dir, 1, RecorderState.STOPPED, recordings=names)
 
 
 def restored(folder: Path) -> None:
@@ -291,16 +291,6 @@ class TestBags:
         own.note(name, {path.name for path in files}, ended=True)
         return claimed(bag_dir)
 
-    @pytest.mark.parametrize(
-        "name",
-        [f"{A}_3.mcap", f"{A}_77.mcap", f"{A}_00.mcap", f"{A}_0.db3", "x.mcap", f"{B}_0.mcap"],
-    )
-    def test_no_others(self, tmp_path: Path, name: str) -> None:
-        own = self.made(tmp_path, A, 3)
-        embedding(tmp_path / A / name)
-        assert not own.owns_bag(tmp_path / A / name)
-        assert not claimed(tmp_path).owns_bag(tmp_path / A / name)
-
     def test_a_recorder_notes_each_split(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=40).started(25)
         foreign = embedding(world.recorders[0].directory / "x_0.mcap")
@@ -360,26 +350,3 @@ class TestBags:
         own_all(tmp_path)
         LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
         assert OwnRecordings(tmp_path).owns_bag(path)
-
-    def test_carried_messages_and_moments_are_those_that_were_listed(self, tmp_path: Path) -> None:
-        own = claimed(tmp_path)
-        saved, carried = made_moment(tmp_path / "moments" / "x") / A, tmp_path / "latched"
-        for folder in (saved, carried):
-            folder.mkdir()
-        assert not own.owns_bag(carried / "carried.mcap")
-        assert not own.owns_bag(saved / f"{A}_0.mcap")
-        own.hold(carried, ["carried.mcap"])
-        own.hold(saved, [f"{A}_0.mcap"])
-        own.hold(saved, [f"{A}_1.mcap.zstd"])
-        for known in (own, OwnRecordings(tmp_path), claimed(tmp_path)):
-            assert known.owns_bag(carried / "carried.mcap")
-            assert known.owns_bag(saved / f"{A}_0.mcap")
-            assert known.owns_bag(saved / f"{A}_1.mcap")
-            assert not known.owns_bag(saved / f"{A}_2.mcap")
-            assert not known.owns_bag(carried / "latched_0.mcap")
-            assert not known.owns_bag(tmp_path / "moments" / "x" / "x_0.mcap")
-            assert not known.owns_bag(tmp_path / "loose.mcap")
-            assert (known.names(), known.in_order()) == ([], [])
-        saved.rename(tmp_path / "moved")  # so that its inode number is not used again
-        saved.mkdir()
-        assert not own.owns_bag(saved / f"{A}_0.mcap")

@@ -23,13 +23,11 @@ from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
 from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
-from ros2_memory.columns.store import FILE
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, log_entry, odom, text, write_mcap
 from tests.support.forked_commands import write_command
-from tests.support.housekeepers import own_all, recorded_before
-from tests.unit.cli.conftest import left
+from tests.support.housekeepers import own_all
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -239,16 +237,6 @@ class TestRecordings:
 
 
 class TestIndex:
-    def test_it_fills_the_store_beside_the_bags(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
-    ) -> None:
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(recorded_before(tmp_path)))
-        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-        left(write_mcap(tmp_path / "rec" / "rec_0.mcap", seconds(0, 5)))
-        (line,) = exits(0, "index").err.splitlines()
-        assert line.endswith("1 of 1 bag is stored")
-        assert (tmp_path / OWN_FOLDER / FILE).is_file()
-
     def test_where_no_store_can_be_written_it_says_so(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
     ) -> None:

@@ -87,6 +87,11 @@ class TestMetadata:
             ("rosbag2_bagfile_information: {}", "not of the storage"),
             ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "not of the storage"),
             ("rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}", "version 4"),
+            (
+                "rosbag2_bagfile_information: {storage_identifier: mcap, compression_mode: FILE}",
+                "compression",
+            ),
+            ("[]", "holds no keys"),
         ],
     )
     def test_of_another_form_is_kept(self, tmp_path: Path, text: str, reason: str) -> None:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.status import memory_status
@@ -25,6 +25,7 @@ from ros2_memory.serving.health import Health
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
+from tests.support.heartbeats import beat
 from tests.support.housekeepers import (
     NOW,
     PLENTY,
@@ -209,10 +210,7 @@ class TestUpgrade:
             embedding(path, start=T0 + number * 10 * S)
         first = tmp_path / A / f"{A}_0.mcap"
         first.write_bytes(first.read_bytes()[:100])
-        write_heartbeat(
-            tmp_path,
-            Heartbeat(1, S, RecorderState.STOPPED, (A,), S, 0, (), (), None, 2.0),
-        )
+        beat(tmp_path, S, RecorderState.STOPPED, recordings=(A,))
         for path in (tmp_path / A).iterdir():
             os.utime(path, (1, 1))
         OwnRecordings(tmp_path).claim()

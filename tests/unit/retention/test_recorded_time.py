@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,7 +14,6 @@ from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.examples import LONG
 from tests.support.fakes import failing
-from tests.support.log_lines import with_checks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -125,36 +123,6 @@ def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: 
             [told] = captured
             assert told["event"] == "recorded_time_damaged"
             assert whole[: bit // 8].count(b"\n") + 1 in told["lines"]
-
-
-def test_what_is_gone_is_left_out_and_the_total_stays(tmp_path: Path) -> None:
-    folders(tmp_path, "b", "c")
-    (tmp_path / ".episodic").mkdir()
-    given = {"gone": 10, "b": 100, "gone too": 200}
-    lines = [json.dumps({"recording": n, "recorded_s": s}) for n, s in given.items()]
-    (tmp_path / FILE).write_text(with_checks("\n".join(lines)))
-    time = RecordedTime(tmp_path)
-    recorded(time, "c", 1)
-    kept = [json.loads(line) for line in (tmp_path / FILE).read_text().split("\n") if line]
-    assert {each["recording"] for each in kept} == {"b", "gone too", "c"}
-    assert RecordedTime(tmp_path).since(["b"])["b"] >= 100 * S
-
-
-def test_a_link_in_place_of_its_folder_or_file_is_not_followed(tmp_path: Path) -> None:
-    elsewhere, bag_dir = tmp_path / "elsewhere", tmp_path / "bags"
-    folders(tmp_path, "elsewhere", "bags")
-    (elsewhere / "recorded.jsonl").write_text('{"recording": "a", "recorded_s": 100}\n')
-    (bag_dir / ".episodic").symlink_to(elsewhere)
-    with structlog.testing.capture_logs() as captured:
-        recorded(RecordedTime(bag_dir), "a", 200)
-    told = [each["event"] for each in captured]
-    assert told == ["recorded_time_not_read", "recorded_time_not_kept"]
-    (bag_dir / ".episodic").unlink()
-    (bag_dir / ".episodic").mkdir()
-    (bag_dir / FILE).symlink_to(elsewhere / "recorded.jsonl")
-    recorded(RecordedTime(bag_dir), "b", 200)
-    assert [path.name for path in elsewhere.iterdir()] == ["recorded.jsonl"]
-    assert (elsewhere / "recorded.jsonl").read_text().count("\n") == 1
 
 
 def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(

@@ -198,14 +198,6 @@ class TestOpenBags:
             f"{A}_2.mcap",
         ]
 
-    def test_a_moment_ends_when_nothing_of_it_is_open_any_more(self, tmp_path: Path) -> None:
-        house, clock = waiting(tmp_path)
-        bag(tmp_path / A / f"{A}_2.mcap", 20)
-        clock.at = T0 + 26 * S
-        house.keep_moments()
-        assert told_of(tmp_path)["complete"] is True
-        assert len(in_moments(tmp_path)) == 3
-
     def test_what_passes_the_share_when_it_closes_is_reported_and_not_kept(
         self, tmp_path: Path
     ) -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import socket
 from contextlib import asynccontextmanager
 from itertools import product
@@ -111,16 +110,6 @@ async def test_health_shows_its_status_alone_to_whoever_shows_no_token() -> None
         shown = await http.get("/health", headers=SHOWN)
         assert shown.json() == {"status": "ok", "bags": 3}
         assert (await http.get("/health", headers={"authorization": "Bearer x"})).status_code == 401
-
-
-async def test_a_tool_is_called_over_mcp_in_one_request_without_a_session() -> None:
-    web = app()
-    async with running(web), client(web) as http:
-        response = await http.post("/mcp", json=call_tool("ask"), headers=MCP_HEADERS)
-    assert response.status_code == 200
-    assert response.headers["content-type"] == "application/json"
-    [block] = response.json()["result"]["content"]
-    assert json.loads(block["text"])["value"] == 7
 
 
 HELLO: dict[str, Any] = {

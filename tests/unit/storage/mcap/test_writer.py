@@ -16,8 +16,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.fakes import files_limited_to
 from tests.support.reader_cases import LAYOUTS
@@ -183,25 +182,6 @@ class TestRewriting:
 
 
 class TestWriting:
-    def test_what_is_written_is_read_again(self, tmp_path: Path) -> None:
-        source = write_mcap(tmp_path / "a.mcap", messages())
-        McapWriter().write(tmp_path / "b.mcap", contents(source))
-        assert contents(tmp_path / "b.mcap") == contents(source)
-        reader = McapReader()
-        assert set(reader.channels(tmp_path / "b.mcap")) == set(reader.channels(source))
-        after = McapReader().summarize(tmp_path / "b.mcap")
-        assert (after.complete, after.notes) == (True, ())
-
-    def test_messages_of_a_sqlite_bag_keep_their_definitions_and_qos(self, tmp_path: Path) -> None:
-        source = write_db3(tmp_path / "a.db3", messages())
-        reader = Rosbag2Reader()
-        records = list(reader.records(source, ["/tf_static"], EVERYTHING))
-        McapWriter().write(tmp_path / "b.mcap", records)
-        (channel,) = McapReader().channels(tmp_path / "b.mcap")
-        assert channel.latched
-        assert channel.schema.text
-        assert dict(channel.metadata)["offered_qos_profiles"].startswith("- history")
-
     def test_a_time_that_the_format_cannot_hold_is_refused_and_leaves_nothing(
         self, tmp_path: Path
     ) -> None:
