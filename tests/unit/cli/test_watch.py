@@ -41,9 +41,8 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("rate", "usual", "age_s", "expected"),
-    [
+def test_a_rate_is_assessed_by_what_is_usual() -> None:
+    for rate, usual, age_s, expected in (
         (20.0, 20.0, 0.0, AS_USUAL),
         (9.9, 20.0, 0.0, "slow"),
         (41.0, 20.0, 0.0, "fast"),
@@ -52,12 +51,8 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (0.0, 0.1, 101.0, "silent"),
         (0.1, 0.4, 5.0, AS_USUAL),
         (0.0, None, 1000.0, AS_USUAL),
-    ],
-)
-def test_a_rate_is_assessed_by_what_is_usual(
-    rate: float, usual: float | None, age_s: float, expected: str
-) -> None:
-    assert assessment(rate, usual, age_s) == expected
+    ):
+        assert assessment(rate, usual, age_s) == expected
 
 
 def rows_of(output: str) -> dict[str, str]:

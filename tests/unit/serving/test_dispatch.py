@@ -95,15 +95,6 @@ def log() -> Iterator[LogCapture]:
     structlog.reset_defaults()
 
 
-async def test_an_unknown_tool_is_answered_with_the_nearest_names() -> None:
-    async with Client(served(tool("get_position_at", raising(ValueError())))) as client:
-        result = await client.call_tool("get_positon", {})
-        assert result.is_error
-        assert sent(result)["error"] == "invalid_arguments"
-        assert sent(result)["detail"].endswith("do you mean get_position_at?")
-        assert "the tools are: get_position_at" in sent(await client.call_tool("qqq", {}))["detail"]
-
-
 @pytest.mark.parametrize("error", [KeyError("secret"), RecursionError(), MemoryError()])
 async def test_a_fault_is_logged_and_told_without_its_inside(
     error: Exception, log: LogCapture
@@ -207,17 +198,6 @@ async def test_a_query_that_waited_and_then_ran_out_of_time_says_so(
         detail = sent(await client.call_tool("late", {}))["detail"]
         held.released.set()
     assert re.search(r" s \(it waited \d\.\d s of its time behind other calls\)", detail)
-
-
-async def test_tools_are_listed_while_queries_run_and_wait() -> None:
-    held = Held()
-    stuck = tool("stuck", held.ask)
-    async with Client(served(stuck)) as client, anyio.create_task_group() as tasks:
-        for _ in range(2 * QUICK_AT_ONCE):
-            tasks.start_soon(client.call_tool, "stuck", {})
-        await anyio.wait_all_tasks_blocked()
-        assert len((await client.list_tools()).tools) == 1
-        held.released.set()
 
 
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:

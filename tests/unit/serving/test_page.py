@@ -19,7 +19,7 @@ SCRIPT = "\n".join(text for name, text in OWN.items() if name.endswith(".js"))
 PATHS = ("/", "/page/page.js", "/page/page.css")
 
 
-async def test_the_page_is_three_files() -> None:
+async def test_the_page_is_three_files_and_allows_this_servers_own_and_nothing_else() -> None:
     async with client(app()) as http:
         for path, kind in zip(PATHS, ("html", "javascript", "css"), strict=True):
             response, head = await http.get(path), await http.head(path)
@@ -27,7 +27,20 @@ async def test_the_page_is_three_files() -> None:
             assert response.headers["content-type"] == f"text/{kind}; charset=utf-8"
             assert head.content == b""
             assert head.headers["content-length"] == response.headers["content-length"]
+            assert response.headers["content-security-policy"] == POLICY
+            assert response.headers["x-content-type-options"] == "nosniff"
+            assert response.headers["referrer-policy"] == "no-referrer"
         assert (await http.get("/")).text == HTML
+        assert (await http.post("/")).status_code == 404
+        for path in ("/index.html", "/page/", "/page/main.js", "/page/../auth.py"):
+            assert (await http.get(path)).status_code == 404
+    allowed = dict(each.split(" ", 1) for each in POLICY.split("; "))
+    for what in ("default-src", "base-uri", "form-action", "frame-ancestors"):
+        assert allowed[what] == "'none'"
+    for what in ("script-src", "style-src", "connect-src"):
+        assert allowed[what] == "'self'"
+    assert allowed["require-trusted-types-for"] == "'script'"
+    assert "unsafe" not in POLICY
 
 
 async def test_a_browser_that_has_a_file_is_not_sent_it_again() -> None:
@@ -36,29 +49,6 @@ async def test_a_browser_that_has_a_file_is_not_sent_it_again() -> None:
         again = await http.get("/page/page.js", headers={"if-none-match": first.headers["etag"]})
     assert again.status_code == 304
     assert again.content == b""
-
-
-async def test_only_these_are_the_page_and_only_to_be_read() -> None:
-    async with client(app()) as http:
-        assert (await http.post("/")).status_code == 404
-        for path in ("/index.html", "/page/", "/page/main.js", "/page/../auth.py"):
-            assert (await http.get(path)).status_code == 404
-
-
-async def test_its_policy_allows_this_servers_own_files_and_nothing_else() -> None:
-    async with client(app()) as http:
-        for path in PATHS:
-            headers = (await http.get(path)).headers
-            assert headers["content-security-policy"] == POLICY
-            assert headers["x-content-type-options"] == "nosniff"
-            assert headers["referrer-policy"] == "no-referrer"
-    allowed = dict(each.split(" ", 1) for each in POLICY.split("; "))
-    for what in ("default-src", "base-uri", "form-action", "frame-ancestors"):
-        assert allowed[what] == "'none'"
-    for what in ("script-src", "style-src", "connect-src"):
-        assert allowed[what] == "'self'"
-    assert allowed["require-trusted-types-for"] == "'script'"
-    assert "unsafe" not in POLICY
 
 
 def test_it_has_no_inline_script_or_style() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
 
 on_every_shelf = pytest.mark.parametrize("shelf", FILES, ids=str)
 
+EVERYTHING = TimeWindow.everything()
 STRING, BOOL = "std_msgs/msg/String", "std_msgs/msg/Bool"
 
 
@@ -53,7 +53,7 @@ def expected(
     messages: list[Msg], topics: Collection[str], window: TimeWindow | None = None
 ) -> list[Seen]:
     """By the contract: inside the window, by log time, ties in file order."""
-    span = window or TimeWindow.everything()
+    span = window or EVERYTHING
     wanted = [m for m in messages if m.topic in topics and span.start <= m.log_time < span.stop]
     return [
         Seen(m.topic, m.type, m.log_time, m.payload)
@@ -69,7 +69,7 @@ def read(
     *,
     newest_first: bool = False,
 ) -> list[Seen]:
-    span = window or TimeWindow.everything()
+    span = window or EVERYTHING
     return [seen(r) for r in reader.records(path, topics, span, newest_first=newest_first)]
 
 
@@ -112,7 +112,7 @@ def test_messages_come_by_log_time_and_newest_first_is_exactly_the_reverse(
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
         reader, path = shelf.stocked(Path(folder), messages)
-        for span in (window, TimeWindow.everything()):
+        for span in (window, EVERYTHING):
             found = read(reader, path, topics, span)
             assert found == expected(messages, topics, span)
             assert read(reader, path, topics, span, newest_first=True) == found[::-1]
@@ -130,7 +130,7 @@ def test_batches_hold_the_messages_of_the_records_and_their_order(
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
         reader, path = shelf.stocked(Path(folder), messages)
-        for span in (window, TimeWindow.everything()):
+        for span in (window, EVERYTHING):
             whole = batched(reader.batches(path, topics, span))
             assert whole == list(reader.records(path, topics, span))
             without = batched(reader.batches(path, topics, span, bare=bare))
@@ -145,7 +145,7 @@ def test_batches_of_one_buffer_follow_each_other_and_lie_inside_of_it(
 ) -> None:
     messages = [text(time, f"{time:0100d}", TOPICS[time % 3]) for time in range(60)]
     reader, path = shelf.stocked(tmp_path, messages)
-    batches = list(reader.batches(path, TOPICS, TimeWindow.everything()))
+    batches = list(reader.batches(path, TOPICS, EVERYTHING))
     for batch in batches:
         assert batch.starts.min() >= 0
         assert (batch.starts + batch.sizes).max() <= len(batch.buffer)
@@ -200,7 +200,7 @@ def test_a_topic_offered_as_transient_local_is_latched(shelf: Shelf, tmp_path: P
 def test_publish_times_are_kept_where_the_format_keeps_them(shelf: Shelf, tmp_path: Path) -> None:
     messages = [odom(5, 0.0, 0.0, log_time=7), odom(6, 0.0, 0.0, log_time=9)]
     reader, path = shelf.stocked(tmp_path, messages)
-    records = list(reader.records(path, ["/odom"], TimeWindow.everything()))
+    records = list(reader.records(path, ["/odom"], EVERYTHING))
     published = [5, 6] if shelf.keeps_publish_time else [7, 9]
     assert [(r.log_time, r.publish_time) for r in records] == list(
         zip([7, 9], published, strict=True)
@@ -213,7 +213,7 @@ def test_a_payload_that_does_not_fit_is_undecodable_and_is_reported(
 ) -> None:
     broken = Msg("/odom", "nav_msgs/msg/Odometry", 1, b"\x00\x01\x00\x00short")
     reader, path = shelf.stocked(tmp_path, [broken, text(2, "whole")])
-    first, second = reader.records(path, ["/odom", "/chatter"], TimeWindow.everything())
+    first, second = reader.records(path, ["/odom", "/chatter"], EVERYTHING)
     with pytest.raises(UndecodableError, match=r"^/odom \(nav_msgs/msg/Odometry\): "):
         reader.decode(first)
     assert getattr(reader.decode(second), "data", None) == "whole"
@@ -222,11 +222,10 @@ def test_a_payload_that_does_not_fit_is_undecodable_and_is_reported(
 @on_every_shelf
 def test_a_bag_that_is_gone_has_vanished_for_every_question(shelf: Shelf, tmp_path: Path) -> None:
     reader, path = shelf.stocked(tmp_path, [text(1, "x")])
-    list(reader.records(path, ["/chatter"], TimeWindow.everything()))
+    list(reader.records(path, ["/chatter"], EVERYTHING))
     path.unlink()
-    everything = TimeWindow.everything()
-    lazy = reader.records(path, ["/chatter"], everything)
-    lazy_batches = reader.batches(path, ["/chatter"], everything)
+    lazy = reader.records(path, ["/chatter"], EVERYTHING)
+    lazy_batches = reader.batches(path, ["/chatter"], EVERYTHING)
     questions = (
         lambda: next(lazy),
         lambda: next(lazy_batches),
@@ -247,12 +246,11 @@ def test_what_is_no_bag_counts_as_closed_and_its_fault_is_reported(
     reader, path = shelf.stocked(tmp_path, [text(1, "x")])
     path.write_bytes(b"FROM ros:jazzy\nRUN true\n" * 30)
     assert reader.closing(path) is Closing.CLOSED
-    everything = TimeWindow.everything()
     questions = (
         lambda: reader.summarize(path),
         lambda: reader.channels(path),
-        lambda: list(reader.records(path, ["/chatter"], everything)),
-        lambda: list(reader.batches(path, ["/chatter"], everything)),
+        lambda: list(reader.records(path, ["/chatter"], EVERYTHING)),
+        lambda: list(reader.batches(path, ["/chatter"], EVERYTHING)),
     )
     for question in questions:
         with pytest.raises(BagError) as caught:
@@ -292,7 +290,7 @@ def test_a_bag_deleted_while_it_is_read_still_answers_to_the_end(
 ) -> None:
     messages = [text(time, f"{time:0100d}") for time in range(50)]
     reader, path = shelf.stocked(tmp_path, messages)
-    records = reader.records(path, ["/chatter"], TimeWindow.everything())
+    records = reader.records(path, ["/chatter"], EVERYTHING)
     first = seen(next(records))
     path.unlink()
     assert [first, *map(seen, records)] == expected(messages, ["/chatter"])
@@ -321,28 +319,6 @@ def test_threads_that_read_at_once_all_get_the_same(shelf: Shelf, tmp_path: Path
         answers = list(pool.map(ask, range(16)))
     whole = expected(messages, TOPICS)
     assert answers == [whole if turn % 2 == 0 else whole[::-1] for turn in range(16)]
-
-
-@on_every_shelf
-def test_an_iteration_given_up_closes_the_file(shelf: Shelf, tmp_path: Path) -> None:
-    reader, path = shelf.stocked(tmp_path, [text(time, "x") for time in range(20)])
-    read(reader, path, ["/chatter"])
-    before = open_files()
-    records = reader.records(path, ["/chatter"], TimeWindow.everything())
-    next(records)
-    opened = open_files() - before
-    assert opened
-    del records
-    assert not open_files() & opened
-
-
-def open_files() -> set[tuple[str, str]]:
-    """The descriptors of this process, each with what it leads to."""
-    found = set()
-    for descriptor in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # that of the listing itself is closed by now
-            found.add((descriptor.name, str(descriptor.readlink())))
-    return found
 
 
 @on_every_shelf

@@ -72,10 +72,6 @@ def trajectory(**other: Any) -> results.TrajectorySummary:
     ("error", "text"),
     [
         (
-            NoDataError(NoDataReason.GAP, "the nearest is 3 s off"),
-            '{"error":"no_data","reason":"gap","detail":"the nearest is 3 s off"}',
-        ),
-        (
             NoDataError(NoDataReason.GAP, "nothing", ("1 file is damaged",)),
             '{"error":"no_data","reason":"gap","detail":"nothing","notes":["1 file is damaged"]}',
         ),
@@ -83,7 +79,6 @@ def trajectory(**other: Any) -> results.TrajectorySummary:
             UndecodableError("/x", "a/msg/B", "no definition"),
             '{"error":"no_data","reason":"undecodable","detail":"/x (a/msg/B): no definition"}',
         ),
-        (InvalidArgumentsError("say a"), '{"error":"invalid_arguments","detail":"say a"}'),
         (QueryTimeoutError("say a"), '{"error":"timeout","detail":"say a"}'),
         (ConfigError("say a"), '{"error":"invalid_config","detail":"say a"}'),
     ],

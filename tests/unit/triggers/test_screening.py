@@ -86,15 +86,6 @@ def test_a_recording_from_before_is_left_alone(bags: ScreenedBags) -> None:
     assert bags.seconds() == halves(0, 10)
 
 
-@pytest.mark.parametrize("keeps", [False, True])
-def test_a_topic_that_is_never_heard(tmp_path: Path, keeps: bool) -> None:
-    bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=not keeps))
-    bags.split(bags.begin(0), words(0, 10))
-    bags.end()
-    assert bags.seconds() == (halves(0, 10) if keeps else [])
-    assert len(bags.served()) == 1
-
-
 def test_a_topic_that_falls_silent(bags: ScreenedBags) -> None:
     said = [mode(n, value=False) for n in range(5)]
     bags.split(bags.begin(0), [*said, *words(0, 10)], VOLATILE)

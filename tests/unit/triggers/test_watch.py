@@ -41,24 +41,6 @@ def seconds(begin: int, stop: int, true_at: Collection[int] = ()) -> list[Msg]:
     return [flag(n, n in true_at) for n in range(begin, stop)]
 
 
-def test_what_comes_after_it_follows_when_it_is_closed(robot: WatchedBags) -> None:
-    name = robot.begin(T0)
-    robot.split(seconds(0, 10, {7}))
-    robot.clock.at = T0 + 9 * S
-    robot.look()
-    [moment] = robot.moments()
-    assert (moment.moment.pending, len(moment.files)) == (True, 1)
-    # A recorder that was killed meanwhile goes on with it.
-    robot.house = robot.new_house()
-    robot.split(seconds(10, 20), name)
-    robot.split(seconds(20, 30), name)
-    robot.clock.at = T0 + 31 * S
-    robot.house.keep_moments()
-    [moment] = robot.moments()
-    assert (moment.moment.pending, len(moment.files)) == (False, 2)
-    assert moment.moment.missing == ()
-
-
 def test_what_was_never_recorded_of_it_is_said(robot: WatchedBags) -> None:
     robot.begin(T0)
     robot.split(seconds(0, 8, {1, 7}))
