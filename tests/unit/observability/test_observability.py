@@ -6,7 +6,6 @@ Gauges of a memory are measured without a look at its bags.
 from __future__ import annotations
 
 import threading
-import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -17,8 +16,6 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import QuerySettings
-from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.support.bags import text, write_mcap
 from tests.support.clocks import SettableClock
@@ -139,22 +136,6 @@ def test_the_bag_directory_is_not_scanned_for_them(tmp_path: Path) -> None:
     assert (last["bags"], last["kept_bytes"] > first["kept_bytes"]) == (2, True)
     aside = [last[f"files_set_aside {state}"] for state in ("active", "damaged", "unread")]
     assert aside == [0, 1, 0]
-
-
-def test_they_show_how_much_is_kept_and_how_old_the_newest_is(tmp_path: Path) -> None:
-    path = tmp_path / "a" / "a_0.mcap"
-    write_mcap(path, [text(T0, "x"), text(T0 + NS_PER_S, "y")])
-    clock = SettableClock(time.time_ns() + 3600 * NS_PER_S)
-    kept = RetentionLimits(max_total_bytes=5000, max_age_ns=NS_PER_S, min_free_bytes=0)
-    memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(kept=kept))
-    memory.index.refresh()
-    scanned, clock.at = clock.at, clock.at + 4 * NS_PER_S
-    found = measured(MemoryGauges(memory))
-    assert found["budget_bytes"] == 5000
-    assert not any(name.startswith("recorder") for name in found)
-    assert found["kept_bytes"] == path.stat().st_size
-    assert found["index_age_seconds"] == 4.0
-    assert found["newest_data_age_seconds"] == (scanned - T0) / NS_PER_S + 3
 
 
 def test_they_show_what_the_recorder_reports_and_whether_it_is_another_one(tmp_path: Path) -> None:

@@ -142,10 +142,6 @@ def budget(size: int) -> RetentionLimits:
     return RetentionLimits(max_total_bytes=size, max_age_ns=10**6 * DAY)
 
 
-def hours(count: int) -> RetentionLimits:
-    return RetentionLimits(max_total_bytes=PLENTY, max_age_ns=count * HOUR)
-
-
 moments = st.one_of(
     st.integers(0, 400).map(lambda ago: NOW - ago * HOUR),
     st.integers(0, 400).map(lambda ago: NOW - 300 * DAY - ago * HOUR),

@@ -221,11 +221,6 @@ def test_it_comes_from_a_file_whose_last_line_may_end(tmp_path: Path, ending: st
     assert revealed({"MEMORY_API_TOKEN_FILE": str(file)}) == GOOD
 
 
-def test_it_comes_from_the_credentials_of_a_systemd_unit(tmp_path: Path) -> None:
-    (tmp_path / "memory_api_token").write_text(GOOD + "\n")
-    assert revealed({"CREDENTIALS_DIRECTORY": str(tmp_path)}) == GOOD
-
-
 def test_two_that_give_it_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "memory_api_token").write_text(GOOD)
     reply = refused({"MEMORY_API_TOKEN": GOOD, "CREDENTIALS_DIRECTORY": str(tmp_path)})

@@ -440,26 +440,6 @@ async def test_a_body_too_large_is_refused_by_its_stated_length_or_by_what_is_co
     assert refused.taken == taken
 
 
-async def test_a_call_whose_client_leaves_is_ended() -> None:
-    ended = anyio.Event()
-
-    async def stuck(_scope: Any, receive: Any, _send: Any) -> None:
-        await receive()
-        try:
-            await anyio.sleep_forever()
-        finally:
-            ended.set()
-
-    leaving = Client(b"{}")
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(leaving.asks, stuck)
-        await anyio.wait_all_tasks_blocked()
-        assert not ended.is_set()
-        leaving.leaves.set()
-    assert ended.is_set()
-    assert leaving.sent == []
-
-
 async def test_a_client_that_leaves_before_its_body_is_whole_reaches_no_application() -> None:
     async def never(_scope: Any, _receive: Any, _send: Any) -> None:
         pytest.fail("there is no whole request")

@@ -19,6 +19,7 @@ from mcp.types import CallToolResult, TextContent
 from structlog.testing import LogCapture
 
 from ros2_memory import results
+from ros2_memory.columns.fill import Progress
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -59,10 +60,16 @@ def value(shown: Any) -> results.TopicValue:
     return results.TopicValue("/a", "a/msg/A", Sample(0, shown))
 
 
-def served(*tools: Tool, timeout_s: float = 25.0, **options: Any) -> EpisodicServer:
+def served(
+    *tools: Tool,
+    timeout_s: float = 25.0,
+    progress: Callable[[], Progress] | None = None,
+    **options: Any,
+) -> EpisodicServer:
     replies = Replies(Path("bags"), 24_000)
     dispatcher = Dispatcher(NOBODY, tools, replies, call_timeout_s=timeout_s, **options)
-    return EpisodicServer(dispatcher, name="episodic", version="1.2.3", instructions="Ask away.")
+    about = {"name": "episodic", "version": "1.2.3", "instructions": "Ask away."}
+    return EpisodicServer(dispatcher, **about, progress=progress)
 
 
 def sent(result: CallToolResult) -> Any:
@@ -222,6 +229,21 @@ class Held:
         self.begun += 1
         assert self.released.wait(20)
         return value(self.begun)
+
+
+async def test_a_client_that_asks_for_progress_receives_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ros2_memory.serving.mcp_server.PROGRESS_EVERY_S", 0.001)
+    held, states = Held(), iter([Progress(10, 4, 6), *[Progress(10, 6, 4)] * 100_000])
+    reported: list[tuple[float, str | None]] = []
+
+    async def note(progress: float, total: float | None, message: str | None) -> None:
+        reported.append((progress, message))
+        if len(reported) == 2:
+            held.released.set()
+
+    async with Client(served(tool("slow", held.ask), progress=lambda: next(states))) as client:
+        await client.call_tool("slow", {}, progress_callback=note, meta={"progress_token": 0})
+    assert reported[:2] == [(1, "40 % of the bags stored"), (2, "60 % of the bags stored")]
 
 
 async def test_one_client_that_floods_the_server_does_not_starve_another() -> None:

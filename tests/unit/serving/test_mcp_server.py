@@ -6,7 +6,6 @@ import json
 import re
 from typing import TYPE_CHECKING, Any
 
-import anyio
 import pytest
 from mcp import Client
 from mcp.server.apps import APP_MIME_TYPE, EXTENSION_ID
@@ -23,7 +22,6 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.bootstrap import build_memory, build_server
-from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
@@ -145,40 +143,6 @@ async def test_one_moment_is_a_resource(tmp_path: Path) -> None:
         refused = await read(client, "episodic://moments/spilt-coffee")
     assert refused["error"] == "invalid_arguments"
     assert name in refused["detail"]
-
-
-async def test_a_client_that_asks_for_progress_receives_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The call waits for a first report, so it cannot be faster than one."""
-    write_run(tmp_path)
-    monkeypatch.setattr("ros2_memory.serving.mcp_server.PROGRESS_EVERY_S", 0.001)
-    states = iter([Progress(10, 4, 6), *[Progress(10, 6, 4)] * 100_000])
-    asked = build_server(
-        settings_of(tmp_path), build_memory(settings_of(tmp_path)), progress=lambda: next(states)
-    )
-    reported: list[tuple[float, float | None, str | None]] = []
-    was_reported = anyio.Event()
-    answer = asked.dispatcher.answer
-
-    async def late(*args: Any, **options: Any) -> Any:
-        await was_reported.wait()
-        return await answer(*args, **options)
-
-    async def note(progress: float, total: float | None, message: str | None) -> None:
-        reported.append((progress, total, message))
-        if len(reported) == 2:
-            was_reported.set()
-
-    monkeypatch.setattr(asked.dispatcher, "answer", late)
-    async with Client(asked) as client:
-        with anyio.fail_after(60):
-            await client.call_tool(
-                "list_frames", {}, progress_callback=note, meta={"progress_token": 0}
-            )
-    assert [each[0] for each in reported[:2]] == [1, 2]
-    assert reported[0][2] == "40 % of the bags stored"
-    assert reported[1][2] == "60 % of the bags stored"
 
 
 async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path) -> None:

@@ -104,14 +104,6 @@ async def test_whether_it_records_is_a_status_of_its_own(
     assert (hidden.status_code, hidden.json()) == (status, {"recording": status == 200})
 
 
-async def test_health_shows_its_status_alone_to_whoever_shows_no_token() -> None:
-    async with client(app(api_token=GOOD)) as http:
-        assert (await http.get("/health")).json() == {"status": "ok"}
-        shown = await http.get("/health", headers=SHOWN)
-        assert shown.json() == {"status": "ok", "bags": 3}
-        assert (await http.get("/health", headers={"authorization": "Bearer x"})).status_code == 401
-
-
 HELLO: dict[str, Any] = {
     "jsonrpc": "2.0",
     "id": 1,
