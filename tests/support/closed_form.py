@@ -8,18 +8,13 @@ left about (0, 2). Header stamps are T0 + t exactly; log times lie some millisec
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import yaml
 from mcap.writer import CompressionType
 
 from tests.support.bags import (
-    TRANSIENT_LOCAL,
-    VOLATILE,
     McapLayout,
     Msg,
     battery,
@@ -31,6 +26,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
+from tests.support.housekeepers import described
 from tests.support.memories import ROOT
 from tests.support.shared_bags import RECORDED
 
@@ -113,14 +109,10 @@ _LAYOUT: Final = McapLayout(chunk_size=16_384, compression=CompressionType.ZSTD)
 def written_session(folder: Path) -> Session:
     """Writes 65 s of the simulated robot as `ros2 bag record` lays them out: splits of 10 s."""
     session = Session(folder, 1795144003095000000)
-    splits = [
-        [*_messages(session.t0, first, min(first + _SPLIT_TICKS, _TICKS))]
-        for first in range(0, _TICKS, _SPLIT_TICKS)
-    ]
-    names = [f"{folder.name}_{nth}.mcap" for nth in range(len(splits))]
-    for name, messages in zip(names, splits, strict=True):
-        write_mcap(folder / name, messages, _LAYOUT)
-    (folder / "metadata.yaml").write_text(yaml.safe_dump(_metadata(names, splits)))
+    for nth, first in enumerate(range(0, _TICKS, _SPLIT_TICKS)):
+        messages = _messages(session.t0, first, min(first + _SPLIT_TICKS, _TICKS))
+        write_mcap(folder / f"{folder.name}_{nth}.mcap", messages, _LAYOUT)
+    described(folder)
     return session
 
 
@@ -151,42 +143,3 @@ def _messages(t0: int, first: int, stop: int) -> Iterator[Msg]:
 
 def _is_seen(name: str, t: float) -> bool:
     return any(begin <= t < end for begin, end in SEEN[name])
-
-
-def _metadata(names: list[str], splits: list[list[Msg]]) -> object:
-    def span(messages: list[Msg]) -> dict[str, object]:
-        first, last = messages[0].log_time, messages[-1].log_time
-        return {
-            "starting_time": {"nanoseconds_since_epoch": first},
-            "duration": {"nanoseconds": last - first},
-            "message_count": len(messages),
-        }
-
-    every = [*chain(*splits)]
-    topics = [
-        {
-            "topic_metadata": {
-                "name": topic,
-                "type": type_name,
-                "serialization_format": "cdr",
-                "offered_qos_profiles": TRANSIENT_LOCAL if topic in _LAYOUT.latched else VOLATILE,
-                "type_description_hash": "",
-            },
-            "message_count": count,
-        }
-        for (topic, type_name), count in Counter((each.topic, each.type) for each in every).items()
-    ]
-    files = [{"path": name, **span(part)} for name, part in zip(names, splits, strict=True)]
-    about = {
-        "version": 9,
-        "storage_identifier": "mcap",
-        **span(every),
-        "topics_with_message_count": topics,
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": names,
-        "files": files,
-        "custom_data": None,
-        "ros_distro": "jazzy",
-    }
-    return {"rosbag2_bagfile_information": about}

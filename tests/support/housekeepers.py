@@ -14,6 +14,7 @@ from mcap.writer import Writer
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import DELETED_FILE, LIST_FILE, MOMENT_FILE, OWN_FOLDER
+from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.bag_dir.moment_file import (
     Outcome,
     PendingRequest,
@@ -202,6 +203,17 @@ def recording(bag_dir: Path, name: str, start: int, splits: int = 6) -> list[Pat
     made = [bag(bag_dir / name / f"{name}_{n}.mcap", start + n * 10) for n in range(splits)]
     (bag_dir / name / "handover.json").write_text('{"format": 1}')
     return made
+
+
+def described(recording: Path) -> Path:
+    """Writes metadata.yaml of a recording, as its recorder would have left it."""
+    reader, path = McapReader(), recording / "metadata.yaml"
+    contents = {
+        bag.name: Contents(reader.summarize(bag), reader.channels(bag))
+        for bag in sorted(recording.glob("*.mcap"))
+    }
+    path.write_text(describing("", contents))
+    return path
 
 
 def asked(

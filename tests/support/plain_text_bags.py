@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.storage.base import BagReader, Channel, Closing, Record
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.mcap_reader import McapReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable
     from pathlib import Path
-
-    from ros2_memory.core.model import TimeWindow
 
 
 def plain(
@@ -49,10 +48,11 @@ def close(path: Path) -> None:
         stream.write("END")
 
 
-class PlainReader(BagReader):
-    """Reads plain bags, and counts by file name what it was asked for."""
+class PlainReader(McapReader):
+    """Reads plain bags but their messages, and counts by file name what it was asked for."""
 
     def __init__(self, *kinds: str) -> None:
+        super().__init__()
         self.kinds = kinds or (".mcap",)
         self.closings: Counter[str] = Counter()
         self.summaries: Counter[str] = Counter()
@@ -88,25 +88,6 @@ class PlainReader(BagReader):
             silent=tuple(topic for (topic, _), at in times.items() if not at),
             complete=text.endswith("END"),
         )
-
-    def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
-    ) -> Iterator[Record]:
-        raise NotImplementedError
-
-    def undecodable(self, channel: Channel) -> str | None:
-        raise NotImplementedError
-
-    def channels(self, path: Path) -> Sequence[Channel]:
-        raise NotImplementedError
-
-    def decode(self, record: Record) -> object:
-        raise NotImplementedError
 
 
 def _text(path: Path) -> str:

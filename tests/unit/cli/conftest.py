@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.columns.pack import decompressed
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.program import exits
 
 if TYPE_CHECKING:
@@ -27,17 +25,6 @@ def left(path: Path) -> Path:
     """Nobody has written to the file for an hour."""
     hour_ago = time.time() - 3600
     os.utime(path, (hour_ago, hour_ago))
-    return path
-
-
-def described(recording: Path) -> Path:
-    """Writes metadata.yaml of a recording, as its recorder would have left it."""
-    reader, path = McapReader(), recording / "metadata.yaml"
-    contents = {
-        bag.name: Contents(reader.summarize(bag), reader.channels(bag))
-        for bag in sorted(recording.glob("*.mcap"))
-    }
-    path.write_text(describing("", contents))
     return path
 
 

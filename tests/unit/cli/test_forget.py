@@ -18,8 +18,8 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.housekeepers import embedding, made_moment, own_all
-from tests.unit.cli.conftest import columns_in, described, left, locked
+from tests.support.housekeepers import described, embedding, made_moment, own_all
+from tests.unit.cli.conftest import columns_in, left, locked
 
 if TYPE_CHECKING:
     from collections.abc import Callable

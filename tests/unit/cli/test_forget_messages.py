@@ -45,8 +45,8 @@ from tests.support.bags import (
     write_db3,
     write_mcap,
 )
-from tests.support.housekeepers import made_moment, own_all
-from tests.unit.cli.conftest import columns_in, described, left, locked
+from tests.support.housekeepers import described, made_moment, own_all
+from tests.unit.cli.conftest import columns_in, left, locked
 
 if TYPE_CHECKING:
     from collections.abc import Callable

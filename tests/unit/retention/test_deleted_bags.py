@@ -23,7 +23,18 @@ from ros2_memory.bag_dir.state_files import (
 )
 from tests.support.clocks import SettableClock
 from tests.support.fakes import failing
-from tests.support.housekeepers import NOW, T0, A, B, S, house_of, kept, recording, size_of
+from tests.support.housekeepers import (
+    NOW,
+    T0,
+    A,
+    B,
+    S,
+    described,
+    house_of,
+    kept,
+    recording,
+    size_of,
+)
 from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
@@ -33,16 +44,10 @@ T0_S = T0 // S
 TRUE = {"topic": "/odom", "condition_type": "above", "value": 1e6, "field": "position.x"}
 
 
-def listed(bag_dir: Path, name: str, start: int, splits: int = 6) -> list[Path]:
+def listed(bag_dir: Path, name: str, start: int) -> list[Path]:
     """A recording with the metadata.yaml that rosbag2 writes at its end."""
-    made = recording(bag_dir, name, start, splits)
-    (bag_dir / name / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information:\n  version: 9\n"
-        f"  message_count: {10 * splits}\n  relative_file_paths:\n"
-        + "".join(f"    - {path.name}\n" for path in made)
-        + "  files:\n"
-        + "".join(f"    - path: {path.name}\n      message_count: 10\n" for path in made)
-    )
+    made = recording(bag_dir, name, start)
+    described(bag_dir / name)
     return made
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,7 @@ from tests.support.bags import (
     stamp,
     write_mcap,
 )
-from tests.support.log_lines import with_checks
+from tests.support.housekeepers import described, own_all
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary
 from tests.support.memories import asked, each_way, memory_of
 
@@ -119,15 +118,9 @@ def test_that_a_long_array_was_not_searched_is_said_whatever_the_newest_is(
 def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_never(
     bag_dir: Path, recalls: bool
 ) -> None:
-    names = "".join(f"  - rec_{n}.mcap\n" for n in range(3))
-    metadata = "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n"
-    (bag_dir / "rec" / "metadata.yaml").write_text(metadata + names)
+    described(bag_dir / "rec")
+    own_all(bag_dir)
     (bag_dir / "rec" / "rec_0.mcap").unlink()
-    own = bag_dir / ".episodic" / "recordings.jsonl"
-    own.parent.mkdir()
-    inode = (bag_dir / "rec").stat().st_ino
-    mine = json.dumps({"recording": "rec", "inode": inode})
-    own.write_text(with_checks(mine))
     wanted = {"topic": "/rosout", "condition_type": "contains", "value": "never"}
     memory = memory_of(bag_dir, recalls=recalls)
     assert asked(memory, bag_dir, "find_last_match", **wanted) is None
