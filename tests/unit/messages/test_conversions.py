@@ -11,6 +11,7 @@ from ros2_memory.messages.conversions import (
     ABSENT,
     descend,
     view,
+    xyz,
 )
 from tests.support import bags
 
@@ -61,6 +62,13 @@ def test_a_point_cloud_is_its_size_and_points() -> None:
         is_dense=True,
     )
     assert view(cloud, "data") == {"bytes": 3200, "points": 200, "shape": [2, 100]}
+
+
+@pytest.mark.parametrize(
+    "node", [None, [1.0, 2.0, 3.0], {"x": True, "y": 2.0, "z": 3.0}, {"x": 10**400, "y": 2, "z": 3}]
+)
+def test_what_is_not_shaped_like_a_point_is_none(node: object) -> None:
+    assert xyz(node) is None
 
 
 def test_the_numbers_of_an_array_are_reached_by_number_and_have_no_fields() -> None:
