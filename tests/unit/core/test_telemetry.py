@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
-
 import anyio
 
-from ros2_memory import results
-from ros2_memory.core.large_reads import LargeReads
-from ros2_memory.core.model import Sample
 from ros2_memory.core.telemetry import Answered, Observer, Telemetry
-from ros2_memory.history.context import Memory
 from ros2_memory.serving.dispatch import Dispatcher
-from ros2_memory.tools.declaration import Tool
-from ros2_memory.tools.replies import Replies
+from tests.unit.serving.test_dispatch import served, tool, value
 
 
 class Heard(Observer):
@@ -31,18 +22,8 @@ class Failing(Observer):
         raise RuntimeError("the observer's own fault")
 
 
-def good(_memory: Any, call: Any) -> Any:
-    with call.stages.timed("read"):
-        return results.TopicValue("/a", "a/msg/A", Sample(0, 7))
-
-
-def dispatcher(*observers: Observer) -> Dispatcher:
-    schema: dict[str, Any] = {"type": "object", "properties": {}}
-    tools = [Tool("good", "good", lambda: ("Asks.", schema), False, lambda _given: good)]
-    replies = Replies(Path("bags"), 1000)
-    telemetry = Telemetry(observers)
-    nobody = cast("Memory", SimpleNamespace(large=LargeReads()))
-    return Dispatcher(nobody, tools, replies, call_timeout_s=5, telemetry=telemetry)
+def dispatcher(observer: Observer) -> Dispatcher:
+    return served(tool("good", lambda _: value(7)), telemetry=Telemetry((observer,))).dispatcher
 
 
 async def test_a_call_that_its_client_left_is_told_as_cancelled() -> None:

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.retention.repair import Repairer
-from ros2_memory.storage.base import Closing, Record
+from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap.salvage import Salvage
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import files_in
+from tests.unit.storage.mcap.test_writer import contents
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -35,12 +35,6 @@ def repairer() -> Repairer:
 def left_open(path: Path) -> Path:
     layout = McapLayout(chunk_size=4000, finish=False)
     return write_mcap(path, MESSAGES, layout)
-
-
-def contents(path: Path) -> list[Record]:
-    reader = McapReader()
-    topics = [each.topic for each in reader.summarize(path).topics]
-    return list(reader.records(path, topics, TimeWindow.everything()))
 
 
 def test_a_bag_that_was_left_open_is_closed_with_its_name_rights_and_time(tmp_path: Path) -> None:
