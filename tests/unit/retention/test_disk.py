@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.retention.disk import HomeDisk, device_of
+from ros2_memory.core.errors import BagError, BagUnreachableError
+from ros2_memory.retention.disk import RETRIED_S, FailingFiles, HomeDisk, device_of
 
 
 class Devices:
@@ -55,3 +56,12 @@ def test_what_is_recorded_on_another_disk_makes_it_none_of_its_own(
     assert home.is_away([])
     (tmp_path / "rec_b").mkdir()
     assert home.is_away(["rec_b"])
+
+
+def test_a_file_is_given_up_after_a_day_unless_it_was_read_meanwhile() -> None:
+    path, fault = Path("a_0.mcap"), BagUnreachableError("a_0.mcap", "Input/output error")
+    hours = [*range(24), 24, 72, 73]
+    files = FailingFiles(iter([hour * RETRIED_S / 24 for hour in hours]).__next__)
+    found = [files.may_recover(path, fault) for _ in hours]
+    assert found == [True] * 24 + [False, True, True]
+    assert not files.may_recover(path, BagError("a_0.mcap", "it is damaged"))

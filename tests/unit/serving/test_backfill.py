@@ -130,6 +130,17 @@ def test_bags_that_a_crash_left_open_keep_nothing_from_being_joined(
     assert joined[0] == joined[1] != []
 
 
+def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path: Path) -> None:
+    bag_dir, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
+    bag(bag_dir, 0)
+    memory, backfill = storing(bag_dir)
+    fill_store(backfill)
+    bag_dir.rename(elsewhere)
+    backfill.prune()
+    elsewhere.rename(bag_dir)
+    assert stored(memory) == ["rec/rec_0.mcap"]
+
+
 @pytest.mark.parametrize("helper", [["/no/such/program"], [sys.executable, "-c", "exit(3)"]])
 async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
     tmp_path: Path, helper: list[str]
