@@ -115,6 +115,20 @@ def test_a_map_is_proposed_where_it_is_latched_and_came_once() -> None:
         assert judge([offered])[offered].choice is choice
 
 
+def test_a_message_takes_its_payload_and_what_mcap_adds() -> None:
+    one = Offered("/a", "a/msg/A", messages=5, hz=1.0, payload_bytes=69.0)
+    # (69 + 31) / 2 compressed, and 16 of an index, in each of 86,400 s.
+    assert DISK.bytes_per_day([one]) == pytest.approx(86_400 * 66)
+    assert DISK.bytes_per_day([one, one]) == pytest.approx(2 * 86_400 * 66)
+    assert replace(DISK, columns_share=0.5).bytes_per_day([one]) == pytest.approx(86_400 * 99)
+
+
+def test_files_take_their_definitions_and_a_list_of_those_before() -> None:
+    # 8,640 files of 20,000 bytes; a recording has 60, each of which lists 30 others on average.
+    assert DISK.files_per_day == pytest.approx(8640 * (20_000 + 30 * 342))
+    assert replace(DISK, split_s=20).files_per_day < DISK.files_per_day / 2
+
+
 def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> None:
     large = replace(DISK, budget_bytes=100e9)
     assert propose([ODOM, SCAN], large)[SCAN].choice is Choice.RECORD
