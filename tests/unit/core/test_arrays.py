@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.arrays import Columns, distinct_rows
+from ros2_memory.core.arrays import Columns, distinct_rows, gathered
+
+PAIR = np.dtype([("number", "<u2"), ("value", "<f8")])
+
+
+def test_nothing_is_gathered_behind_the_end() -> None:
+    last = np.array([2])
+    assert gathered(b"abcd", np.dtype("<u2"), last).tolist() == [struct.unpack("<H", b"cd")[0]]
+    with pytest.raises(IndexError):
+        gathered(b"abcd", np.dtype("<u2"), last + 1)
+    with pytest.raises(IndexError):
+        gathered(b"a", np.dtype("<u4"), np.array([0]))
+    assert gathered(b"", PAIR, np.empty(0, np.int64)).size == 0
 
 
 @given(st.lists(st.tuples(st.integers(-(2**63), 2**63 - 1), st.integers(-9, 300))))

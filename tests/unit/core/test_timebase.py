@@ -16,6 +16,8 @@ from ros2_memory.core.timebase import (
     iso_local,
     local_text,
     ns_from_unix,
+    rest_of_text_s,
+    rounded_off_s,
     unix_from_ns,
     unix_from_text,
     unix_rounded_up,
@@ -96,6 +98,27 @@ def test_local_times_of_replies_are_read_as_they_were_written(moment: int) -> No
     again = unix_from_text(local_text(moment) or "")
     assert whole == again
     assert local_text(ns_from_unix(again)) == local_text(moment)
+
+
+@pytest.mark.parametrize(
+    ("text", "rest_s"),
+    [
+        ("2026-11-20T14:05:03.745", 0.001),
+        ("2026-11-20 14:05:03,7+01:00", 0.1),
+        ("14:05:03.745616", 0.0),
+        ("2026-11-20T14:05:03.745616001", 0.0),
+        ("2026-11-20T14:05:03", 1.0),
+        ("Tue 2026-11-17 14:05:03", 1.0),
+        ("Tue 2026-11-17 14:05", 0.0),
+        ("2026-11-20", 0.0),
+        ("1784023200.745", 0.0),
+        ("now", 0.0),
+    ],
+)
+def test_the_last_decimal_of_a_text_is_all_part_of_it(text: str, rest_s: float) -> None:
+    assert rest_of_text_s(text) == pytest.approx(rest_s, abs=2e-6)
+    was_rounded = text.startswith("Tue")
+    assert rounded_off_s(text) == pytest.approx(rest_s if was_rounded else 0.0, abs=2e-6)
 
 
 def test_unix_seconds_in_quotes_are_read_where_they_can_be_no_date() -> None:

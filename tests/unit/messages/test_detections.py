@@ -123,6 +123,26 @@ def test_what_lies_too_deep_is_not_looked_into() -> None:
         assert without_low_scores({"data": hostile}, 0.5) == {"data": hostile}
 
 
+@pytest.mark.parametrize(
+    ("said", "score"),
+    [
+        ({"score": 0.5}, 0.5),
+        ({"confidence": 1}, 1),
+        ({"probability": 0.25}, 0.25),
+        ({"score": True, "confidence": 0.5}, 0.5),
+        ({"score": "high"}, None),
+        ({"score": 10**400}, None),
+        ({"score": float("nan")}, None),
+        ({}, None),
+    ],
+    ids=str,
+)
+def test_a_score_is_a_number_under_one_of_its_names(
+    said: dict[str, JsonValue], score: float | None
+) -> None:
+    assert detections_of([{"label": "cup", **said}]) == (Detection("cup", score=score),)
+
+
 SCORED: JsonValue = {
     "detections": [
         {"label": "cup", "score": 0.4},

@@ -5,7 +5,7 @@ import pytest
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import Msg, definition, text
+from tests.support.bags import Msg, definition, odom, text
 
 
 def record_of(message: Msg, schema: Schema | None = None) -> Record:
@@ -17,6 +17,15 @@ def test_big_endian_messages_are_read() -> None:
     payload = b"\x00\x00\x00\x00" + b"\x00\x00\x00\x03hi\x00"
     record = record_of(text(1, "x"))._replace(payload=payload)
     assert getattr(McapReader().decode(record), "data", "") == "hi"
+
+
+def test_every_cut_of_a_payload_is_undecodable_and_nothing_else() -> None:
+    whole = record_of(odom(1, 2.0, 3.0))
+    decoding = McapReader()
+    for size in range(len(whole.payload)):
+        with pytest.raises(UndecodableError):
+            decoding.decode(whole._replace(payload=whole.payload[:size]))
+    assert decoding.decode(whole)
 
 
 def test_a_message_of_a_type_whose_definition_is_empty_names_what_to_set() -> None:

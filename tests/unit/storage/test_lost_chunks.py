@@ -140,6 +140,19 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported
         assert "a_0.mcap could not be read whole" in found.notes[0]
 
 
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_what_is_read_for_copies_alone_is_not_reported_when_it_is_damaged(
+    tmp_path: Path, newest_first: bool
+) -> None:
+    memory = overlapping(tmp_path)
+    view = View(memory, Call())
+    found = view.stream.messages(["/chatter"], TimeWindow(2 * S, 4 * S), newest_first=newest_first)
+    assert len(list(found)) == 2
+    assert view.notes.sentences() == ()
+    list(view.stream.messages(["/chatter"], TimeWindow(S, 4 * S), newest_first=newest_first))
+    assert len(view.notes.sentences()) == 1
+
+
 def test_sightings_report_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
     memory = overlapping(tmp_path)
     for each in (memory, with_store(memory, tmp_path)):

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import Reader as RosbagsReader
 
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
@@ -19,7 +20,7 @@ from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write
 from tests.support.examples import examples
 from tests.support.fakes import files_limited_to
 from tests.support.reader_cases import LAYOUTS
-from tests.support.shared_bags import REAL, needs_real
+from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -149,6 +150,27 @@ class TestRewriting:
         with pytest.raises(BagError, match="File exists"):
             McapWriter().rewrite(source, target)
         assert target.read_bytes() == b"somebody's"
+
+    @needs_recorded
+    @pytest.mark.parametrize(
+        ("name", "count"),
+        [
+            ("session_killed_chunk64k/session_killed_chunk64k_2", 251),
+            ("extra/full_truncated/fullsmall_4", 94),
+        ],
+    )
+    def test_what_a_killed_recorder_left_is_read_by_other_libraries_afterwards(
+        self, tmp_path: Path, name: str, count: int
+    ) -> None:
+        source, target = RECORDED / f"{name}.mcap", tmp_path / "b.mcap"
+        assert McapWriter().rewrite(source, target).messages == count
+        before = contents(source)
+        with RosbagsReader(target) as reader:
+            assert reader.message_count == count
+            read = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
+        assert sorted(read) == sorted(
+            (each.channel.topic, each.log_time, each.payload) for each in before
+        )
 
     @needs_real
     def test_what_anybody_recorded_is_the_same_afterwards(self, tmp_path: Path) -> None:
