@@ -51,6 +51,13 @@ def test_what_was_never_seen_is_new(tmp_path: Path) -> None:
     assert RecordedTime(tmp_path).since(["copied"])["copied"] >= 60 * S
 
 
+def test_a_kill_forgets_a_minute_at_most(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    recorded(RecordedTime(tmp_path), "a", 119)
+    recorded(RecordedTime(tmp_path), "b", 119)
+    assert 60 * S <= RecordedTime(tmp_path).since(["a"])["a"] <= 119 * S
+
+
 def test_silence_does_not_count_for_more_than_a_minute(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     time = RecordedTime(tmp_path)
