@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.bag_dir.state_files import Loss
     from ros2_memory.history.view import View
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
@@ -156,14 +157,16 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
 def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterator[str]:
     """Yields a sentence for each reason for which nothing was recorded in a part of a window.
 
+    And one where recording ended unexpectedly after the newest data, which no gap shows yet.
     Without a reason where none is known, unless only gaps that are `explained` are asked for.
     """
     bag_dir, touched = view.bag_dir, view.gaps(window)
-    if not touched:
-        return
     interruptions = [
         loss for loss in read_losses(bag_dir, MIN_NS, MAX_NS) if loss.by in INTERRUPTIONS
     ]
+    yield from _describe_open_end(view, window, interruptions)
+    if not touched:
+        return
     if explained and not interruptions:
         return
     spans_by_cause = defaultdict[str, list[str]](list)
@@ -180,6 +183,25 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
         named = listed(spans[-MAX_NAMED:], len(spans))
         because = f", because {INTERRUPTIONS[by]}" if by else ""
         yield f"nothing was recorded from {named}{because}"
+
+
+def _describe_open_end(
+    view: View, window: TimeWindow, interruptions: Sequence[Loss]
+) -> Iterator[str]:
+    """Yields why messages may be missing after the newest data, if it is known.
+
+    Not in a simulation, whose data is dated by another clock.
+    """
+    latest = view.snapshot.latest
+    if latest is None or view.limits.now == "latest" or window.stop <= latest:
+        return
+    causes = dict.fromkeys(
+        INTERRUPTIONS[loss.by]
+        for loss in interruptions
+        if latest < loss.stop and loss.start < window.stop
+    )
+    if causes:
+        yield f"after {unix_text(latest)} messages may be missing, because {', and '.join(causes)}"
 
 
 def _span_text(start: Ns, end: Ns) -> str:

@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, Span, unix_from_ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     cut_spans,
@@ -71,6 +71,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     if heartbeat is not None:
         recorder = state_of(heartbeat, live=live)
     mixed = describe_mixed(memory, call)
+    until_now = TimeWindow(MIN_NS, max(wall, latest or wall) + 1)
     gaps = view.gaps(TimeWindow.everything())
     stalls = {*gaps} & {pause.span for pause in snapshot.suspects}
     moments = None
@@ -104,7 +105,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *_describe_unheard(heard, latest),
             *missing_data(view),
             *dict.fromkeys(f"{sentence.partition(':')[0]} (see notes)" for sentence in mixed),
-            *describe_gaps(view, TimeWindow.everything(), explained=True),
+            *describe_gaps(view, until_now, explained=True),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),
         notes=(

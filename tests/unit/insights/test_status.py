@@ -126,6 +126,42 @@ def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Pat
     )
 
 
+def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
+    tmp_path: Path,
+) -> None:
+    memory = remembering(tmp_path)  # up to 49 s; asked at 60 s
+    beating(tmp_path, RecorderState.RECORDING, 59)
+    assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
+    append_losses(
+        tmp_path,
+        [
+            Loss("*", BEGIN + 51 * S, BEGIN + 52 * S + 1, 0, "died"),
+            Loss("*", BEGIN + 53 * S, BEGIN + 54 * S + 1, 0, "unclean"),
+            # The clock was ahead then.
+            Loss("*", BEGIN + 7 * DAY, BEGIN + 8 * DAY, 0, "hung"),
+        ],
+    )
+    after = f"after {BEGIN // S + 49}.000000 messages may be missing, because "
+    sentence = f"{after}ros2 bag record died, and the recorder ended without a shutdown"
+    assert shown(memory, tmp_path)["doubts"] == sentence
+    for until, notes in ((45, []), (60, [sentence])):
+        window = {"start": BEGIN / S + 40, "end": BEGIN / S + until}
+        recap = asked(memory, tmp_path, "recap", **window)
+        assert [note for note in recap.get("notes", ()) if after in note] == notes
+    (tmp_path / "later").mkdir()
+    messages = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(55, 60)]
+    write_mcap(tmp_path / "later" / "later_0.mcap", messages)
+    memory.index.refresh()
+    assert after not in shown(memory, tmp_path)["doubts"]
+
+
+def test_a_simulation_has_another_clock_than_what_ended_unexpectedly(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    memory = replace(memory, limits=replace(memory.limits, now="latest"))
+    append_losses(tmp_path, [Loss("*", BEGIN + 51 * S, BEGIN + 52 * S + 1, 0, "died")])
+    assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
+
+
 def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
     append_losses(
