@@ -25,6 +25,7 @@ from ros2_memory.analysis.motion.trajectory import SLICE_NS, PathSlice, Trajecto
 from ros2_memory.columns.kinds import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import without
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -36,6 +37,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.clock_steps import across_steps, elapsed_in
+from ros2_memory.history.coverage import reached, recording_gaps
 from ros2_memory.history.driven_path import (
     PoseSlice,
     driven_path,
@@ -55,6 +57,8 @@ if TYPE_CHECKING:
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
 """A standstill that begins so soon after a loss of speed is what that led to."""
+_MOST_MISSING: Final = 0.1
+"""Where poses are missing for more of the time, how long the robot stood is not known."""
 
 
 class Stop(NamedTuple):
@@ -74,7 +78,8 @@ class Drive:
     """How the robot moved: its path, and its standstills.
 
     `drops` are sudden losses of speed that no standstill follows. `elapsed` is how much time passed
-    between moments of the window.
+    between moments of the window, `recorded` for how much of it, from where the path is known on,
+    something was recorded.
     """
 
     elapsed: Elapsed
@@ -82,6 +87,7 @@ class Drive:
     trajectory: Trajectory | None = None
     standstills: tuple[Stop, ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
+    recorded: Ns = 0
 
     @property
     def valid_trajectory(self) -> Trajectory | None:
@@ -102,8 +108,9 @@ class Drive:
         """Returns how long the robot stood in all, in a window of a length; None if not known.
 
         It is not known where no pose has a valid position, nor where poses are too far apart to
-        show it, nor where the robot neither moved nor stood for most of the time: noise hides where
-        it stood.
+        show it, or missing for much of the time in which something was recorded: some robots
+        publish none while they stand. Nor where the robot neither moved nor stood for most of the
+        time: noise hides where it stood.
         """
         stood = self.elapsed.among(
             (standstill.start, standstill.end) for standstill, _ in self.standstills
@@ -113,6 +120,9 @@ class Drive:
             return stood or None
         recorded_s = trajectory.totals.duration_s - unix_from_ns(trajectory.totals.gap_ns)
         if ns_from_unix(recorded_s) > SILENCE_NS * max(trajectory.poses - 1, 1):
+            return None
+        missing = self.recorded - ns_from_unix(recorded_s)
+        if missing > max(SHORTEST_NS, _MOST_MISSING * self.recorded):
             return None
         else_s = recorded_s - unix_from_ns(stood)
         is_slow = else_s > recorded_s / 2 and trajectory.totals.distance_m <= CREEP_MPS * else_s
@@ -138,7 +148,10 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")
         return Drive(elapsed, None, None, standstills, drops)
     trajectory = across_steps(path.trajectory(0), path, elapsed)
-    return Drive(elapsed, path, trajectory, standstills, drops)
+    known = reached(view.snapshot, TimeWindow(begin, window.stop))
+    spans = without([known.asked()], [*recording_gaps(view, known)])
+    recorded = elapsed.among(spans)
+    return Drive(elapsed, path, trajectory, standstills, drops, recorded)
 
 
 def _standstills_in(

@@ -306,3 +306,21 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["avg_speed"] <= path["max_speed"]
     assert path["duration_s"] == pytest.approx(7219.9)
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
+
+
+def test_how_long_a_robot_stood_that_publishes_poses_only_while_it_moves_is_not_known(
+    tmp_path: Path,
+) -> None:
+    body = [boolean(BEGIN + n * S, n % 2 > 0, "/bumper") for n in range(121)]
+    body += [
+        odom(BEGIN + n * S // 10, n * 0.05, 0.0, 0.0) for n in range(1200) if n // 200 % 2 == 0
+    ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", body)
+
+    def stood(memory: Memory, end_s: int) -> object:
+        given = {"start": BEGIN / S, "end": BEGIN / S + end_s}
+        return asked(memory, tmp_path, "recap", **given)["stood_s"]
+
+    for memory in (memory_of(tmp_path), memory_of(tmp_path, recalls=True)):
+        assert stood(memory, 120) is None
+        assert stood(memory, 19) == 0
