@@ -122,7 +122,7 @@ def visits(
         all_counted=region_visits.known.since is None,
         where=place.name,
         unknown=_unknown(view, window, [track], mixed),
-        reaches_now=newest is not None,
+        is_current=current is not None,
         notes=view.notes.sentences(),
     )
 

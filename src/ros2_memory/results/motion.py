@@ -365,7 +365,7 @@ class Visits(AnswerWithNotes):
         exits: likewise, to leave.
         places: of every named place, where none was asked for; then there are no visits.
         unknown: for how long something was recorded, and it is not known where the robot was.
-        reaches_now: whether the window reaches the newest pose.
+        is_current: whether the window has a pose that shows where the robot is now.
     """
 
     frame_id: str
@@ -381,12 +381,12 @@ class Visits(AnswerWithNotes):
     where: str | None = None
     places: tuple[PlaceVisits, ...] | None = None
     unknown: Ns = 0
-    reaches_now: bool = True
+    is_current: bool = True
 
     @property
     def there_now(self) -> bool | None:
-        """Whether the robot is still there; None where the window ends before that is known."""
-        if not self.reaches_now or self.is_of_places:
+        """Whether the robot is still there; None where no pose of the window shows it."""
+        if not self.is_current or self.is_of_places:
             return None
         return any(visit.departed is None for visit in self.visits)
 

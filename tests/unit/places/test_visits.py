@@ -18,7 +18,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.places.visits import visits
-from tests.support.bags import Msg, odom, tf, transform, write_mcap, write_splits
+from tests.support.bags import Msg, boolean, odom, tf, transform, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.examples import LONG
 from tests.support.memories import asked, each_way, memory_of, with_store
@@ -73,14 +73,24 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     newest = BEGIN + round(49.8 * S)
     for later in (31 * S, 365 * 86_400 * S):
         shown = asked(at(memory, newest + later), tmp_path, "visits", **THERE)
-        assert shown["there_now"] is False
+        assert "there_now" not in shown
         [visit] = shown["visits"]
         assert visit["departed"] == pytest.approx(newest / S)
         assert visit["ago_s"] == pytest.approx(later / S)
         assert "too old to know whether the robot is there now" in shown["notes"][0]
     elsewhere = visits(at(memory, newest + 365 * 86_400 * S), Call(), 5.0, 0.0, radius_m=1.0)
     assert elsewhere.visits
+    assert elsewhere.there_now is None
     assert elsewhere.notes == ()
+
+
+def test_a_robot_without_poses_of_late_may_have_left(tmp_path: Path) -> None:
+    later = [boolean(BEGIN + (50 + n) * S, n % 2 > 0) for n in range(30)]
+    memory = remembering(tmp_path, [*line((20, 0.5), (30, 0.0)), *later])
+    for place in (THERE, {**THERE, "x": 5.0}):
+        shown = asked(at(memory, BEGIN + 79 * S), tmp_path, "visits", **place)
+        assert shown["total"] == 1
+        assert "there_now" not in shown
 
 
 @pytest.mark.parametrize("in_map", [False, True])
