@@ -515,10 +515,13 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(when, deleted=deleted))
     elif gaps or max(outside) > _EDGE_NS:
-        recorded_s, of_s = unix_from_ns(max(length - missing, 0)), unix_from_ns(length)
         digits = 0 if length >= 100 * NS_PER_S else 1
+        recorded_s, of_s = (
+            f"{unix_from_ns(lasted):.{digits}f}" for lasted in (max(length - missing, 0), length)
+        )
         what = "here are only" if deleted else "recorded only"
-        view.notes.add(f"{what} {recorded_s:.{digits}f} of {of_s:.{digits}f} s {when}")
+        if recorded_s != of_s:
+            view.notes.add(f"{what} {recorded_s} of {of_s} s {when}")
 
 
 def why_nothing(when: str, *, deleted: bool) -> str:

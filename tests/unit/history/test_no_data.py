@@ -172,3 +172,16 @@ def test_never_before_the_memory_began_is_no_data(memory: Memory, bag_dir: Path,
     assert found["timestamp"] == T0_S
     never = BEFORE[tool] | {"value": False}
     assert asked(memory, bag_dir, tool, **never) is None
+
+
+@pytest.mark.parametrize("tool", WINDOWED)
+def test_a_window_that_is_recorded_in_part_says_how_much(
+    memory: Memory, bag_dir: Path, tool: str
+) -> None:
+    told = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 149)
+    window = f"between {T0_S}.000000 and {T0_S + 149}.000000"
+    assert f"recorded only 48 of 149 s {window}" in told["notes"]
+    whole = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39)
+    assert not any("recorded" in note for note in whole.get("notes", ()))
+    almost = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39.01)
+    assert not any("recorded only" in note for note in almost.get("notes", ()))
