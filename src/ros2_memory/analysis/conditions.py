@@ -13,7 +13,7 @@ import json
 import math
 import re
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, starmap
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue, Vector3
+    from ros2_memory.extract import SchemaExtractor
 
 T = TypeVar("T")
 
@@ -243,6 +244,13 @@ class Condition:
     test: Test
     field: str | None = None
     min_score: float = 0.0
+
+    def of_type(self, type_name: str, extractor: SchemaExtractor) -> Condition:
+        """Returns the condition on extracted values of a type, where `field` may be a full path."""
+        if self.field is None:
+            return self
+        path = extractor.own_path(self.field, type_name)
+        return self if path == self.field else replace(self, field=path)
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether the value, or any target of the field in it, passes the test."""

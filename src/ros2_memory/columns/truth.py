@@ -10,7 +10,6 @@ What is known without unpacking a column (its zone) is looked at first.
 from __future__ import annotations
 
 import math
-from functools import partial
 from itertools import compress
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -71,7 +70,9 @@ class ColumnCondition:
     """
 
     def __init__(self, condition: Condition, extractor: SchemaExtractor) -> None:
-        self._plans = ByType(extractor, partial(_Plan.of, condition))
+        self._plans = ByType(
+            extractor, lambda shape: _Plan.of(condition.of_type(shape.type, extractor), shape)
+        )
         self._possible: dict[int, Sequence[_Test]] = {}
 
     def truth(self, table: Table) -> TruthValues:

@@ -91,10 +91,10 @@ def condition_of(
 ) -> Condition:
     """Returns the condition of a question; without a `min_score` of its own the configured one.
 
-    `pattern` is the name or glob of the topics. Where all of these are of one type, the field may
-    be a full path in its messages, and the level of a log or status may be named (WARN), also
-    without a field where it is to be equal, as may a constant of the message definition where the
-    field is a number.
+    `pattern` is the name or glob of the topics. The field may be a full path in their messages.
+    Where all are of one type, the level of a log or status may be named (WARN), also without a
+    field where it is to be equal, as may a constant of the message definition where the field is a
+    number.
 
     Raises:
         NoDataError: no such topic is recorded.
@@ -484,9 +484,12 @@ class CandidateRows:
 def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
     """Notes when arrays at or below some fields were too long to be more than summarised."""
     newest = view.stream.last(topic)
-    value = None if newest is None else view.value(newest)
+    if newest is None:
+        return
+    value = view.value(newest)
+    paths = (view.extractor.own_path(field, newest.type) for field in fields)
     try:
-        for condition in chain(*(summarising(field, value) for field in fields)):
+        for condition in chain(*(summarising(path, value) for path in paths)):
             candidates = CandidateRows(view, [topic], condition, window).messages()
             long = next((at for at in candidates if condition.matches(view.value(at))), None)
             if long is not None:
@@ -594,19 +597,35 @@ class ReverseSearch:
             self.newest(until)
 
     def _refusal(self, topic: str) -> str | None:
-        """Returns why no message of a topic can match, by the newest one that shows its fields."""
-        newest = self._view.stream.last(topic)
+        """Returns why no message of a topic can match, whichever type it has."""
+        types = self._view.timeline.types_of(topic)
+        if len(types) == 1:
+            return self._refusal_of(topic, MAX_NS, types[0])
+        refusals = []
+        for type_name, totals in self._view.census(topic).items():
+            refusal = self._refusal_of(topic, totals.last + 1, type_name)
+            if refusal is None:
+                return None
+            refusals.append(f"of {type_name} {refusal}")
+        return "; ".join(refusals) or None
+
+    def _refusal_of(self, topic: str, before: Ns, type_name: str) -> str | None:
+        """Returns why no message of a type can match, by the newest one that shows its fields."""
+        window = TimeWindow(MIN_NS, before)
+        messages = self._view.stream.messages([topic], window, newest_first=True)
+        looked_at = islice(messages, _MOST_EMPTY)
+        own = (stored for stored in looked_at if stored.type == type_name)
+        newest = next(own, None)
         value = None if newest is None else self._view.value(newest)
         if newest is None or value is None:
             return None
-        field, test = self.condition.field or "", self.condition.test
+        condition = self.condition.of_type(type_name, self._view.extractor)
+        field, test = condition.field or "", condition.test
         if field and not shows_field(value, field):
             # An empty list does not show what its elements have, nor a part of the joints the rest.
-            window = TimeWindow(MIN_NS, newest.time)
-            older = self._view.stream.messages([topic], window, newest_first=True)
-            values = map(self._view.value, islice(older, _MOST_EMPTY))
+            values = map(self._view.value, own)
             value = next((older for older in values if shows_field(older, field)), value)
-        refusal = refusal_for(self.condition, value)
+        refusal = refusal_for(condition, value)
         word = test.folded if isinstance(test, Contains | Equals) else None
         if refusal is None or word is None:
             return refusal
@@ -622,7 +641,8 @@ class ReverseSearch:
             if not failures:  # a message may be null, as JSON
                 self._has_decoded = True
                 value = self._view.extractor.exact(message, stored.type)
-                return self.condition.matches(value)
+                own = self.condition.of_type(stored.type, self._view.extractor)
+                return own.matches(value)
         key = stored.topic, stored.type
         # The newest is reported, in whatever order messages are tested.
         if key not in self._failures or self._failures[key][1] < stored.time:

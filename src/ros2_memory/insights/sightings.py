@@ -302,9 +302,10 @@ def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:
 def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> StoredMessage | None:
     """Returns what a latched topic had said last before a moment, if it meets a condition."""
     held = held_at(view, topic, moment)
-    if held is None or not condition.matches(view.value(held)):
+    if held is None:
         return None
-    return held
+    own = condition.of_type(held.type, view.extractor)
+    return held if own.matches(view.value(held)) else None
 
 
 def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:
@@ -378,7 +379,7 @@ def _sighting(
         ),
         matched=tuple(
             named(text) if text in labels else Quoted(text)
-            for text in matched_texts(condition, value)
+            for text in matched_texts(condition.of_type(newest.type, view.extractor), value)
         ),
         score=None if thing is None else thing.score,
         robot_at_first=robot_at_first,
@@ -483,7 +484,7 @@ def _place_of_thing(
         if message is None:
             continue
         value, detections = _counted(view, condition, stored.type, message)
-        if condition.matches(value):
+        if condition.of_type(stored.type, view.extractor).matches(value):
             thing = _sought_detection(detections, condition)
             earlier = _place_of_detection(view, thing, stored, targets)
             if earlier is not None and earlier.frame_id in targets:

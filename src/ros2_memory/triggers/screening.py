@@ -17,7 +17,6 @@ import time
 from collections import Counter
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
@@ -323,10 +322,8 @@ class Screening:
 
         With it the reason, where no message of this shape can show it.
         """
-        type_name, condition = record.channel.type, rule.condition
-        if condition.field is not None:
-            path = self._extractor.own_path(condition.field, type_name)
-            condition = replace(condition, field=path)
+        type_name = record.channel.type
+        condition = rule.condition.of_type(type_name, self._extractor)
         try:
             value = self._extractor.exact(self._reader.decode(record), type_name)
         except UndecodableError as error:

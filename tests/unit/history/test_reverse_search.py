@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+from dataclasses import replace
 from functools import partial
 from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any
@@ -84,6 +85,37 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
     assert newest("POWER_SUPPLY_STATUS_FULL", "/chatter", "value") == T0  # a text stays one
     with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
         newest("POWER_SUPPLY_STATUS_EMPTY")
+
+
+def test_a_topic_whose_name_looks_like_a_glob_is_searched(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [text(T0, "cup", topic="/[b]")])
+    given = {"topic": "/[b]", "condition_type": "contains", "value": "cup"}
+    assert asked(memory_of(tmp_path), tmp_path, "find_last_match", **given)["timestamp"] == T0_S
+
+
+@pytest.mark.parametrize("recalls", [False, True])
+def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recalls: bool) -> None:
+    level = make("std_msgs/msg/Float32", data=45.5)
+    before = [Msg("/level", "std_msgs/msg/Float32", T0, level), text(T0, "45", topic="/said")]
+    later = replace(battery(T0 + 10 * NS_PER_S, 0.5), topic="/level")
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", before)
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", [later])
+    memory = memory_of(tmp_path, recalls=recalls)
+
+    def reply(tool: str, field: str, limit: float, topic: str = "/level") -> Any:
+        given = {"topic": topic, "condition_type": "above", "field": field, "value": limit}
+        return asked(memory, tmp_path, tool, **given)
+
+    for field in ("data", "value"):
+        assert reply("find_last_match", field, 45)["timestamp"] == T0_S
+        assert reply("find_last_match", field, 45, "/*")["timestamp"] == T0_S
+        assert reply("find_matches", field, 45)["total"] == 1
+        assert reply("find_last_match", field, 46) is None
+    assert reply("find_last_match", "percentage", 0.4)["timestamp"] == T0_S + 10
+    refused = reply("find_last_match", "percent", 0.4)
+    assert refused["error"] == "invalid_arguments"
+    assert "std_msgs/msg/Float32 the values have no field 'percent'" in refused["detail"]
+    assert "BatteryState the values have no field 'percent'" in refused["detail"]
 
 
 def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
