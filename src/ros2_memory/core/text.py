@@ -112,11 +112,11 @@ def match_topics(names: Iterable[str], glob: str) -> list[str]:
     """Returns the names that a glob matches, in their order.
 
     `*`, `?` and `[...]` work as in a shell, except that a slash is a character like any other.
-    Upper and lower case differ. `fnmatch.filter` matches likewise, but caches 32,768 globs: clients
-    could fill memory with them.
+    Upper and lower case differ. A glob that is a name matches itself, too. `fnmatch.filter`
+    matches likewise, but caches 32,768 globs: clients could fill memory with them.
     """
     matches = re.compile(translate(glob)).match
-    return [name for name in names if matches(name)]
+    return [name for name in names if name == glob or matches(name)]
 
 
 def abbreviate(value: object, max_chars: int = 80) -> str:

@@ -39,7 +39,9 @@ def test_nothing_is_shown_longer_than_asked_or_as_something_that_is_not_text(val
 
 @given(names=names, glob=globs)
 def test_a_glob_matches_what_it_matches_in_a_shell(names: list[str], glob: str) -> None:
-    assert match_topics(names, glob) == [name for name in names if fnmatchcase(name, glob)]
+    assert match_topics(names, glob) == [
+        name for name in names if name == glob or fnmatchcase(name, glob)
+    ]
 
 
 def test_a_glob_of_many_stars_takes_no_long_search() -> None:
