@@ -56,6 +56,7 @@ from ros2_memory.history.driven_path import (
     newest_of_body,
     resolve_path_topic,
 )
+from ros2_memory.history.held_values import still_holds
 from ros2_memory.history.no_data import (
     decode,
     describe_lack,
@@ -438,7 +439,7 @@ def value_when(
             view.notes.add(f"{name} held no message yet at {unix_text(match.time)}")
             return results.ValueWhen(matched, notes=view.notes.sentences())
         distance = match.time - held.time
-        latched = memory.limits.latching.holds(view.snapshot, held)
+        latched = still_holds(view, held, match.time)
         if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
             view.notes.add(f"the value is {seconds(distance)} older than the match")
         held_value = _with_latched_age(view, _as_value(view, held, fields, None), held, match.time)
@@ -715,14 +716,19 @@ def _newest_at(
         pose = view.stream.newest(topic, before)
         if pose is not None and is_thinned(pose.bag.file) and _holds_until_next(view, pose):
             stored = pose
+    deleted = False
     if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
         newest = view.stream.last(topic, window.stop)
         if newest is None:
             tolerance = None
         elif latching.holds(view.snapshot, newest):
-            stored = newest
+            if still_holds(view, newest, at):
+                stored = newest
+            else:
+                note_unread(view, TimeWindow(newest.time, window.stop), nothing=True)
+                deleted = True
     if stored is None:
-        raise no_data_at(view, (topic,), at, tolerance)
+        raise no_data_at(view, (topic,), at, tolerance, deleted=deleted)
     note_robots_near(view, stored)
     note_unread(view, TimeWindow(stored.time, window.stop))
     return stored
@@ -768,7 +774,7 @@ def _with_latched_age(
     view: View, value: results.TopicValue, stored: StoredMessage, at: Ns
 ) -> results.TopicValue:
     """Returns a value with whether it is latched, and then how old it is."""
-    if not view.limits.latching.holds(view.snapshot, stored):
+    if not still_holds(view, stored, at):
         return value
     age = max(at - stored.time, 0) if value.age is None else value.age
     return replace(value, latched=True, age=age)
@@ -776,7 +782,7 @@ def _with_latched_age(
 
 def _note_latched(view: View, stored: StoredMessage, at: Ns) -> None:
     """Notes of an answer that does not show its age that it is latched, and how old it is."""
-    if view.limits.latching.holds(view.snapshot, stored):
+    if still_holds(view, stored, at):
         topic = stored.topic
         view.notes.add(
             f"{topic} is latched: its value of {seconds(max(at - stored.time, 0))} before is still "

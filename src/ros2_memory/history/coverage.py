@@ -222,21 +222,35 @@ def deleted_between(view: View, window: TimeWindow) -> Spans:
 
     Those in gaps, and those before the memory begins unless the window is open there (`MIN_NS`).
     """
-    snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
-    if not gone:
-        return []
-    deleted: Spans = []
-    if window.start > MIN_NS and snapshot.earliest is not None:
-        deleted += [(start, min(stop, snapshot.earliest)) for start, stop in gone]
-    for gap in snapshot.gaps:
-        if window.overlaps(*gap):
-            deleted += without([gap], _unrecorded(snapshot, gap, gone))
     first, last = window.asked()
     return [
         (start, stop)
+        for _, deleted in deleted_by_gap(view, window)
         for start, stop in deleted
-        if stop - start > snapshot.shortest_gap and start < last and first < stop
+        if start < last and first < stop
     ]
+
+
+def deleted_by_gap(view: View, window: TimeWindow) -> Iterator[tuple[Ns, Spans]]:
+    """Yields the end of each gap that a window overlaps and retention deleted some of, with that.
+
+    First that of the time before the memory, unless the window is open there (`MIN_NS`).
+    """
+    snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
+    if not gone:
+        return
+    gaps: list[tuple[Ns, Spans]] = []
+    if window.start > MIN_NS and (earliest := snapshot.earliest) is not None:
+        gaps.append((earliest, [(start, min(stop, earliest)) for start, stop in gone]))
+    gaps += (
+        (gap[1], without([gap], _unrecorded(snapshot, gap, gone)))
+        for gap in snapshot.gaps
+        if window.overlaps(*gap)
+    )
+    for end, parts in gaps:
+        deleted = [(start, stop) for start, stop in parts if stop - start > snapshot.shortest_gap]
+        if deleted:
+            yield end, deleted
 
 
 def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:

@@ -3,13 +3,15 @@
 So do the texts that say what a robot does (`std_msgs/msg/String`): nothing of them is known to have
 ended only because a topic is silent, or because nothing was recorded for a while. Where another run
 of the recorder begins, only what a latched topic said is known to hold on; of a topic that is
-usually heard often, no value where it falls silent for `SILENCE_NS`.
+usually heard often, no value where it falls silent for `SILENCE_NS`. No value is known to hold
+where messages of the topic were deleted.
 """
 
 from __future__ import annotations
 
 import json
 from bisect import bisect_left
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -18,9 +20,11 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.columns.numbers import words_of
 from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
+from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
 from ros2_memory.messages.conversions import Summary
 from ros2_memory.messages.to_json import round_real
@@ -34,6 +38,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 TEXT: Final = "std_msgs/msg/String"
+_DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
+"""Of a view: the `deletions` of topics."""
 _MOST_CHARS: Final = 16 << 20
 """How much of values a call may hold, as JSON text."""
 
@@ -283,6 +289,7 @@ def _breaks(view: View, topic: str) -> list[Ns]:
     Also where bags of a wrong clock end before the others, and where these end before more.
     """
     snapshot, breaks = view.snapshot, list[Ns]()
+    breaks += deletions(view, topic)
     if not is_latched(view, topic):
         breaks += [start for start, _ in snapshot.breaks]
     if snapshot.earliest is not None and snapshot.latest is not None:
@@ -290,6 +297,31 @@ def _breaks(view: View, topic: str) -> list[Ns]:
         breaks += sorted(bag.end for bag in bags if bag.end < snapshot.earliest)[-1:]
         breaks += [snapshot.latest] if any(bag.start > snapshot.latest for bag in bags) else []
     return sorted(set(breaks))
+
+
+def deletions(view: View, topic: str) -> Sequence[Ns]:
+    """Returns the moments from which on messages of a topic may have been deleted, up to its next.
+
+    Of bags that go as a whole, retention carries on what a latched topic said newest, and what held
+    while something was recorded that stays. So after its last message in a time that was deleted,
+    no more was; nor where it has none there.
+    """
+    known = view.memo.of(_DELETIONS, dict)
+    if topic not in known:
+        cut = cut_spans(view.bag_dir, topic, TimeWindow.everything())
+        known[topic] = [start for start, _ in cut]
+        statics = view.limits.latching.static_topics
+        is_carried_on = view.timeline.is_transient_state(topic) or topic in statics
+        for end, deleted in deleted_by_gap(view, TimeWindow(0, MAX_NS)):
+            window = TimeWindow(deleted[0][0], end + 1)
+            if not is_carried_on:
+                known[topic].append(window.start)
+                continue
+            scanned = scan(view, topic, window, columns=False)
+            times = [*chain.from_iterable(rows.times.tolist() for rows in scanned)]
+            newest = max(times, default=MIN_NS)
+            known[topic] += [at for at in (window.start, *times) if at < newest]
+    return known[topic]
 
 
 def _as_said(value: JsonValue) -> JsonValue:
@@ -334,6 +366,13 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
     if before is None or any(before.time <= at < moment for at in breaks):
         return None
     return before
+
+
+def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
+    """Returns whether the newest message of its topic before a moment is latched and holds then."""
+    return view.limits.latching.holds(view.snapshot, stored) and not any(
+        stored.time <= start < moment for start in deletions(view, stored.topic)
+    )
 
 
 def holds_on(view: View, topics: Iterable[str]) -> bool:

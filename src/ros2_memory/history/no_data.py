@@ -295,11 +295,13 @@ def no_data_at(
     at: Ns,
     tolerance: Ns | None,
     around: Ns | None = None,
+    *,
+    deleted: bool = False,
 ) -> NoDataError:
     """Returns the error for no message of these topics at a moment or within a tolerance before.
 
-    With `around`, neither so long after it. The sentence names the nearest older and newer message
-    with their distances, and what to do.
+    With `around`, neither so long after it. `deleted`: one may have been deleted. The sentence
+    names the nearest older and newer message with their distances, and what to do.
     """
     older, newer, elsewhere, is_between = _nearest(
         view, topics, TimeWindow(at, at + 1), (at, at + 1)
@@ -313,7 +315,7 @@ def no_data_at(
     reason, why = between(view, window) if is_between else beyond(view, at), list[str]()
     if older and newer and around is None and reason is NoDataReason.GAP:
         reason, why = _within_recording(view, older, newer)
-    if _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
+    if deleted or _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
         reason = NoDataReason.DELETED
     detail = [
         f"no message of {' or '.join(topics)} {when} {unix_text(at)}",

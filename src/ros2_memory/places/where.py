@@ -7,7 +7,7 @@ a search besides its window.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -25,7 +25,7 @@ from ros2_memory.core.text import abbreviate, caseless
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import holds_on
+from ros2_memory.history.held_values import deletions, holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
@@ -389,6 +389,9 @@ class _ConditionStates:
         condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
         self.search = ReverseSearch(view, topic, condition)
         self._holds_on = holds_on(view, self.search.topics)
+        self._deletions = sorted(
+            chain.from_iterable(deletions(view, topic) for topic in self.search.topics)
+        )
         self._known = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._values: list[bool] = []
@@ -410,8 +413,12 @@ class _ConditionStates:
         number = bisect_right(self._times, time)
         if not number:
             return False
-        since = time - self._times[number - 1]
-        return self._values[number - 1] and (self._holds_on or since <= SILENCE_NS)
+        last = self._times[number - 1]
+        return (
+            self._values[number - 1]
+            and (self._holds_on or time - last <= SILENCE_NS)
+            and self._deleted_from(last) >= time
+        )
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
         """Returns until when the condition is known to be met from a moment on; at most `end`."""
@@ -420,8 +427,15 @@ class _ConditionStates:
             last, following = self._times[number - 1], self._next_after(time, end)
             if not self._holds_on and min(following, end) - last > SILENCE_NS:
                 return max(time, last)
+            if (deleted := self._deleted_from(last)) < min(following, end):
+                return max(time, deleted)
             time = following
         return min(time, end)
+
+    def _deleted_from(self, last: Ns) -> Ns:
+        """Returns from when on messages after one may have been deleted; `MAX_NS`: none was."""
+        nth = bisect_left(self._deletions, last)
+        return self._deletions[nth] if nth < len(self._deletions) else MAX_NS
 
     def parts_of(self, first: Ns, last: Ns) -> Iterator[Span]:
         """Yields the parts of a time (inclusive) in which the condition is met, in order."""
