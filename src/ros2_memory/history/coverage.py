@@ -21,6 +21,7 @@ The first few of each kind are named, and the others counted:
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -66,6 +67,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 
+_RESTART_NS: Final = 10 * NS_PER_S
+"""What an interruption costs may begin so much earlier, and end so much later."""
 _EDGE_NS: Final = 20 * NS_PER_S
 """So much of a window may lie before or after the memory without a note on what was recorded."""
 
@@ -157,10 +160,11 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
 def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterator[str]:
     """Yields a sentence for each reason for which nothing was recorded in a part of a window.
 
+    What was deleted or excluded was recorded; what files have that cannot be read may have been.
     And one where recording ended unexpectedly after the newest data, which no gap shows yet.
     Without a reason where none is known, unless only gaps that are `explained` are asked for.
     """
-    bag_dir, touched = view.bag_dir, view.gaps(window)
+    bag_dir, snapshot, touched = view.bag_dir, view.snapshot, view.gaps(window)
     interruptions = [
         loss for loss in read_losses(bag_dir, MIN_NS, MAX_NS) if loss.by in INTERRUPTIONS
     ]
@@ -169,20 +173,42 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
         return
     if explained and not interruptions:
         return
-    spans_by_cause = defaultdict[str, list[str]](list)
-    gone = deleted_spans(bag_dir)
-    gaps = (part for gap in touched for part in _unrecorded(view.snapshot, gap, gone))
-    for start, end in gaps:
-        cause = next(
-            (loss.by for loss in interruptions if loss.start < end and start < loss.stop), ""
-        )
-        may_come = being_written(view.snapshot, TimeWindow(start + 1, end))
-        if window.overlaps(start, end) and (cause or not (explained or may_come)):
-            spans_by_cause[cause].append(_span_text(start, end))
-    for by, spans in spans_by_cause.items():
+    texts = defaultdict[tuple[str, str], list[str]](list)
+    gone = united([*deleted_spans(bag_dir), *excluded_spans(bag_dir)])
+    unread = [snapshot.unread_bounds[aside] for aside in (*snapshot.damaged, *snapshot.unread)]
+    unread += snapshot.bounds_of(_absent(view)).values()
+    for part in chain.from_iterable(_unrecorded(snapshot, gap, gone) for gap in touched):
+        inside = TimeWindow(part[0] + 1, part[1])
+        may_hold = any(_touches(span, inside, unknown=True) for span in unread)
+        may_come = being_written(snapshot, inside)
+        for by, start, end in _by_cause(part, interruptions, 0 if may_hold else _RESTART_NS):
+            if (start, end) != part and not by and end - start <= snapshot.shortest_gap:
+                continue
+            if window.overlaps(start, end) and (by or not (explained or may_come)):
+                what = "could be read" if may_hold and not by else "was recorded"
+                texts[by, what].append(_span_text(start, end))
+    for (by, what), spans in texts.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
         because = f", because {INTERRUPTIONS[by]}" if by else ""
-        yield f"nothing was recorded from {named}{because}"
+        yield f"nothing {what} from {named}{because}"
+
+
+def _by_cause(
+    part: Span, interruptions: Sequence[Loss], around: Ns
+) -> Iterator[tuple[str, Ns, Ns]]:
+    """Yields the interruptions in a part of a gap, and what is left of it, with "" for the cause.
+
+    One of it reaches up to `around` farther: what had not reached the disk before it was lost as
+    well, and the next start takes time.
+    """
+    left = [part]
+    for loss in interruptions:
+        if not (loss.start < part[1] and part[0] < loss.stop):
+            continue
+        rest = without(left, [(loss.start - around, loss.stop + around)])
+        yield from ((loss.by, start, end) for start, end in without(left, rest))
+        left = rest
+    yield from (("", start, end) for start, end in left)
 
 
 def _describe_open_end(
@@ -270,11 +296,16 @@ def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
     return united((loss.start, loss.stop) for loss in gone)
 
 
+def excluded_spans(bag_dir: Path, window: TimeWindow | None = None) -> Spans:
+    """Returns the intervals (log time, half-open) that overlap a window and were excluded."""
+    start, stop = (MIN_NS, MAX_NS) if window is None else (window.start, window.stop)
+    excluded = excluded_between(bag_dir, start, stop)
+    return united(stretch.span for stretch in excluded)
+
+
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on the intervals of a window that were excluded."""
-    excluded = excluded_between(bag_dir, window.start, window.stop)
-    spans = united(stretch.span for stretch in excluded)
-    if spans:
+    if spans := excluded_spans(bag_dir, window):
         named = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in spans[-MAX_NAMED:]]
         yield (
             "excluded by the rules of recording.exclude_when, so there is no data of it: "
