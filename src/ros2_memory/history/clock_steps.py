@@ -25,6 +25,7 @@ from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, mean_s
 from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.columns.table import Texts
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     QueryTimeoutError,
@@ -156,9 +157,16 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
     steps += [ClockStep(at, -by) for at, by in read_thinned(view.bag_dir).set_back]
     for pause in _suspects(view, window)[-_MOST_SUSPECTS:]:
         steps += _steps_of_pause(view, pause)
-    newest_first = sorted(steps, reverse=True)
-    # A step back is a minimum: of two at one time the longer one is nearer to the truth.
-    return sorted({step.at: step for step in newest_first}.values())
+    distinct: list[ClockStep] = []
+    for step in sorted(steps):
+        # Recordings that overlap show one step back to some milliseconds; it is a minimum, and the
+        # longer one is nearer to the truth.
+        apart = OUT_OF_ORDER_NS if step.by < 0 and distinct and distinct[-1].by < 0 else 0
+        if distinct and step.at - distinct[-1].at <= apart:
+            distinct[-1] = ClockStep(distinct[-1].at, min(distinct[-1].by, step.by))
+        else:
+            distinct.append(step)
+    return distinct
 
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:

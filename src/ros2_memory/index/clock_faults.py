@@ -20,14 +20,14 @@ from enum import StrEnum
 from itertools import takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.bag_summary import set_back_while_written
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, set_back_while_written
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
@@ -189,14 +189,25 @@ def _step_faults(
     timeline: Timeline,
 ) -> Iterator[ClockFault]:
     """Yields the faults of clocks that were set back, if no other fault explains the step."""
+    steps = [
+        step for step in steps if step.before.file not in faulty and step.after.file not in faulty
+    ]
+    faults = [
+        ClockFault(
+            step.after,
+            FaultyClock.SET_BACK,
+            step.by,
+            None if step.before is step.after else step.before,
+            misleads=False,
+        )
+        for step in steps
+    ]
+    within = {fault.bag.file: fault for fault in faults if fault.before is None}
     strays: set[str] = set()
-    for step in steps:
-        if step.before.file in faulty or step.after.file in faulty:
-            continue
-        within = step.before is step.after
-        before = None if within else step.before
-        yield ClockFault(step.after, FaultyClock.SET_BACK, step.by, before, misleads=False)
-        if within or step.by < FAR_BACK_NS:
+    for step, fault in zip(steps, faults, strict=True):
+        if not _is_shown_within(fault, within):
+            yield fault
+        if fault.before is None or step.by < FAR_BACK_NS:
             continue
         half = FAR_BACK_NS // 2
         sides = [
@@ -208,6 +219,24 @@ def _step_faults(
             if bag.file not in strays and bag.file not in faulty:
                 strays.add(bag.file)
                 yield ClockFault(bag, FaultyClock.STRAY)
+
+
+def _is_shown_within(fault: ClockFault, within: Mapping[str, ClockFault]) -> bool:
+    """Returns whether a step between two bags is the one within one of them.
+
+    A bag in which the clock was set back begins before the one before it ends, and ends after the
+    next one begins, too.
+
+    Args:
+        fault: a step.
+        within: the steps within bags, by their files.
+    """
+    if fault.before is None:
+        return False
+    into, out_of = within.get(fault.bag.file), within.get(fault.before.file)
+    return (into is not None and fault.before.end <= into.at + into.by + OUT_OF_ORDER_NS) or (
+        out_of is not None and fault.bag.start >= out_of.at - OUT_OF_ORDER_NS
+    )
 
 
 def dated_segments(timeline: Timeline, faults: Sequence[ClockFault]) -> Sequence[Segment]:

@@ -210,19 +210,34 @@ def test_pauses_that_are_not_looked_at_are_noted(
     assert len(steps(memory, tmp_path)) == 1
 
 
-def test_a_step_back_that_several_bags_show_is_listed_once(tmp_path: Path) -> None:
-    """The clock is set back by 20 s at 15 s, within the second of files of 10 s."""
-    files: list[list[Msg]] = [[]]
-    for tick in range(900):
+def set_back_in_a_split(folder: Path, since: int, *, driven: bool = True) -> None:
+    """A recording since a tick, in files of 10 s: the clock is set back by 20 s in the second."""
+    files: list[list[Msg]] = [[] for _ in range(4)]
+    for tick in range(since, 400):
         at = BEGIN * S + tick * S // 10 - (20 * S if tick >= 150 else 0)
-        if files[-1] and at - files[-1][0].log_time >= 10 * S:
-            files.append([])
-        files[-1].append(odom(at, tick / 20, 0.0, vx=0.5))
-    for nth, some in enumerate(files):
+        if driven:
+            files[tick // 100].append(odom(at, tick / 20, 0.0, vx=0.5))
+        files[tick // 100].append(battery(at + S // 50, 0.5))
+    for nth, some in enumerate(filter(None, files)):
         layout = McapLayout(chunk_size=1 << 14)
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", some, layout)
-    [step] = asked(memory_of(tmp_path), tmp_path, "data_time_range")["clock_steps"]
+        write_mcap(folder / f"{folder.name}_{nth}.mcap", some, layout)
+
+
+@pytest.mark.parametrize("recordings", [1, 2])
+def test_a_step_back_that_several_bags_show_is_listed_once(tmp_path: Path, recordings: int) -> None:
+    set_back_in_a_split(tmp_path / "rec", 0)
+    if recordings > 1:  # a rotation: the next one has begun already
+        set_back_in_a_split(tmp_path / "next", 120, driven=False)
+    memory = memory_of(tmp_path)
+    reply = asked(memory, tmp_path, "data_time_range")
+    [step] = reply["clock_steps"]
     assert -20 <= step["step_s"] <= -19
+    assert step["at"] == pytest.approx(BEGIN - 5, abs=0.1)
+    reasons = [fault["reason"] for fault in reply["clock_faults"]]
+    within = "the clock was set back by 20 s or more while it was being written"
+    assert reasons == [within] * recordings
+    recap = asked(memory, tmp_path, "recap", start=BEGIN - 10, end=BEGIN + 20)
+    assert recap["counts"]["clock steps"] == 1
 
 
 WHEN = 54.95
