@@ -83,10 +83,20 @@ class SummarySchema:
     @cached_property
     def remarks(self) -> tuple[str, ...]:
         """The notes, and a sentence on a clock that was set back."""
-        if self.set_back is None:
+        if self.clock_set_back is None:
             return self.notes
-        by, _ = self.set_back
+        by, _ = self.clock_set_back
         return (*self.notes, set_back_while_written(by))
+
+    @cached_property
+    def is_damaged(self) -> bool:
+        """Whether the file is known as damaged: then its times may be, too."""
+        return any(_DAMAGED in note for note in self.notes)
+
+    @cached_property
+    def clock_set_back(self) -> SetBack:
+        """As `set_back`; None in a damaged file, of which it says nothing about a clock."""
+        return None if self.is_damaged else self.set_back
 
     @cached_property
     def positions(self) -> dict[str, tuple[int, ...]]:
@@ -135,6 +145,8 @@ class SummarySchema:
         )
 
 
+_DAMAGED: Final = "damaged"
+"""In each note on bytes that cannot have been written so."""
 WRONG_STATISTICS: Final = "its own statistics are wrong"
 READ_WITHOUT_INDEXES: Final = "its messages were read without its indexes"
 MESSAGES_MISSING: Final = "messages may be missing"

@@ -68,7 +68,7 @@ class ClockFault(NamedTuple):
     @property
     def at(self) -> Ns:
         """The first log time after the clock was set back; of other faults that of the bag."""
-        set_back = self.bag.summary.schema.set_back if self.before is None else None
+        set_back = self.bag.summary.schema.clock_set_back if self.before is None else None
         return self.bag.start if set_back is None else set_back[1]
 
     @property

@@ -206,8 +206,8 @@ class Segment:
         """Where the clock was set back within a bag."""
         return tuple(
             StepBack(bag, bag, back[0])
-            for bag in self._bags_with("set_back")
-            if (back := bag.summary.schema.set_back) is not None
+            for bag in self._bags_with("clock_set_back")
+            if (back := bag.summary.schema.clock_set_back) is not None
         )
 
     @cached_property

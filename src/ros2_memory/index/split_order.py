@@ -7,6 +7,7 @@ splits lie on both sides of one that cannot be read.
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -121,15 +122,20 @@ def is_recording(series: Series) -> bool:
 
 
 def steps_of(timeline: Timeline) -> list[StepBack]:
-    """Returns where the clock was set back between two splits of a recording that follow."""
+    """Returns where the clock was set back between two splits of a recording that follow.
+
+    Those that are damaged are passed over: their times may be, too.
+    """
     position_of: dict[Series, int] = {}
     all_series, all_numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for stems, positions, numbers in (segment.bags.names for segment in timeline.segments):
+    for rows in (segment.bags for segment in timeline.segments):
+        stems, positions, numbers = rows.names
         of_stems = [
             position_of.setdefault(series, len(position_of)) if is_recording(series) else -1
             for series, *_ in stems
         ]
-        all_series.append(np.array(of_stems)[positions])
+        is_damaged = rows.with_schema(attrgetter("is_damaged"))
+        all_series.append(np.where(is_damaged, -1, np.array(of_stems)[positions]))
         all_numbers.append(numbers)
     series, numbers = np.concatenate(all_series), np.concatenate(all_numbers)
     bags, starts, ends = timeline.bags, timeline.starts, timeline.ends
