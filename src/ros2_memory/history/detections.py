@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, overload
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from ros2_memory.columns.detections import (
 )
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts, joined_texts
-from ros2_memory.core.arrays import merged_times
+from ros2_memory.core.arrays import begins_of, in_ranges, merged_times
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.scan import messages_of, of_columns
 from ros2_memory.messages.conversions import nanoseconds
@@ -41,16 +42,48 @@ class Detected(NamedTuple):
 
     Attributes:
         log_times: of the messages (ns).
-        times: in the clock of the transforms, as far as is known: of their stamps where these agree
-            with the log times, else those.
+        stamps: of their headers (ns); the log times where they have none.
         found: by the place of their message; places are rounded to 0.1 mm, as the store has them.
         frames: of the messages, empty where their headers name none.
     """
 
     log_times: IntArray
-    times: IntArray
+    stamps: IntArray
     found: Detections
     frames: Texts
+
+    @property
+    def times(self) -> IntArray:
+        """In the clock of the transforms (ns), as far as is known.
+
+        Those of their stamps where these agree with the log times, else those.
+        """
+        return np.where(_agree(self.log_times, self.stamps), self.stamps, self.log_times)
+
+    def new_since(self, time: Ns) -> Detected:
+        """Returns the messages from a log time (ns) on that do not repeat the one before.
+
+        A detector that hangs may publish one message again and again: with the stamp, the frame and
+        the detections of the one before it is no new look. A stamp of 0 is none.
+        """
+        rows, labels, scores, places, frames = self.found
+        columns = np.column_stack((labels.codes, frames.codes, scores, places))
+        order = np.lexsort((self.stamps, self.frames.codes))
+        before, after = order[:-1], order[1:]
+        begins = begins_of(rows, len(order) + 1)
+        sizes = np.diff(begins)
+        is_alike = (self.stamps[before] == self.stamps[after]) & (self.stamps[after] != 0)
+        is_alike &= self.frames.codes[before] == self.frames.codes[after]
+        is_alike &= sizes[before] == sizes[after]
+        before, after = before[is_alike], after[is_alike]
+        was, now = (columns[in_ranges(begins[some], sizes[some])] for some in (before, after))
+        is_same = ((was == now) | (np.isnan(was) & np.isnan(now))).all(axis=1)
+        pair = np.repeat(np.arange(len(after)), sizes[after])
+        is_new = self.log_times >= time
+        is_new[after[np.bincount(pair, ~is_same, len(after)) == 0]] = False
+        which = np.flatnonzero(is_new)
+        found, of_messages = self.found.at(which), self.frames.rows(which)
+        return Detected(self.log_times[which], self.stamps[which], found, of_messages)
 
 
 def joined_detected(parts: Sequence[Detected]) -> Detected:
@@ -62,9 +95,9 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
         part.found._replace(rows=place[part.found.rows])
         for place, part in zip(places, parts, strict=True)
     ]
-    times = np.concatenate([part.times for part in parts])[order]
+    stamps = np.concatenate([part.stamps for part in parts])[order]
     frames = joined_texts([part.frames for part in parts]).rows(order)
-    return Detected(log_times, times, joined_detections(detections), frames)
+    return Detected(log_times, stamps, joined_detections(detections), frames)
 
 
 class DetectionRows:
@@ -100,7 +133,8 @@ class DetectionRows:
         if rows.index is not None:
             detections, frames = detections.at(rows.index), frames.rows(rows.index)
             stamps = None if stamps is None else stamps[rows.index]
-        return _with_times(rows.times, stamps, detections, frames)
+        stamps = rows.times if stamps is None else stamps
+        return _rounded(Detected(rows.times, stamps, detections, frames))
 
     def _by_messages(self, rows: Rows) -> Detected:
         extractor = self._view.extractor
@@ -117,36 +151,53 @@ class DetectionRows:
                 messages.append((stored.time, stamp, detections, frame))
         # Those of a part come bag after bag, in the order in which bags were stored.
         messages.sort(key=itemgetter(0))
-        return _with_times(
-            np.array([log_time for log_time, *_ in messages], np.int64),
-            np.array([stamp for _, stamp, *_ in messages], np.int64),
-            detections_by([detections for *_, detections, _ in messages]),
-            Texts.of([frame for *_, frame in messages]),
+        return _rounded(
+            Detected(
+                np.array([log_time for log_time, *_ in messages], np.int64),
+                np.array([stamp for _, stamp, *_ in messages], np.int64),
+                detections_by([detections for *_, detections, _ in messages]),
+                Texts.of([frame for *_, frame in messages]),
+            )
         )
 
 
 def seen_at(view: View, stored: StoredMessage) -> Ns:
-    """Returns when what a message detects was seen, as `Detected.times` has it."""
+    """Returns when what a message detects was seen: as `Detected.times` has it.
+
+    Where it repeats the stamp of the message before, as that of a detector that hangs, by that
+    stamp if the first one that had it agrees with its log time.
+    """
+    topic, stamp = stored.topic, _stamp(view, stored)
+    if _agree(stored.time, stamp):
+        return stamp
+    before = view.stream.last(topic, stored.time)
+    if before is not None and _stamp(view, before) == stamp:
+        soon = TimeWindow(stamp - AGREEMENT_NS, stamp + _LONGEST_LATENCY_NS + 1)
+        if any(_stamp(view, each) == stamp for each in view.stream.messages([topic], soon)):
+            return stamp
+    return stored.time
+
+
+def _stamp(view: View, stored: StoredMessage) -> Ns:
+    """Returns the stamp of a message, or its log time where it has none."""
     stamp = _stamp_of(view.bags.decode(stored))
-    if stamp is None:
-        return stored.time
-    return int(_seen_at(np.array([stored.time]), np.array([stamp]))[0])
+    return stored.time if stamp is None else stamp
 
 
 def _stamp_of(message: object) -> Ns | None:
     return nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
 
 
-def _seen_at(log_times: IntArray, stamps: IntArray) -> IntArray:
+@overload
+def _agree(log_time: Ns, stamp: Ns) -> bool: ...
+@overload
+def _agree(log_time: IntArray, stamp: IntArray) -> Mask: ...
+def _agree(log_time: Ns | IntArray, stamp: Ns | IntArray) -> bool | Mask:
     # A stamp of another clock cannot be compared with those of transforms.
-    latency = log_times - stamps
-    is_of_this_clock = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
-    return np.where(is_of_this_clock, stamps, log_times)
+    latency = log_time - stamp
+    return (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
 
 
-def _with_times(
-    log_times: IntArray, stamps: IntArray | None, detections: Detections, frames: Texts
-) -> Detected:
-    times = log_times if stamps is None else _seen_at(log_times, stamps)
-    places = METRES.nearest(detections.places)
-    return Detected(log_times, times, detections._replace(places=places), frames)
+def _rounded(detected: Detected) -> Detected:
+    places = METRES.nearest(detected.found.places)
+    return detected._replace(found=detected.found._replace(places=places))

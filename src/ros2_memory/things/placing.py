@@ -107,12 +107,12 @@ class Placer:
             window: the rows are of this time.
             session: the rows are of it.
             lender: the one whose transforms hold for it; empty where none do.
-            units: the rows, of some topics.
+            units: the rows, of some topics; those before the window show what repeats them.
 
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
-        detected, detectors = self._detected(units)
+        detected, detectors = self._detected(units, window.start)
         if not detected:
             return None
         poses = self._poses(session, window)
@@ -139,13 +139,16 @@ class Placer:
         """
         target, frames = self._frames(lender, window, self._poses(session, window))
         for bag, units in units_of_bags.items():
-            for topic, messages in self._detected(units)[0].items():
+            for topic, messages in self._detected(units, window.start)[0].items():
                 if messages.found.rows.size:
                     nowhere = np.full((len(messages.log_times), 5), math.nan)
                     yield bag, target, _sights_of(topic, messages, frames, nowhere)
 
-    def _detected(self, units: Iterable[Rows]) -> tuple[dict[str, Detected], set[str]]:
-        """Returns the messages by topic, and which topics are surely of detectors."""
+    def _detected(self, units: Iterable[Rows], since: Ns) -> tuple[dict[str, Detected], set[str]]:
+        """Returns the messages since a time by topic, and which topics are surely of detectors.
+
+        Those that only repeat the one before are no messages.
+        """
         by_topic: dict[str, list[Rows]] = defaultdict(list)
         # However they are stored.
         for rows in sorted(units, key=lambda rows: (rows.first, rows.last, str(rows.recording))):
@@ -153,7 +156,7 @@ class Placer:
         detected: dict[str, Detected] = {}
         detectors: set[str] = set()
         for topic, of_topic in by_topic.items():
-            messages = joined_detected([self.rows.of(rows) for rows in of_topic])
+            messages = joined_detected([self.rows.of(rows) for rows in of_topic]).new_since(since)
             named = [rows for rows in of_topic if _OF_DETECTORS.search(rows.table.channel.type)]
             is_named = any(map(self.rows.have_labels, named))
             if messages.log_times.size:

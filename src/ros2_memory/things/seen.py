@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 
-VERSION: Final = 6
+VERSION: Final = 7
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS
@@ -455,14 +455,19 @@ class Watching:
     def _read(self, around: _Surroundings) -> Seen:
         """Returns what was seen, by the messages."""
         by_session: dict[Session, list[Rows]] = defaultdict(list)
-        for rows in self._rows(around.window):
+        start = around.window.start
+        for rows in self._rows(TimeWindow(max(start - AROUND_NS, MIN_NS), around.window.stop)):
             by_session[self._sessions.of(rows.recording)].append(rows)
         stretches: list[SeenStretch[int]] = []
         for number, (session, lender, slices) in enumerate(around.sessions):
             units = by_session[session]
             if slices is not None:
                 units = [
-                    rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices)))
+                    rows.some(
+                        np.flatnonzero(
+                            np.isin(rows.times // SLICE_NS, slices) | (rows.times < start)
+                        )
+                    )
                     for rows in units
                 ]
             seen = self._placer.placed(around.window, session, lender, units)
@@ -476,7 +481,6 @@ class Watching:
                     )
                     for sights in seen.sights
                 )
-                start = around.window.start
                 stretches.append(SeenStretch((number,), (start,), seen.frame_id, spots, topics))
         return Seen(tuple(stretches))
 

@@ -276,11 +276,11 @@ def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     """Yields why no thing may be known of a window: its detectors published nothing in it."""
     window, (first, last) = asked.window, known.estimate.looks.times()
     topics = [topic for topic in known.estimate.topics if topic not in asked.undecoded]
-    # Each message of a detector is a look.
+    # Each new message of a detector is a look.
     is_empty = not ((first < window.stop) & (last >= window.start)).any()
     if topics and is_empty and known.reaches_back(window):
         yield (
-            f"{listed(topics)} published nothing in this window: whether things were there "
+            f"{listed(topics)} published nothing new in this window: whether things were there "
             "is not known"
         )
     yield from describe_silences(view, known.estimate.topics, window)

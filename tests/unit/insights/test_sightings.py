@@ -157,6 +157,23 @@ def test_the_place_of_a_sighting_is_where_the_thing_was_at_the_stamp_of_its_mess
     assert (place, row["place"]["frame_id"]) == ({"x": 1.0, "y": 5.0}, "map")
 
 
+def test_a_detector_that_hangs_drags_nothing_along(tmp_path: Path) -> None:
+    """It repeats its first message for a minute, as the robot turns on the spot."""
+    turning = []
+    for at in range(BEGIN, BEGIN + 60 * S, S // 2):
+        turn = (at - BEGIN) / S / 9
+        turning.append(tf(at, transform(at, "map", "base_link", (1.0, 2.0, 0.0), turn)))
+    first = detections(BEGIN, ["cup"], at=(3.0, 0.0, 0.0))
+    hung = [replace(first, log_time=BEGIN + nth * S) for nth in range(60)]
+    write_mcap(tmp_path / "bag.mcap", [*turning, *hung])
+    memory = memory_of(tmp_path)
+    [row] = asked(
+        memory, tmp_path, "find_matches", topic=OBJECTS, condition_type="contains", value="cup"
+    )["sightings"]
+    place = {name: round(row["place"][name], 2) for name in ("x", "y")}
+    assert (place, row["place"]["frame_id"]) == ({"x": 4.0, "y": 2.0}, "map")
+
+
 def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Path) -> None:
     def seen(label: str, score: float, x: float) -> dict[str, JsonValue]:
         return {"label": label, "score": score, "position": {"x": x, "y": 1.0, "z": 0.0}}

@@ -426,7 +426,7 @@ def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Pat
     blind = [each for each in looked(30, 60, HERE) if "vision" not in each.topic]
     write_splits(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.5)) + blind)
     window: dict[str, Any] = {"start": BEGIN + 40, "end": BEGIN + 60}
-    silent = "/vision/scene/scene_objects published nothing in this window: "
+    silent = "/vision/scene/scene_objects published nothing new in this window: "
     reply = ask(tmp_path, **window)
     assert (reply["things"], reply["frame_id"]) == ([], "map")
     assert reply["notes"][0].startswith(silent)
@@ -531,3 +531,23 @@ def test_things_are_the_same_in_one_file_and_in_many(
     assert [each is not None for each in missed_by] == [back, back]
     if back:  # by when is known to a split, or a slice of one
         assert abs(missed_by[0] - missed_by[1]) <= max(split_s, 15.0)
+
+
+@pytest.mark.parametrize("repeated", [(), (("crate", 3.0, 0.0),)], ids=["nothing", "a crate"])
+def test_a_detector_that_repeats_one_message_looks_at_nothing(
+    tmp_path: Path, repeated: Sequence[Seen]
+) -> None:
+    """It hangs for over ten minutes, as the robot turns to a cup and to a crate."""
+    cup, crate = ("cup", 3.0, 0.5), ("crate", -2.0, 0.0)
+    seen = [*looked(0, 30, HERE, cup), *looked(30, 60, AWAY, crate), *looked(60, 90, HERE, cup)]
+    [*_, frozen] = scene(90, (1.0, -5.0, 0.0), [*repeated])
+    hung = []
+    for at in range(90, 790):
+        *robot, message = scene(at, HERE if at % 60 < 30 else AWAY, ())
+        hung += [*robot, replace(message, body=frozen.body)]
+    things = told_of(tmp_path, [*seen, *hung])["things"]
+    assert {each["label"]: each["still_there"] for each in things} == {
+        "cup": {"in_view": BEGIN + 89},
+        "crate": {"not_looked_at_since": BEGIN + 59},
+    }
+    assert not any("moved_times" in each or "moves" in each for each in things)
