@@ -130,7 +130,7 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     tmp_path: Path,
 ) -> None:
     memory = remembering(tmp_path)  # up to 49 s; asked at 60 s
-    beating(tmp_path, RecorderState.RECORDING, 59)
+    beat(tmp_path, BEGIN + 59 * S)
     assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
     append_losses(
         tmp_path,
