@@ -74,7 +74,7 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
     ),
     ("recap", {"start": T0_S, "end": T0_S + LENGTH_S}, "events"),
     ("recap", {"last_s": 5}, "stood_s"),
-    ("visits", {"x": 0.0, "y": 0.0}, "there_now"),
+    ("visits", {"x": 0.0, "y": 0.0}, "visits"),
     ("memory_status", {}, "doubts"),
 ]
 REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [

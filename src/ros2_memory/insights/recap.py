@@ -190,7 +190,8 @@ def recap(
     stood = drive.stood(end - start)
     if stood is None and drive.valid_trajectory is not None:
         view.notes.add(
-            "the positions are too noisy, or too few, to detect standstills: stood_s is null"
+            "positions are too noisy, too few or missing for too long to detect standstills: "
+            "stood_s is null"
         )
     answer = Recap(
         start=start,
