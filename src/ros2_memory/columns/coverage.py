@@ -75,6 +75,11 @@ class Coverage:
         self._order: IntArray = order[np.searchsorted(all_numbers[order], 0) :]
         self._numbers: IntArray = all_numbers[self._order]
 
+    @property
+    def stored(self) -> int:
+        """How many bags are stored."""
+        return self._numbers.size
+
     @cached_property
     def missing(self) -> Sequence[BagFile]:
         """The bags that are not stored, in order of time."""

@@ -213,6 +213,11 @@ class Filling:
         shares = [(parts, self._share(bags)) for parts, bags in groups]
         self.store.thin(shares, self._limits.max_share)
 
+    def count_gone(self, timeline: Timeline) -> tuple[int, int]:
+        """Returns how many stored bags are none of a timeline, as it has them, and of how many."""
+        coverage, stored = self._scanner.coverage(timeline), self.store.numbers().size
+        return stored - (0 if coverage is None else coverage.stored), stored
+
     def prune(self, timeline: Timeline) -> None:
         """Deletes the bags whose files are gone; nothing where no bag is left.
 

@@ -51,7 +51,9 @@ _MERGED_HERE: Final = 100
 _BACKLOG_ALONE: Final = 256
 """Bags of a lake that are stored in a round: no child process knows them."""
 PRUNE_INTERVAL_S: Final = 600.0
-"""How often what is stored of deleted files is removed."""
+"""How often what is stored of deleted files is removed, and the file of the store is checked."""
+_MOST_GONE: Final = 1 / 64
+"""Share of the stored bags; where more are gone, what is stored of them is removed at once."""
 
 LONGEST_TURN_S: Final = 600.0
 """How long one of several stores is filled before it is the next one's turn."""
@@ -77,6 +79,7 @@ class Backfill:
     undecodable: dict[str, str] = field(default_factory=dict)
     _of_others: list[Ns] | None = None
     _pruned_s: float = -math.inf
+    _left: int = 0
     _is_precomputed: bool = False
 
     async def fill(self) -> None:
@@ -111,8 +114,9 @@ class Backfill:
         if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
             await in_thread(self.precompute)
             self._is_precomputed = True
-        if due:
+        if due or await in_thread(self.has_many_gone):
             await in_thread(self.prune)
+        if due:
             self._pruned_s = time.monotonic()
 
     async def _in_thread(self, work: Callable[[], T]) -> T:
@@ -195,6 +199,12 @@ class Backfill:
             rows = list_recorded_topics(self.memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
 
+    def has_many_gone(self) -> bool:
+        """Returns whether many of the stored bags were deleted since `prune`: it looks at all."""
+        gone, stored = self._filled(Filling.count_gone, (0, 0))
+        self._left = min(self._left, gone)
+        return gone - self._left > _MOST_GONE * stored
+
     def prune(self) -> None:
         """Removes what is stored of deleted files; stores what each metadata.yaml lists now.
 
@@ -204,6 +214,8 @@ class Backfill:
         def of_deleted(filling: Filling, timeline: Timeline) -> None:
             if timeline.bags:
                 filling.prune(timeline)
+                # Some that are still there cannot be read, or have changed.
+                self._left, _ = filling.count_gone(timeline)
                 self.memory.store_listings(self.memory.index.snapshot())
 
         self._filled(of_deleted, None)
