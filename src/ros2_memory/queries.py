@@ -40,6 +40,7 @@ from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_i
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
     by_remark,
+    describe_gaps,
     describe_misdated,
     describe_odd,
     not_covered,
@@ -675,11 +676,13 @@ def _notes_on_never(
 ) -> tuple[str, ...]:
     """Returns the notes on a search that found nothing; without any the reply is a plain null.
 
-    They are on what was not read, and on when its topics were silent.
+    They are on what was not read, on when recording was interrupted, and on when its topics were
+    silent.
     """
     window, condition = TimeWindow(MIN_NS, until), search.condition
     notes = (
         *not_covered(view, search.topics, window),
+        *describe_gaps(view, window, explained=True),
         *describe_silences(view, search.topics, window),
         *notes_on_never(view, topic, condition, window, min_score),
     )

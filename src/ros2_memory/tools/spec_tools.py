@@ -179,9 +179,9 @@ DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("find_last_match", "Last match"),),
-        "When a condition was last true, in all history. Reply: {{timestamp, value, topic, type, "
-        "frame_id, age_s}}, or null if never ({{timestamp: null, value: null, notes}} if something "
-        "could not be read).",
+        "When a condition was last true, in any closed bag. Reply: {{timestamp, value, topic, "
+        "type, frame_id, age_s}}, or null if never ({{timestamp: null, value: null, notes}} if a "
+        "bag was unread or recording broke off).",
         LastMatchArguments,
         queries.find_last_match,
         blocking=True,
@@ -190,7 +190,7 @@ DECLARATIONS = (
     ToolDeclaration(
         (ToolName("get_value_when", "Topic when another matched"),),
         "The value of value_topic when condition_topic last met a condition, "
-        "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
+        "e.g. where the robot last saw scissors. Reply: {{timestamp, matched, value, "
         "value_timestamp, condition_topic, value_topic, frame_id}}, or null as find_last_match.",
         ValueWhenArguments,
         queries.value_when,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
+from ros2_memory.bag_dir.state_files import Loss, append_losses
 from tests.support.bags import (
     Msg,
     boolean,
@@ -127,6 +128,35 @@ def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_nev
     (bag_dir / "rec" / "rec_1.mcap").rename(bag_dir / "rec" / "rec_0.mcap")
     memory = memory_of(bag_dir, recalls=recalls)
     assert asked(memory, bag_dir, "find_last_match", **wanted)["notes"]
+
+
+@pytest.mark.parametrize(
+    ("tool", "topics"),
+    [
+        ("find_last_match", {"topic": "/rosout"}),
+        ("get_value_when", {"condition_topic": "/rosout", "value_topic": "/bumper"}),
+    ],
+)
+@each_way
+def test_that_recording_was_interrupted_is_said_where_nothing_was_found(
+    tmp_path: Path, tool: str, topics: dict[str, str], recalls: bool
+) -> None:
+    for nth, begin in enumerate((0, 30)):
+        beats = range(begin * S, (begin + 10) * S, S // 10)
+        beating = [boolean(T0 + beat, True) for beat in beats]
+        told = [log(T0 + beat + 1, 20, "on its way") for beat in beats]
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", [*beating, *told])
+    wanted = {**topics, "condition_type": "contains", "value": "never"}
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert asked(memory, tmp_path, tool, **wanted) is None
+    (tmp_path / ".episodic").mkdir(exist_ok=True)
+    append_losses(tmp_path, [Loss("*", T0 + 10 * S, T0 + 30 * S, 0, "died")])
+    never = asked(memory_of(tmp_path, recalls=recalls), tmp_path, tool, **wanted)
+    assert (never["timestamp"], never["value"]) == (None, None)
+    [note] = never["notes"]
+    assert note.endswith("(20.1 s), because ros2 bag record died")
+    early = asked(memory_of(tmp_path, recalls=recalls), tmp_path, tool, **wanted, before=T0_S + 5)
+    assert early is None
 
 
 def lie_in_a_message_index(path: Path) -> None:
