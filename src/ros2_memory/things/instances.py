@@ -38,7 +38,7 @@ from ros2_memory.core.arrays import (
     narrowed,
     numbered,
 )
-from ros2_memory.core.timebase import MAX_NS, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.places import (
     GATE_MM,
@@ -142,7 +142,7 @@ class Instance:
     epoch: int
     stays: list[PlacedStay]
     looks: int = 0
-    """Detector messages since it was last seen, from where it would have been."""
+    """Detector messages from where it would have been, as of `Estimate.missing`."""
     missed_by: Ns | None = None
     """When the chance that all of these missed it fell below 1 %; None where it did not."""
     labels: Mapping[str, int] = field(default_factory=dict)
@@ -221,6 +221,8 @@ class Estimate:
     """The name to show of each key."""
     evidence: dict[tuple[str, int, int], Evidence]
     """By key, epoch and place: the evidence for the places of things."""
+    unplaced_of: dict[str, Ints]
+    """The rows of `unplaced` of each key."""
     stays: list[tuple[Instance, PlacedStay]] = field(init=False)
     stay_of: Ints = field(init=False)
     """Of each spot, the first of `stays` that has it; -1 where none has."""
@@ -236,7 +238,8 @@ class Estimate:
         """About how much memory it takes."""
         tables: list[Columns | Ints | Flags] = [self.spots, self.unplaced, self.counts, self.poor]
         tables += chain((self.stay_of,), self.scores, self.hits, self.looks)
-        tables += chain(*self.evidence.values(), (stay.spots for _, stay in self.stays))
+        tables += chain(self.unplaced_of.values(), *self.evidence.values())
+        tables += chain((stay.spots for _, stay in self.stays))
         return sum(table.nbytes for table in tables)
 
     def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
@@ -304,11 +307,19 @@ class Estimate:
     def missing(
         self, instance: Instance, stay: PlacedStay, window: Span | None = None
     ) -> tuple[int, Ns | None]:
-        """Returns `looks_without` a thing after one of its stays, or in a window before it."""
+        """Returns `looks_without` a thing after one of its stays, or in a window before it.
+
+        What those who saw it detected of its label without a place may be the thing: only what
+        follows shows that it is not there.
+        """
         evidence = self.evidence[instance.key, instance.epoch, stay.place]
         seen_to = stay.last if window is None else MAX_NS
-        window = window or (stay.last + 1, MAX_NS)
-        return looks_without(self.looks, evidence, stay.stay, seen_to, window)
+        start, stop = window or (stay.last + 1, MAX_NS)
+        unplaced = self.unplaced_of[instance.key]
+        may_be_it = np.isin(unplaced[:, Unplaced.TOPIC], self.spots[stay.spots, Spot.TOPIC])
+        may_be_it &= unplaced[:, Unplaced.FIRST] < stop
+        start = max(start, int(unplaced[may_be_it, Unplaced.LAST].max(initial=MIN_NS)) + 1)
+        return looks_without(self.looks, evidence, stay.stay, seen_to, (start, stop))
 
     def stay_with(self, foreign: Ints) -> tuple[Instance, PlacedStay] | None:
         """Returns the thing, and its stay, that has the first of some spots that any thing has.
@@ -398,6 +409,7 @@ def estimate(
         poor=observed.poor,
         names=names,
         evidence=evidence,
+        unplaced_of={group.key: group.unplaced for group in groups},
     )
     for instance in instances:
         instance.looks, instance.missed_by = result.missing(instance, instance.stays[-1])

@@ -184,3 +184,14 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
     until_its_end = ask(tmp_path, **{**within, "end": BEGIN + 89})
     assert labels(until_its_end) == {"appeared": ["book"]}
     assert not any("things" in each for each in until_its_end["notes"])
+
+
+def test_a_thing_that_was_detected_without_a_place_after_it_was_missed_is_not_missed(
+    tmp_path: Path,
+) -> None:
+    lost = ("mug", math.nan, math.nan)
+    missed = [*looked(0, 20, HERE, MUG), *looked(30, 50, HERE)]
+    reply = compared(tmp_path / "later", [*missed, *looked(60, 90, AWAY, lost)])
+    assert labels(reply) == {"not_looked_at": ["mug"]}
+    appeared = [*looked(0, 20, HERE), *looked(20, 29, AWAY, lost), *looked(60, 90, HERE, MUG)]
+    assert labels(compared(tmp_path / "earlier", appeared)) == {"not_looked_at": ["mug"]}
