@@ -11,8 +11,10 @@ from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
 from ros2_memory.core.spans import lies_inside, united, without
 from ros2_memory.triggers.exclusion import (
+    Cut,
     ExclusionRule,
     RecordingConditions,
+    add_excluded,
     add_message,
     excluded_intervals,
 )
@@ -192,6 +194,19 @@ def test_nothing_is_known_across_a_clock_that_was_set_back() -> None:
     assert excluded_intervals(rule(excludes_unknown=False), [unclear]) == [Excluded(3, 5, False)]
 
 
+def test_latched_messages_go_by_when_they_were_published() -> None:
+    held, unknown, older = Excluded(10, 20), Excluded(30, 40, False), Excluded(1, 3)
+    cut = Cut([held, unknown], [older, Excluded(5, 7, False)], {"/map"})
+    plain = [time for time in range(50) if cut.takes("/odom", time, 0)]
+    assert plain == [*range(10, 20), *range(30, 40)]
+    # Received again, in a stretch and after it, by when it was published.
+    expected = {2: (True, True), 6: (True, False), 8: (False, False), 15: (True, True)}
+    for published, goes in expected.items():
+        assert tuple(cut.takes("/map", at, published) for at in (18, 45)) == goes, published
+    assert [cut.takes("/map", 35, at) for at in (35, 0, 25)] == [True, True, False]
+    assert [cut.takes("/map", 45, at) for at in (35, 0)] == [False, False]
+
+
 SPANS = st.lists(
     st.tuples(st.integers(0, 30), st.integers(1, 8)).map(lambda each: (each[0], sum(each)))
 )
@@ -207,3 +222,12 @@ def test_spans_are_sets_of_moments(
     one, other = united(spans), united(others)
     assert moments(one) == moments(spans) == {at for at in range(50) if lies_inside(one, at)}
     assert moments(without(one, other)) == moments(spans) - moments(others)
+
+
+def test_what_was_excluded_is_joined_over_splits() -> None:
+    s = 10**9
+    held = Excluded(3 * s, 30 * s)
+    known = add_excluded([], [held], 0, 10 * s)
+    assert known == [Excluded(3 * s, 11 * s + 1)]
+    known = add_excluded(known, [held, Excluded(28 * s, 35 * s, False)], 11 * s, 40 * s)
+    assert known == [held, Excluded(28 * s, 35 * s, False)]
