@@ -2,9 +2,11 @@
 
 A detection is an object with a name under one of the fields of `naming`: an entry of a list, or the
 whole message; a list of strings under one of `LISTS_OF_LABELS` is a list of detections. A string
-that is JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The position
-is a point in metres, at one of `POSITIONS`, in the frame that the innermost object around it names.
-Boxes in an image are in pixels, and give no position. The score is a number under one of `SCORES`.
+that is JSON is parsed; what it names is a detection if it is in a list, has a score, a place or an
+outline, or nothing beside the name: else it is a state. Those of vision_msgs are named by their
+best hypothesis. The position is a point in metres, at one of `POSITIONS`, in the frame that the
+innermost object around it names. Boxes in an image are in pixels, and give no position. The score
+is a number under one of `SCORES`.
 """
 
 from __future__ import annotations
@@ -42,6 +44,8 @@ POSITIONS: Final = (
 _SCORED: Final = frozenset(SCORES)
 _SHOWN: Final = frozenset({"box", "z"}.union(*(path[:1] for path in POSITIONS)))
 """What has a score and one of these is something that was seen, and named as such things are."""
+_NOTHING: Final = "none"
+"""What JSON names so, without a score, is that nothing was seen."""
 _NAMED_IN_TYPES: Final = {
     frozenset({"family", "id"}): "id",  # apriltag_msgs, isaac_ros_apriltag_interfaces
     frozenset({"marker_id", "pose"}): "marker_id",  # aruco_opencv_msgs
@@ -76,7 +80,7 @@ def detections_of(
     They are looked for `depth` lists, objects and texts deep.
     """
     detections: list[Detection] = []
-    _walked(value, frame_id, depth, None, detections)
+    _walked(value, frame_id, depth, None, detections, listed=None)
     return tuple(detections)
 
 
@@ -99,26 +103,38 @@ def without_low_scores(value: JsonValue, min_score: float, depth: int = MAX_DEPT
     also the place of each that scores less. What has no score stays. A value without any such
     detection is returned as it is. They are looked for as by `detections_of`.
     """
-    return _walked(value, "", depth, min_score, [])
+    return _walked(value, "", depth, min_score, [], listed=None)
 
 
 def _walked(
-    value: JsonValue, frame: str, depth: int, least: float | None, detections: list[Detection]
+    value: JsonValue,
+    frame: str,
+    depth: int,
+    least: float | None,
+    detections: list[Detection],
+    *,
+    listed: bool | None,
 ) -> JsonValue:
-    """Appends the detections in a value; returns it without those of a score below `least`."""
+    """Appends the detections in a value; returns it without those of a score below `least`.
+
+    `listed`: in JSON, whether it is in a list; None outside of JSON.
+    """
     if depth == 0:
         return value
     if isinstance(value, dict):
-        return _walked_object(value, _frame(value) or frame, depth, least, detections)
+        return _walked_object(
+            value, _frame(value) or frame, depth, least, detections, listed=listed
+        )
     if isinstance(value, str):
         if not looks_like_json(value):  # most are names
             return value
         parsed = _from_json(value)
-        kept = _walked(parsed, frame, depth - 1, least, detections)
+        kept = _walked(parsed, frame, depth - 1, least, detections, listed=False)
         return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
     if isinstance(value, list):
+        listed = None if listed is None else True
         parts = [
-            _walked(element, frame, depth - 1, least, detections)
+            _walked(element, frame, depth - 1, least, detections, listed=listed)
             if isinstance(element, dict)
             else element
             for element in value
@@ -133,12 +149,43 @@ def _walked_object(
     depth: int,
     least: float | None,
     detections: list[Detection],
+    *,
+    listed: bool | None,
 ) -> JsonValue:
     """Returns an object as `_walked` does; `frame` is the one that it is in."""
     label = _label(value)
-    if label is not None:
-        detections.append(_placed((value,), frame, label, _score(value)))
-        return None if _is_below(value, least) else value
+    if label is None:
+        return _walked_parts(value, frame, depth, least, detections, listed=listed)
+    own = _placed((value,), frame, label, _score(value))
+    if listed is not None and own.score is None and _SHOWN.isdisjoint(value):
+        inner: list[Detection] = []
+        kept = _walked_parts(value, frame, depth, least, inner, listed=listed)
+        if label.strip().casefold() == _NOTHING or not (listed or _is_alone(value)):
+            detections += inner
+        else:
+            detections += [own, *(one for one in inner if one.score is not None)]
+        return kept
+    detections.append(own)
+    return None if _is_below(value, least) else value
+
+
+def _is_alone(value: dict[str, JsonValue]) -> bool:
+    """Returns whether an object has nothing beside its name, or lists of numbers or points."""
+    others = [part for name, part in value.items() if name not in _NAMED_BY]
+    lists = [part for part in others if isinstance(part, list)]
+    return not others or any(isinstance(part[0], int | float | list) for part in lists if part)
+
+
+def _walked_parts(
+    value: dict[str, JsonValue],
+    frame: str,
+    depth: int,
+    least: float | None,
+    detections: list[Detection],
+    *,
+    listed: bool | None,
+) -> JsonValue:
+    """Returns an object of which only parts may be detections as `_walked` does."""
     best = _best_result(value.get("results"))
     best_label = None if best is None else _label(_hypothesis(best))
     if best is not None and best_label is not None:
@@ -151,7 +198,9 @@ def _walked_object(
                 Detection(element) for element in inner if isinstance(element, str) and element
             ]
         is_leaf = not inner or isinstance(inner, int | float)  # most are: no call for each
-        fields[name] = inner if is_leaf else _walked(inner, frame, depth - 1, least, detections)
+        fields[name] = (
+            inner if is_leaf else _walked(inner, frame, depth - 1, least, detections, listed=listed)
+        )
     return value if all(map(is_, fields.values(), value.values())) else fields
 
 

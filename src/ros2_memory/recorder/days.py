@@ -7,6 +7,7 @@ it, `forget` rewrites it. It is never changed in place: a new file takes its nam
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from collections import defaultdict
@@ -42,7 +43,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, caseless, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_since
-from ros2_memory.messages.detections import detections_of
+from ros2_memory.messages.detections import detections_of, looks_like_json
 from ros2_memory.recorder.thinning import (
     MINUTE_NS,
     TopicThinning,
@@ -435,7 +436,8 @@ class MemoryDays:
         labels = [
             detection.label for value in (extracted, *texts) for detection in detections_of(value)
         ]
-        return any(starmap(self._is_hidden, [*zip(repeat(LABELS[0]), labels), *_labels(message)]))
+        said = chain(zip(repeat(LABELS[0]), labels), _labels(message), *map(_labels_in_json, texts))
+        return any(starmap(self._is_hidden, said))
 
     def _is_hidden(self, field: str, text: str) -> bool:
         """Returns whether a text in such a field is of people.
@@ -556,6 +558,18 @@ def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:
         for item in value if isinstance(value, list) else [value]:
             if name in _NAMES or not isinstance(item, str):
                 yield from _labels(item, name)
+
+
+def _labels_in_json(text: str) -> Iterator[tuple[str, str]]:
+    """Yields what a text that is JSON has for labels, also of states, each with its field."""
+    fields: list[tuple[str, object]] = []
+    if looks_like_json(text):
+        with suppress(ValueError, RecursionError):
+            json.loads(text, object_pairs_hook=fields.extend)
+    for name, value in fields:
+        if name in _OF_DETECTIONS:
+            items = value if isinstance(value, list) else [value]
+            yield from ((name, str(item)) for item in items if isinstance(item, str | int))
 
 
 def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> object:

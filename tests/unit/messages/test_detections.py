@@ -109,6 +109,41 @@ def test_json_is_looked_into_wherever_it_begins_and_however_long_it_is(said: str
     assert detections_of(without_low_scores({"data": said}, 0.9)) == (Detection("cup"),)
 
 
+PUMP: JsonValue = {"label": "pump", "score": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("said", "labels"),
+    [
+        ({"state": "closed", "force_n": 12.5, "object": "crate blue"}, []),
+        ({"class": "battery", "level": "low"}, []),
+        ({"class": "battery", "level": {"is": "low"}, "cells": []}, []),
+        ({"alarm": {"class": "battery", "level": "low"}}, []),
+        ({"class": "none", "level": "ok"}, []),
+        ({"class": "none"}, []),
+        ([{"class": "none"}], []),
+        ({"n": 1, "class": "EVT", "deep": {"list": [PUMP, {"label": "valve"}]}}, ["pump", "valve"]),
+        ([{"class": "EVT", "items": [PUMP, {"label": "valve"}]}], ["EVT", "pump"]),
+        ({"class": "EVT", "results": [{"class_id": "cup", "score": 0.5}]}, ["cup"]),
+        ({"class": "cup"}, ["cup"]),
+        ([{"class": "cup", "state": "full", "parts": [{"label": "handle"}]}], ["cup"]),
+        ({"class": "cup", "state": "full", "score": 0.5}, ["cup"]),
+        ({"class": "cup", "state": "full", "position": [1, 2, 3]}, ["cup"]),
+        ({"class": "cup", "state": "full", "corners": [[1, 2], [3, 4]]}, ["cup"]),
+    ],
+    ids=str,
+)
+def test_json_that_names_something_in_a_state_detects_nothing(
+    said: JsonValue, labels: list[str]
+) -> None:
+    value: JsonValue = {"data": json.dumps(said)}
+    assert [seen.label for seen in detections_of(value)] == labels
+    kept = without_low_scores(value, 0.6)
+    assert [seen.label for seen in detections_of(kept)] == [
+        seen.label for seen in detections_of(value) if seen.score is None
+    ]
+
+
 def test_what_lies_too_deep_is_not_looked_into() -> None:
     value: JsonValue = [{"label": "cup"}]
     for _ in range(MAX_DEPTH - 2):

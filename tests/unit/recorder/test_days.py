@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import operator
 import shutil
 import time
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -252,6 +254,19 @@ def test_people_are_looked_for_in_frames_topics_and_numbers(bag_dir: Path) -> No
     assert "person" not in repr(stays)
     assert "label='0'" not in repr(stays)
     assert "base_link" in repr([one for topic, one in stays if topic == "/tf"])
+
+
+def test_people_are_looked_for_in_json_that_is_no_detection(bag_dir: Path) -> None:
+    states = (
+        {"state": "held", "object": "mug"},
+        {"state": "held", "object": "person"},
+        {"class": "EVT", "of": [{"label": "child"}, {"class_id": 0}]},
+    )
+    every = zip(range(T0, T0 + 60 * S, S), cycle(map(json.dumps, states)), strict=False)
+    record(bag_dir, [text(at, state, topic="/arm") for at, state in every])
+    keep_all(bag_dir, limits=MemoryLimits(texts=("/arm",)))
+    said = {McapReader().decode(one).data for one in of_topic(bag_dir, "/arm")}  # type: ignore[attr-defined]
+    assert said == {json.dumps(states[0])}
 
 
 def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> None:
