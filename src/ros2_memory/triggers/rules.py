@@ -325,7 +325,10 @@ class SplitSearch:
                 continue  # its publisher is silent until something changes
             matches = None
             if rule.condition is not None:
-                matches = self._test(rule, rule.condition, event.topic, value, state)
+                condition = rule.condition
+                if record is not None:
+                    condition = condition.of_type(record.channel.type, self._extractor)
+                matches = self._test(rule, condition, event.topic, value, state)
             runs = state.rules[rule.name].runs
             fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)
             if fired is not None:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import RunRecord
 from tests.support.bags import Msg, boolean
@@ -190,6 +191,15 @@ def test_a_message_that_is_written_late_into_the_next_split_counts_in_its_place(
     robot.split([flag(9.5, False), flag(11, True), flag(12, True)])
     robot.close_all()
     assert robot.fired_at() == [T0 + 10 * S + S * 3 // 2]
+
+
+def test_the_field_of_a_rule_may_be_a_full_path(tmp_path: Path) -> None:
+    pressed = parse_condition("equals", True, 0.5, "data")
+    robot = WatchedBags(tmp_path / "bags", [rule(condition=pressed)])
+    robot.begin(T0)
+    robot.split([flag(0, False), flag(1, True)])
+    robot.close_all()
+    assert robot.fired_at() == [T0 + S]
 
 
 def test_a_recording_waits_for_the_end_of_the_one_that_it_took_over_from(tmp_path: Path) -> None:
