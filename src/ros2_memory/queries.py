@@ -48,6 +48,7 @@ from ros2_memory.history.coverage import (
     note_unread,
     note_unrecorded,
     seconds,
+    unexcluded,
     unix_text,
 )
 from ros2_memory.history.driven_path import (
@@ -518,7 +519,7 @@ def data_time_range(
         latest=snapshot.dating.latest,
         now=memory.now(now, snapshot.latest, call),
         bags=len(snapshot.bags),
-        gaps=gaps_with_deleted(view, view.gaps(window)),
+        gaps=gaps_with_deleted(view, unexcluded(view, view.gaps(window))),
         incomplete=left_open(snapshot),
         active=snapshot.active,
         damaged=snapshot.damaged,

@@ -18,7 +18,7 @@ from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.coverage import cut_spans
+from ros2_memory.history.coverage import cut_spans, excluded_spans
 from ros2_memory.history.scan import count_messages
 from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
@@ -94,11 +94,13 @@ def _observe(memory: Memory) -> JsonObject:
 def _rows(memory: Memory, snapshot: Snapshot, latest: Ns, *, is_live: bool) -> Iterator[JsonObject]:
     """Yields the rate of every topic that is not latched.
 
-    Without a usual rate for logs, and for topics whose last messages were deleted by request.
+    Without a usual rate for logs, for topics whose last messages were deleted by request, and where
+    some of the newest time was excluded.
     """
     window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
     timeline, latching = snapshot.timeline, memory.limits.latching
     view = View(memory, Call())
+    is_excluded = bool(excluded_spans(memory.index.bag_dir, window))
     for topic in timeline.topics():
         if latching.is_latched(snapshot, topic):
             continue
@@ -107,7 +109,8 @@ def _rows(memory: Memory, snapshot: Snapshot, latest: Ns, *, is_live: bool) -> I
         last = max(totals.last for totals in timeline.totals(topic).values())
         usual = usual_rate(snapshot, topic, latching)
         since = TimeWindow(last + 1, latest + 1)
-        if timeline.is_log(topic) or cut_spans(memory.index.bag_dir, topic, since):
+        is_cut = cut_spans(memory.index.bag_dir, topic, since)
+        if timeline.is_log(topic) or is_cut or is_excluded:
             usual = None
         age_s, rate = max(unix_from_ns(latest - last), 0.0), int(count) / unix_from_ns(WINDOW_NS)
         yield {

@@ -59,7 +59,7 @@ from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.listed_splits import absent_files
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.state_files import Loss
@@ -301,6 +301,19 @@ def excluded_spans(bag_dir: Path, window: TimeWindow | None = None) -> Spans:
     start, stop = (MIN_NS, MAX_NS) if window is None else (window.start, window.stop)
     excluded = excluded_between(bag_dir, start, stop)
     return united(stretch.span for stretch in excluded)
+
+
+def unexcluded(view: View, gaps: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
+    """Yields gaps in the recording, or what is left of them outside of what was excluded."""
+    excluded = excluded_spans(view.bag_dir)
+    for gap in gaps:
+        yield from _unrecorded(view.snapshot, gap, excluded)
+
+
+def was_removed(view: View, window: TimeWindow) -> bool:
+    """Whether some of a window was deleted by retention, or excluded."""
+    excluded = excluded_between(view.bag_dir, window.start, window.stop)
+    return bool(excluded or deleted_between(view, window))
 
 
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
@@ -556,7 +569,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     gaps = [last - first for first, last in recording_gaps(view, until_end)]
     length, missing = end - start, sum(max(span_ns, 0) for span_ns in (*outside, *gaps))
     when = f"between {unix_text(start)} and {unix_text(end)}"
-    deleted = bool(deleted_between(view, until_end))
+    deleted = was_removed(view, until_end)
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(when, deleted=deleted))
     elif gaps or max(outside) > _EDGE_NS:
@@ -570,7 +583,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
 
 
 def why_nothing(when: str, *, deleted: bool) -> str:
-    """Returns that a time has no messages: none were recorded, or retention deleted them."""
+    """Returns that a time has no messages: none were recorded, or they were deleted since."""
     return f"what was recorded {when} was deleted" if deleted else f"nothing was recorded {when}"
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.columns.numbers import words_of
 from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -369,9 +370,14 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
 
 
 def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
-    """Returns whether the newest message of its topic before a moment is latched and holds then."""
-    return view.limits.latching.holds(view.snapshot, stored) and not any(
-        stored.time <= start < moment for start in deletions(view, stored.topic)
+    """Returns whether the newest message of its topic before a moment is latched and holds then.
+
+    Nothing is known to hold in a time that was excluded.
+    """
+    return (
+        view.limits.latching.holds(view.snapshot, stored)
+        and not any(stored.time <= start < moment for start in deletions(view, stored.topic))
+        and not excluded_between(view.bag_dir, moment, moment + 1)
     )
 
 

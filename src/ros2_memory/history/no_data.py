@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.layout import is_derived, is_thinned
-from ros2_memory.bag_dir.state_files import read_losses
+from ros2_memory.bag_dir.state_files import excluded_between, read_losses
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import overlaps_any
@@ -26,12 +26,12 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.context import short_name
 from ros2_memory.history.coverage import (
     being_written,
-    deleted_between,
     gap_around,
     note_unread,
     note_unrecorded,
     seconds,
     unix_text,
+    was_removed,
     why_nothing,
 )
 from ros2_memory.index.recordings import is_named_after_folder
@@ -315,7 +315,13 @@ def no_data_at(
     reason, why = between(view, window) if is_between else beyond(view, at), list[str]()
     if older and newer and around is None and reason is NoDataReason.GAP:
         reason, why = _within_recording(view, older, newer)
-    if deleted or _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
+    excluded = excluded_between(view.bag_dir, at, at + 1)
+    if (
+        deleted
+        or excluded
+        or _have_expired(view, topics, window)
+        or _is_thinned(view, TimeWindow(at, at + 1))
+    ):
         reason = NoDataReason.DELETED
     detail = [
         f"no message of {' or '.join(topics)} {when} {unix_text(at)}",
@@ -415,8 +421,7 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
         when = f"after {unix_text(start)}"
     else:
         when = f"between {unix_text(start)} and {unix_text(end)}"
-    deleted = deleted_between(view, asked)
-    detail = [why_nothing(when, deleted=bool(deleted))]
+    detail = [why_nothing(when, deleted=was_removed(view, asked))]
     if first is not None and last is not None:
         detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
         reason = between(view, asked)
@@ -506,8 +511,7 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
     """
     if being_written(view.snapshot, window):
         return NoDataReason.NOT_CLOSED_YET
-    deleted = deleted_between(view, window)
-    return NoDataReason.DELETED if deleted else NoDataReason.GAP
+    return NoDataReason.DELETED if was_removed(view, window) else NoDataReason.GAP
 
 
 def beyond(view: View, at: Ns) -> NoDataReason:

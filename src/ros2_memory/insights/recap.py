@@ -30,6 +30,7 @@ from ros2_memory.history.coverage import (
     note_unrecorded,
     recording_gaps,
     seconds,
+    unexcluded,
 )
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.view import TimeRange, View, open_span
@@ -406,7 +407,7 @@ def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[
     for time, before_mps, after_mps in drive.drops:
         text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
         yield Event("drop", time, None, text)
-    for begin, until in recording_gaps(view, TimeWindow(*window.asked())):
+    for begin, until in unexcluded(view, recording_gaps(view, TimeWindow(*window.asked()))):
         yield Event("gap", begin, until, _gap_sentence(view, begin, until))
     for at, by in clock_steps(view, window):
         how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"

@@ -18,7 +18,12 @@ from ros2_memory.core.timebase import (
     Span,
     local_text,
 )
-from ros2_memory.history.coverage import cut_spans, recording_gaps, unix_text
+from ros2_memory.history.coverage import (
+    cut_spans,
+    excluded_spans,
+    recording_gaps,
+    unix_text,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -64,7 +69,15 @@ def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
 
 
 def _outside_deleted(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:
-    """Yields a silence, or the parts of it before and after messages that were deleted."""
+    """Yields a silence, or the parts of it before and after messages that were deleted.
+
+    None that lasts long enough only with times that were excluded.
+    """
+    shortest = snapshot.shortest_silence(silence.topic)
+    excluded = excluded_spans(bag_dir, TimeWindow(silence.start, silence.end))
+    outside = without([(silence.start, silence.end)], excluded)
+    if excluded and all(end - start < shortest for start, end in outside):
+        return
     deleted = cut_spans(bag_dir, silence.topic, TimeWindow(silence.start + 1, silence.end))
     if not deleted:
         yield silence
@@ -72,7 +85,7 @@ def _outside_deleted(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Ite
     if silence.length < silence.end - silence.start:
         return  # the robot was off for a while, and which part that was in is not known
     for start, end in without([(silence.start, silence.end)], deleted):
-        if end - start >= snapshot.shortest_silence(silence.topic):
+        if end - start >= shortest:
             goes_on = silence.goes_on and end == silence.end
             yield Silence(silence.topic, start, end, end - start, goes_on)
 

@@ -19,6 +19,8 @@ from ros2_memory.history.coverage import (
     describe_excluded,
     describe_gaps,
     describe_lost,
+    excluded_spans,
+    unexcluded,
     unix_text,
 )
 from ros2_memory.history.robots import describe_mixed
@@ -72,7 +74,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         recorder = state_of(heartbeat, live=live)
     mixed = describe_mixed(memory, call)
     until_now = TimeWindow(MIN_NS, max(wall, latest or wall) + 1)
-    gaps = view.gaps(TimeWindow.everything())
+    gaps = [*unexcluded(view, view.gaps(TimeWindow.everything()))]
     stalls = {*gaps} & {pause.span for pause in snapshot.suspects}
     moments = None
     try:
@@ -258,8 +260,9 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         recorded = last - first - length_in(snapshot.gaps, first, last)
         usual = recorded // (messages - 1)
         longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))
-        is_long = latest - last > max(SILENT_AFTER_NS, longest)
         since = TimeWindow(last + 1, latest + 1)
+        excluded = length_in(excluded_spans(memory.index.bag_dir, since), last, latest)
+        is_long = latest - last - excluded > max(SILENT_AFTER_NS, longest)
         if is_long and not cut_spans(memory.index.bag_dir, topic, since):
             yield SilentTopic(topic, last)
 

@@ -25,7 +25,7 @@ from ros2_memory.core.reply import JsonObject, moment, seconds
 from ros2_memory.core.text import encodable, shortened
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.context import Call, Memory, short_name
-from ros2_memory.history.coverage import recording_gaps
+from ros2_memory.history.coverage import recording_gaps, unexcluded
 from ros2_memory.history.view import View
 from ros2_memory.insights.status import clock_faults, left_open, problems_of, unrecorded
 from ros2_memory.serving.auth import HEALTH_PATH
@@ -182,7 +182,8 @@ def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> J
 
 def _gaps(memory: Memory, now: Ns) -> JsonObject:
     """Returns how often nothing was recorded in the last hour, and for how long in all."""
-    gaps = [*recording_gaps(View(memory, Call()), TimeWindow(now - _HOUR_NS, now))]
+    view = View(memory, Call())
+    gaps = [*unexcluded(view, recording_gaps(view, TimeWindow(now - _HOUR_NS, now)))]
     return {"count": len(gaps), "seconds": seconds(sum(end - start for start, end in gaps))}
 
 
