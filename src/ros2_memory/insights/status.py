@@ -176,6 +176,9 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield f"the recorder is paused: {heartbeat.last_error or 'it gives no reason'}"
     elif heartbeat.state is RecorderState.WAITING:
         yield f"the recorder waits: {heartbeat.waiting_for or 'it gives no reason'}"
+    elif heartbeat.state is RecorderState.STARTING and not heartbeat.recovered:
+        if heartbeat.last_error is not None:
+            yield f"the recorder does not record yet: {heartbeat.last_error}"
     if heartbeat.held_back is not None and heartbeat.is_live(wall):
         yield heartbeat.held_back
     if heartbeat.is_live(wall):

@@ -118,6 +118,7 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
     [
         (RecorderState.RECORDING, 600, ["the recorder died"]),
         (RecorderState.PAUSED, 1, ["the recorder is paused: disk full"]),
+        (RecorderState.STARTING, 1, ["the recorder does not record yet: disk full"]),
         (RecorderState.STOPPED, 600, None),
     ],
 )
