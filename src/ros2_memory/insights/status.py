@@ -172,18 +172,27 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         return
     if not heartbeat.is_live(wall):
         yield "the recorder died"
-    elif heartbeat.state is RecorderState.PAUSED:
-        yield f"the recorder is paused: {heartbeat.last_error or 'it gives no reason'}"
-    elif heartbeat.state is RecorderState.WAITING:
-        yield f"the recorder waits: {heartbeat.waiting_for or 'it gives no reason'}"
-    elif heartbeat.state is RecorderState.STARTING and not heartbeat.recovered:
-        if heartbeat.last_error is not None:
-            yield f"the recorder does not record yet: {heartbeat.last_error}"
-    if heartbeat.held_back is not None and heartbeat.is_live(wall):
+        return
+    if reason := _why_not_recording(heartbeat):
+        yield reason
+    if heartbeat.held_back is not None:
         yield heartbeat.held_back
-    if heartbeat.is_live(wall):
-        yield from required_missing(heartbeat)
-        yield from unrecorded(heartbeat)
+    yield from required_missing(heartbeat)
+    yield from unrecorded(heartbeat)
+
+
+def _why_not_recording(heartbeat: Heartbeat) -> str | None:
+    """Returns why a live recorder does not record, where that is known or lasts; else None."""
+    error = heartbeat.last_error
+    match heartbeat.state:
+        case RecorderState.PAUSED:
+            return f"the recorder is paused: {error or 'it gives no reason'}"
+        case RecorderState.WAITING:
+            return f"the recorder waits: {heartbeat.waiting_for or 'it gives no reason'}"
+        case RecorderState.STARTING if error is not None and not heartbeat.recovered:
+            return f"the recorder does not record yet: {error}"
+        case _:
+            return None
 
 
 def required_missing(heartbeat: Heartbeat) -> Iterator[str]:
