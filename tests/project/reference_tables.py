@@ -355,6 +355,9 @@ def _events_of(tree: ast.AST) -> Iterator[Event]:
         first = node.args[0]
         if not (isinstance(first, ast.Constant) and isinstance(first.value, str)):
             continue
+        if isinstance(node.func, ast.Name) and node.func.id == "Rotation":
+            level = "warning" if "is_fault" in {word.arg for word in node.keywords} else "info"
+            yield Event(first.value, level, ("reason", "recording"))
         choices = [each for each in ast.walk(node.func) if isinstance(each, ast.Attribute)]
         loggers = [each for each in choices if each.attr in LEVELS and _is_log(each.value)]
         for method in loggers:
