@@ -599,7 +599,7 @@ class Excluded:
 
     @property
     def span(self) -> Span:
-        """From when to when it is."""
+        """Its start and its stop (log time, ns)."""
         return self.start, self.stop
 
 

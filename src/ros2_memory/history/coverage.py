@@ -303,8 +303,8 @@ def excluded_spans(bag_dir: Path, window: TimeWindow | None = None) -> Spans:
     return united(stretch.span for stretch in excluded)
 
 
-def unexcluded(view: View, gaps: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
-    """Yields gaps in the recording, or what is left of them outside of what was excluded."""
+def unexcluded(view: View, gaps: Iterable[Span]) -> Iterator[Span]:
+    """Yields the gaps of the recording without what was excluded."""
     excluded = excluded_spans(view.bag_dir)
     for gap in gaps:
         yield from _unrecorded(view.snapshot, gap, excluded)

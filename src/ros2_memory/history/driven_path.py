@@ -71,7 +71,7 @@ _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _BODIES: Final = ("base_footprint", "base_link")
 _READ_NS: Final[Ns] = 3600 * NS_PER_S
-"""Of so long transforms are read at once."""
+"""Transforms are read an hour (log time) at once."""
 _STEP_NS: Final[Ns] = NS_PER_S // 20
 """Poses by transforms are no closer than this."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
@@ -529,7 +529,7 @@ def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow)
 
 
 def _apart(times: IntArray) -> IntArray:
-    """Returns the positions of those ascending times that are `_STEP_NS` apart, or more."""
+    """Returns the positions of ascending times (ns), each `_STEP_NS` or more after the last."""
     last, positions = MIN_NS, list[int]()
     for position, time in enumerate(times.tolist()):
         if time - last >= _STEP_NS:

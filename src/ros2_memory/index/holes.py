@@ -48,7 +48,7 @@ class Pause(NamedTuple):
 
     @property
     def span(self) -> Span:
-        """From when to when it is."""
+        """Its first and its last moment (log time, ns)."""
         return self.start, self.end
 
     @property
