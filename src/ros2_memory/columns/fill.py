@@ -214,7 +214,7 @@ class Filling:
         self.store.thin(shares, self._limits.max_share)
 
     def count_gone(self, timeline: Timeline) -> tuple[int, int]:
-        """Returns how many stored bags are gone from a timeline or changed, and how many are stored."""
+        """Returns how many stored bags are gone, or have changed, and how many are stored."""
         coverage, stored = self._scanner.coverage(timeline), self.store.numbers().size
         return stored - (0 if coverage is None else coverage.stored), stored
 
