@@ -178,6 +178,22 @@ def seen_at(view: View, stored: StoredMessage) -> Ns:
     return stored.time
 
 
+def hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
+    """Returns the stamp (ns) of an old message that a topic's newest ones in a window repeat.
+
+    None where the newest one is not the one before again, is no older than an image that is still
+    looked at, or has no stamp.
+    """
+    newest = view.stream.newest(topic, window)
+    if newest is None:
+        return None
+    before = view.stream.newest(topic, TimeWindow(window.start, newest.time))
+    if before is None or before.record.payload != newest.record.payload:
+        return None
+    stamp = _stamp_of(view.bags.decode(newest))
+    return stamp if stamp and newest.time - stamp > _LONGEST_LATENCY_NS else None
+
+
 def _stamp(view: View, stored: StoredMessage) -> Ns:
     """Returns the stamp of a message, or its log time where it has none."""
     stamp = _stamp_of(view.bags.decode(stored))

@@ -64,7 +64,7 @@ from ros2_memory.results import (
 from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.places import LEAST_MM
-from ros2_memory.things.unseen import note_undecoded, unplaced_notes, vague_notes
+from ros2_memory.things.unseen import describe_hung, note_undecoded, unplaced_notes, vague_notes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -165,6 +165,7 @@ def _compare_things(
     )
     for window in windows:
         note_undecoded(view, window)
+        view.notes.add(*describe_hung(view, window))
     things = known_things(view, limits.min_score, both)
     note_other_frames(view, things, where)
     first, second = sorted(windows, key=lambda window: (window.start, window.stop))

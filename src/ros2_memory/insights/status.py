@@ -32,6 +32,7 @@ from ros2_memory.insights.silences import silences_of
 from ros2_memory.recorder.policies import OWN_TOPICS
 from ros2_memory.results import ANOTHER, Budget, Gap, SilentTopic, Status, Undecodable
 from ros2_memory.retention.inventory import state_bytes_in
+from ros2_memory.things.unseen import describe_hung
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -106,6 +107,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *problems_of(snapshot, heartbeat, wall),
             *_describe_unheard(heard, latest),
             *missing_data(view),
+            *describe_hung(view, until_now),
             *dict.fromkeys(f"{sentence.partition(':')[0]} (see notes)" for sentence in mixed),
             *describe_gaps(view, until_now, explained=True),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),

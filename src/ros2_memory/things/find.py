@@ -32,7 +32,7 @@ from ros2_memory.things.instances import (
 )
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.routine import usual_places
-from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
+from ros2_memory.things.unseen import Asked, describe_hung, note_undecoded, notes_on
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -90,6 +90,7 @@ def find_things(
         )
     note_robots(view, view.pose_topic, window)
     undecoded = note_undecoded(view, window)
+    view.notes.add(*describe_hung(view, window))
     known = known_things(view, lowest, window)
     view.notes.retract_outside(whole)
     note_other_frames(view, known, region)

@@ -35,6 +35,7 @@ from ros2_memory.core.text import (
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.detections import hung_since
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -123,6 +124,18 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
     for topic, reason in reasons.items():
         view.notes.add_lack(Note(_UNDECODED, topic, reason))
     return frozenset(reasons)
+
+
+def describe_hung(view: View, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence for each detector that hangs at the end of a window."""
+    for topic in topics_with_detections(view.timeline):
+        with suppress(NotInLakeError):
+            since = hung_since(view, topic, window)
+            if since is not None:
+                yield (
+                    f"{topic} repeats its message of {unix_text(since)} again and again: its "
+                    "detector seems to hang, and what it saw since then is not known"
+                )
 
 
 def _has_columns(view: View, topic: str, at: Ns) -> bool:

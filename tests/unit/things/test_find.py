@@ -560,7 +560,11 @@ def test_a_detector_that_repeats_one_message_looks_at_nothing(
     for at in range(90, 790):
         *robot, message = scene(at, HERE if at % 60 < 30 else AWAY, ())
         hung += [*robot, replace(message, body=frozen.body)]
-    things = told_of(tmp_path, [*seen, *hung])["things"]
+    reply = told_of(tmp_path, [*seen, *hung])
+    things = reply["things"]
+    [hangs] = [note for note in reply["notes"] if "seems to hang" in note]
+    assert hangs.startswith(f"/vision/scene/scene_objects repeats its message of {BEGIN + 90}.")
+    assert hangs in str(asked(memory_of(tmp_path), tmp_path, "memory_status"))
     assert {each["label"]: each["still_there"] for each in things} == {
         "cup": {"in_view": BEGIN + 89},
         "crate": {"not_looked_at_since": BEGIN + 59},
