@@ -36,7 +36,7 @@ from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
 SMALL_BUDGET_GB: Final = 0.1
 """Of a smaller budget, what is stored beside the bags may take a large part."""
@@ -189,43 +189,28 @@ def plan_deletions(contents: DirContents, limits: RetentionLimits) -> DeletionPl
     Where deleting everything that may go would not free enough of the disk, nothing is deleted for
     that: it would cost all history, and recording would still have to pause.
     """
-    ordered = _with_consistent_dates(contents, limits)
-    plan, free = _plan_and_free_bytes(ordered, limits)
-    if not (plan.fits or free is None or free >= limits.min_free_bytes):
-        plan, _ = _plan_and_free_bytes(replace(ordered, free_bytes=None), limits)
-        plan = plan._replace(fits=False, most_free=free)
-    if not plan.to_delete or ordered is contents:
-        return plan
-    given = {bag.path: bag for bag in contents.bags}
-    return plan._replace(to_delete=tuple(given[bag.path] for bag in plan.to_delete))
-
-
-def _plan_and_free_bytes(
-    contents: DirContents, limits: RetentionLimits
-) -> tuple[DeletionPlan, int | None]:
-    """Returns a plan, and how much of the disk is free after it."""
-    left = _Remaining(contents)
-    total = left.total
-    periods = _periods(contents, limits)
-    aged = _too_old(contents, periods, limits.max_age_ns)[contents.synchronised]
+    left, dated = _Remaining(contents), _with_consistent_dates(contents, limits)
+    total, periods, most_free = left.total, _periods(dated, limits), None
+    aged = _too_old(dated, periods, limits.max_age_ns)[contents.synchronised]
     if not aged and left.fits(limits):
-        return DeletionPlan((), total, fits=True), left.free
-    order = _oldest_first(contents, limits, periods[-1] if periods else [])
+        return DeletionPlan((), total, fits=True)
+    order = _oldest_first(dated, limits, periods[-1] if periods else [])
     newest = _newest(order, periods)
-    going = {bag.path for bag in order if bag.path in aged and bag is not newest}
-    for bag in order:
-        if bag.path in going:
-            left.delete(bag)
-    for bag in order:
-        if left.fits(limits):
-            break
-        if bag.path not in aged and bag is not newest and left.freed_by(bag):
-            going.add(bag.path)
-            left.delete(bag)
-    deleted = tuple(bag for bag in order if bag.path in going)
-    kept = "" if newest is None else newest.path
-    fits = left.fits(limits)
-    return DeletionPlan(deleted, total, fits, aged=aged & going, newest=kept), left.free
+    order = [bag for bag in order if bag is not newest]
+    going = left.delete_until_fits(order, aged, limits)
+    if left.free is not None and left.free < limits.min_free_bytes:
+        most_free = left.free
+        left = _Remaining(replace(contents, free_bytes=None))
+        going = left.delete_until_fits(order, aged, limits)
+    given = {bag.path: bag for bag in contents.bags}
+    return DeletionPlan(
+        tuple(given[bag.path] for bag in order if bag.path in going),
+        total,
+        fits=most_free is None and left.fits(limits),
+        most_free=most_free,
+        aged=aged & going,
+        newest="" if newest is None else newest.path,
+    )
 
 
 def _newest(order: Sequence[StoredBag], periods: Sequence[_Period]) -> StoredBag | None:
@@ -274,12 +259,20 @@ class _Remaining:
         """Returns how many bytes deleting a bag frees."""
         return sum(file.size for file in bag.files if file.inode not in self._saved)
 
-    def delete(self, bag: StoredBag) -> None:
-        """Takes one bag away."""
-        freed = self.freed_by(bag)
-        self.total -= freed
-        if self.free is not None:
-            self.free += freed
+    def delete_until_fits(
+        self, order: Sequence[StoredBag], aged: Collection[str], limits: RetentionLimits
+    ) -> set[str]:
+        """Takes away the bags that are too old, then others in this order; returns their paths."""
+        going: set[str] = set()
+        for bag in sorted(order, key=lambda bag: bag.path not in aged):
+            is_old, freed = bag.path in aged, self.freed_by(bag)
+            if not is_old and self.fits(limits):
+                break
+            if is_old or freed:
+                going.add(bag.path)
+                self.total -= freed
+                self.free = None if self.free is None else self.free + freed
+        return going
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""
@@ -324,16 +317,10 @@ _Period: TypeAlias = "list[StoredBag]"
 def _periods(contents: DirContents, limits: RetentionLimits) -> list[_Period]:
     """Splits the dated bags where a pause is too long; the last period is the present one."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
-    dated = _credibly_dated(contents, limits)
-    if not dated:
-        return []
-    reach, end = min(bag.start for bag in dated), max(bag.end for bag in dated)
-    if end - reach <= longest:
-        return [dated]
-    dated.sort(key=attrgetter("start"))
-    periods: list[_Period] = [[]]
-    for bag in dated:
-        if bag.start - reach > longest:
+    periods: list[_Period] = []
+    reach = MIN_NS
+    for bag in sorted(_credibly_dated(contents, limits), key=attrgetter("start")):
+        if not periods or bag.start - reach > longest:
             periods.append([])
         periods[-1].append(bag)
         reach = max(reach, bag.end)
@@ -394,8 +381,6 @@ def _oldest_first(
 
 def _outside_periods(bags: Sequence[StoredBag], *periods: _Period) -> Sequence[StoredBag]:
     """Returns the bags that are in none of some periods."""
-    if len(bags) == sum(map(len, periods)):
-        return ()
     there = {bag.path for period in periods for bag in period}
     return [bag for bag in bags if bag.path not in there]
 
