@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import stat
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 _sidecar: Final = until_changed(HANDOVER_FILE, most=4096)(sure_handover)
 
 
+@dataclass(eq=False, repr=False)
 class BagDirReader(BagReader):
     """Reads bags through an adapter, under the rules of a bag directory.
 
@@ -58,16 +59,14 @@ class BagDirReader(BagReader):
         every_message: ignores `handover.json`, to compare counts with the files.
     """
 
-    def __init__(
-        self, reader: BagReader, bag_dir: Path | None = None, *, every_message: bool = False
-    ) -> None:
-        self._reader = reader
-        self._bag_dir = bag_dir
-        self._every_message = every_message
+    reader: BagReader
+    bag_dir: Path | None = None
+    _: KW_ONLY
+    every_message: bool = False
 
     def reads(self, path: Path) -> bool:
         """Returns what the adapter returns."""
-        return self._reader.reads(path)
+        return self.reader.reads(path)
 
     def closing(self, path: Path) -> Closing:
         """Returns whether the writer has finished the file, which must lie in the directory.
@@ -75,7 +74,7 @@ class BagDirReader(BagReader):
         Raises:
             BagError: as the adapter, or the path leads out of the bag directory.
         """
-        return self._reader.closing(self._confined(path))
+        return self.reader.closing(self._confined(path))
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns counts and times of the messages that count in this recording.
@@ -83,7 +82,7 @@ class BagDirReader(BagReader):
         Raises:
             BagError: as the adapter, or the path leads out of the bag directory.
         """
-        summary = self._reader.summarize(self._confined(path))
+        summary = self.reader.summarize(self._confined(path))
         handover, problem = self._sidecar_of(path)
         if problem is not None:
             summary = summary.replaced(notes=(*summary.notes, problem))
@@ -117,7 +116,7 @@ class BagDirReader(BagReader):
             rule = self._rule_of(located, topics, window)
             if rule is not None and rule.hides_all:
                 return
-            records = self._reader.records(located, topics, window, newest_first=newest_first)
+            records = self.reader.records(located, topics, window, newest_first=newest_first)
             yield records if rule is None else filter(rule.counts, records)
 
         # A generator would end at the first error; after a damaged chunk the adapter's iterator
@@ -142,33 +141,33 @@ class BagDirReader(BagReader):
             located = self._located(path)
             rule = self._rule_of(located, topics, window)
             if rule is None:
-                yield self._reader.batches(located, topics, window, bare=bare)
+                yield self.reader.batches(located, topics, window, bare=bare)
             elif not rule.hides_all:
                 # Which messages count is known by their publish times and payloads.
-                batches = self._reader.batches(located, topics, window)
+                batches = self.reader.batches(located, topics, window)
                 yield map(partial(_counted_batch, rule), batches)
 
         return chain.from_iterable(opened())
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that the file declares."""
-        return self._reader.channels(self._located(path))
+        return self.reader.channels(self._located(path))
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns what the adapter returns."""
-        return self._reader.undecodable(channel)
+        return self.reader.undecodable(channel)
 
     def decode(self, record: Record) -> object:
         """Decodes as the adapter does."""
-        return self._reader.decode(record)
+        return self.reader.decode(record)
 
     def encode(self, channel: Channel, message: object) -> bytes:
         """Encodes as the adapter does."""
-        return self._reader.encode(channel, message)
+        return self.reader.encode(channel, message)
 
     def definition(self, channel: Channel) -> Definition | None:
         """Returns what the adapter returns."""
-        return self._reader.definition(channel)
+        return self.reader.definition(channel)
 
     def _confined(self, path: Path) -> Path:
         """Returns the path, which must lie in the bag directory and behind no link inside it.
@@ -177,9 +176,9 @@ class BagDirReader(BagReader):
             BagVanishedError: a folder of the path does not exist.
             BagError: the path leads out of the directory.
         """
-        if self._bag_dir is None:
+        if self.bag_dir is None:
             return path
-        text, folder = str(path), f"{str(self._bag_dir).rstrip(os.sep)}{os.sep}"
+        text, folder = str(path), f"{str(self.bag_dir).rstrip(os.sep)}{os.sep}"
         names = text[len(folder) :].split("/")[:-1]
         if not text.startswith(folder) or os.pardir in names:
             raise BagError(text, "it is not in the bag directory")
@@ -200,13 +199,13 @@ class BagDirReader(BagReader):
         Raises:
             BagError: as `_confined`.
         """
-        if self._bag_dir is not None and not os.path.lexists(path):
-            recorded = Path(HardLinks(self._bag_dir).recorded_as(str(path)))
-            name = os.path.relpath(recorded, self._bag_dir)
+        if self.bag_dir is not None and not os.path.lexists(path):
+            recorded = Path(HardLinks(self.bag_dir).recorded_as(str(path)))
+            name = os.path.relpath(recorded, self.bag_dir)
             links = [recorded]
             with suppress(OSError):
                 links += (
-                    folder / name for folder in sorted((self._bag_dir / MOMENTS_FOLDER).iterdir())
+                    folder / name for folder in sorted((self.bag_dir / MOMENTS_FOLDER).iterdir())
                 )
             path = next((link for link in links if os.path.lexists(link)), path)
         return self._confined(path)
@@ -222,7 +221,7 @@ class BagDirReader(BagReader):
         Raises:
             BagUnreachableError: the disk fails, so which messages count is unknown.
         """
-        if self._every_message:
+        if self.every_message:
             return HandoverReading(Handover(), None)
         reading = _sidecar(path.parent)
         if reading is None:
@@ -250,7 +249,7 @@ class BagDirReader(BagReader):
         lost = sum(
             record.channel.type == topic.type and not rule.counts(record)
             for window in windows
-            for record in self._reader.records(path, [topic.topic], window)
+            for record in self.reader.records(path, [topic.topic], window)
         )
         if not lost:
             return topic

@@ -124,11 +124,10 @@ class Heartbeat:
 def runs(pid: int) -> bool:
     """Returns whether there is a process of this id, or may be one."""
     try:
-        os.kill(pid, 0)
+        with suppress(PermissionError, OverflowError):
+            os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except (OSError, OverflowError):
-        return True
     return True
 
 

@@ -16,6 +16,7 @@ import json
 import os
 import re
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, lru_cache, wraps
 from typing import (
     TYPE_CHECKING,
@@ -72,6 +73,7 @@ class Line(NamedTuple, Generic[_T]):
     error: ValueError | None
 
 
+@dataclass(eq=False, repr=False)
 class JsonLog(Generic[_T]):
     """A log in the bag directory, whose rows are of one dataclass.
 
@@ -84,18 +86,19 @@ class JsonLog(Generic[_T]):
             where that fails.
     """
 
-    def __init__(
-        self, name: str, row: type[_T], *, most_bytes: int = MOST_BYTES, is_brief: bool = False
-    ) -> None:
-        self.name = name
-        self._row = row
-        self._most_bytes = most_bytes
-        self._is_brief = is_brief
-        self.current = until_changed(name)(self.rows)
+    name: str
+    row: type[_T]
+    _: KW_ONLY
+    most_bytes: int = MOST_BYTES
+    is_brief: bool = False
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self.current = until_changed(self.name)(self.rows)
 
     @cached_property
     def _adapter(self) -> TypeAdapter[_T]:  # takes some ms to make, and most files are never there
-        return TypeAdapter(self._row)
+        return TypeAdapter(self.row)
 
     def lines(self, bag_dir: Path) -> Iterator[Line[_T]]:
         """Yields the lines that are not empty.
@@ -105,9 +108,9 @@ class JsonLog(Generic[_T]):
             ValueError: it is not a regular file.
         """
         with open_plain(state_path(bag_dir, self.name)) as stream:
-            if stream.seek(0, os.SEEK_END) > self._most_bytes:
-                yield Line(0, b"", None, ValueError(f"it is larger than {self._most_bytes} bytes"))
-                stream.seek(-self._most_bytes, os.SEEK_END)
+            if stream.seek(0, os.SEEK_END) > self.most_bytes:
+                yield Line(0, b"", None, ValueError(f"it is larger than {self.most_bytes} bytes"))
+                stream.seek(-self.most_bytes, os.SEEK_END)
                 stream.readline()
             else:
                 stream.seek(0)
@@ -157,7 +160,7 @@ class JsonLog(Generic[_T]):
 
     def text(self, rows: Iterable[_T]) -> str:
         """Returns rows as lines."""
-        dumped = (self._adapter.dump_python(row, exclude_defaults=self._is_brief) for row in rows)
+        dumped = (self._adapter.dump_python(row, exclude_defaults=self.is_brief) for row in rows)
         lines = (json.dumps(fields).removesuffix("}").encode() for fields in dumped)
         return "".join(f"{_with_check(line).decode()}\n" for line in lines)
 
@@ -183,6 +186,7 @@ class JsonLog(Generic[_T]):
         write_durably(target, self.text(rows))
 
 
+@dataclass(eq=False, repr=False)
 class JsonDocument(Generic[_T]):
     """A document in the bag directory, which holds one value of a dataclass.
 
@@ -195,23 +199,19 @@ class JsonDocument(Generic[_T]):
             where that fails.
     """
 
-    def __init__(
-        self,
-        name: str,
-        content: type[_T],
-        *,
-        is_ascii: bool = True,
-        most_bytes: int = MAX_SMALL_FILE,
-    ) -> None:
-        self.name = name
-        self._content = content
-        self._is_ascii = is_ascii
-        self._most_bytes = most_bytes
-        self.current = until_changed(name)(self.read)
+    name: str
+    content: type[_T]
+    _: KW_ONLY
+    is_ascii: bool = True
+    most_bytes: int = MAX_SMALL_FILE
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self.current = until_changed(self.name)(self.read)
 
     @cached_property
     def _adapter(self) -> TypeAdapter[_T]:
-        return TypeAdapter(self._content)
+        return TypeAdapter(self.content)
 
     def read(self, bag_dir: Path) -> _T | None:
         """Returns the value; None where there is no file.
@@ -221,7 +221,7 @@ class JsonDocument(Generic[_T]):
             ValueError: it is damaged, or of another format.
         """
         try:
-            text = read_small_file(state_path(bag_dir, self.name), self._most_bytes)
+            text = read_small_file(state_path(bag_dir, self.name), self.most_bytes)
         except FileNotFoundError:
             return None
         return parsed(self._adapter, text, _FORMAT)
@@ -235,7 +235,7 @@ class JsonDocument(Generic[_T]):
         target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         content = {"format": _FORMAT, **self._adapter.dump_python(value)}
-        text = json.dumps(content, ensure_ascii=self._is_ascii, separators=(",", ":"))
+        text = json.dumps(content, ensure_ascii=self.is_ascii, separators=(",", ":"))
         write_durably(target, text, mode=READABLE)
 
     def remove(self, bag_dir: Path) -> None:

@@ -12,6 +12,7 @@ import os
 import socket
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import is_open_file
@@ -29,12 +30,12 @@ _FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _MAX_TEXT: Final = 1000
 
 
+@dataclass(eq=False, repr=False)
 class BagDirLock:
     """The lock of one bag directory, held until `release` and by children that inherit it."""
 
-    def __init__(self, descriptor: int, path: Path) -> None:
-        self.descriptor = descriptor
-        self._path = path
+    descriptor: int
+    path: Path
 
     @classmethod
     def acquire(cls, bag_dir: Path, patience_s: float = CHILD_EXIT_S) -> BagDirLock:
@@ -74,15 +75,15 @@ class BagDirLock:
             RecorderError: another recorder has acquired it since, which the sentence names.
         """
         try:
-            if not self._path.parent.is_dir() or is_open_file(self._path, self.descriptor):
+            if not self.path.parent.is_dir() or is_open_file(self.path, self.descriptor):
                 return False
-            is_same_disk = self._path.parent.stat().st_dev == os.fstat(self.descriptor).st_dev
+            is_same_disk = self.path.parent.stat().st_dev == os.fstat(self.descriptor).st_dev
             flags = _FLAGS if is_same_disk else _FLAGS & ~os.O_CREAT
-            descriptor = os.open(self._path, flags, 0o644)
+            descriptor = os.open(self.path, flags, 0o644)
         except OSError:
             return False
         try:
-            _lock(descriptor, self._path, 0.0)
+            _lock(descriptor, self.path, 0.0)
             os.dup2(descriptor, self.descriptor, inheritable=False)
         finally:
             os.close(descriptor)
@@ -105,8 +106,16 @@ def _lock(descriptor: int, path: Path, patience_s: float) -> None:
             # A restarted container: the process before had the number that this one has.
             is_before = pid == os.getpid()
             alive = host != socket.gethostname() or pid is None or (not is_before and runs(pid))
-            if alive or time.monotonic() >= give_up:
-                raise RecorderError(_refusal(path, pid, host, alive=alive)) from None
+            who = f"process {pid} on {host}" if pid is not None else "a process that left no name"
+            if alive:
+                raise RecorderError(
+                    f"{path.parent} is being recorded into by {who}; two recorders cannot share it"
+                ) from None
+            if time.monotonic() >= give_up:
+                raise RecorderError(
+                    f"{path.parent}: {who} has died, and a ros2 bag record of its that still runs "
+                    "does not end; end that process"
+                ) from None
             time.sleep(_POLL_S)
         except OSError as error:
             raise RecorderError(
@@ -115,16 +124,6 @@ def _lock(descriptor: int, path: Path, patience_s: float) -> None:
             ) from error
         else:
             return
-
-
-def _refusal(path: Path, pid: int | None, host: str | None, *, alive: bool) -> str:
-    who = f"process {pid} on {host}" if pid is not None else "a process that left no name"
-    if alive:
-        return f"{path.parent} is being recorded into by {who}; two recorders cannot share it"
-    return (
-        f"{path.parent}: {who} has died, and a ros2 bag record of its that still runs does not "
-        "end; end that process"
-    )
 
 
 def write_holder(descriptor: int) -> None:

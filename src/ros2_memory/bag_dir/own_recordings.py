@@ -263,8 +263,8 @@ class OwnRecordings:
 
         Without a list it makes one, and names what looks like recordings: nothing shows whether
         they were restored or copied. Else it drops entries of recordings that have gone, completes
-        those that a kill left without a directory (see `_find_completed`), and counts the splits
-        of those that a kill ended. What cannot be written is known all the same, so that space can
+        those that a kill left without a directory, and counts the splits of those that a kill
+        ended (see `_left_by_kill`). What cannot be written is known all the same, so that space can
         be freed on a full disk; the next recording writes it.
 
         Raises:
@@ -279,9 +279,8 @@ class OwnRecordings:
                 )
             except OSError as error:
                 raise self._failure(error, "read") from error
-            rows = self._find_completed()
+            rows = self._left_by_kill()
             self._add(rows)
-            rows += self._find_ended()
             if left:
                 names, count = left[:_MAX_NAMED], len(left)
                 _log.warning(
@@ -397,29 +396,25 @@ class OwnRecordings:
         # A new dictionary: another thread may iterate over this one.
         self._rows = self._rows | _by_recording(rows)
 
-    def _find_completed(self) -> list[ListRow]:
-        """Returns the entries without a directory whose directory our child made after all.
+    def _left_by_kill(self) -> list[ListRow]:
+        """Returns what a kill kept from being listed.
 
-        Those that the last heartbeat names: it named them before the child was started.
+        Entries without a directory whose directory our child made after all: those that the last
+        heartbeat names, which named them before the child was started. And the splits of recordings
+        that did not end.
         """
-        completed: list[ListRow] = []
-        for name in read_heartbeat(self._bag_dir).recordings:
-            row = self._rows.get(name)
-            if row is not None and row.identity is None:
-                with suppress(OSError):
-                    if identity := identity_of(self._bag_dir / name):
-                        completed.append(ListRow(name, *identity, splits=0))
-        return completed
-
-    def _find_ended(self) -> list[ListRow]:
-        """Returns the recordings that a kill ended, with the splits that they have."""
-        ended: list[ListRow] = []
+        named = read_heartbeat(self._bag_dir).recordings
+        left: list[ListRow] = []
         for name, row in self._rows.items():
-            if row.identity is not None and row.splits is not None and not row.ended:
-                with suppress(OSError):
-                    files = {path.name for path in bags_in(self._bag_dir / name)}
-                    ended.append(replace(row, splits=row.counted(files), ended=True))
-        return ended
+            with suppress(OSError):
+                directory = self._bag_dir / name
+                if row.identity is None and name in named and (found := identity_of(directory)):
+                    row = ListRow(name, *found, splits=0)  # noqa: PLW2901 - as it is now
+                    left.append(row)
+                if row.identity is not None and row.splits is not None and not row.ended:
+                    files = {path.name for path in bags_in(directory)}
+                    left.append(replace(row, splits=row.counted(files), ended=True))
+        return left
 
     def _missing_on_disk(self, names: Iterable[str]) -> list[str]:
         """Returns the recordings that are no longer in the bag directory."""

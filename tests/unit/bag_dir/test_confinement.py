@@ -27,7 +27,6 @@ from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, 
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.columns.database import open_file
 from ros2_memory.config import Settings, load_settings
-from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -325,13 +324,6 @@ class TestDeletions:
             queue = RequestQueue(bags)
             queue.open()
             assert not queue.has_requests()
-
-    def test_no_bag_of_a_moment_is_linked_behind_a_link(self, bags: Path, outside: Path) -> None:
-        with untouched(outside):
-            (bags / "moments").mkdir()
-            (bags / "moments/a").symlink_to(outside)
-            with pytest.raises(OSError, match="symbolic link"):
-                directories.make(bags, bags / "moments/a/rec_0")
 
     def test_a_store_behind_a_link_is_neither_written_nor_set_aside(
         self, bags: Path, outside: Path

@@ -244,7 +244,7 @@ class TestLogs:
     ) -> None:
         laid(tmp_path, log, text * 50)
         rows = log.rows(tmp_path)
-        monkeypatch.setattr(log, "_most_bytes", 600)
+        monkeypatch.setattr(log, "most_bytes", 600)
         left_out, *found = log.lines(tmp_path)
         assert (left_out.number, left_out.row, len(found) > 1) == (0, None, True)
         assert "larger than 600 bytes" in str(left_out.error)
