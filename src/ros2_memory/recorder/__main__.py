@@ -42,7 +42,6 @@ from ros2_memory.retention.policy import SMALL_BUDGET_GB, small_budget
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from ros2_memory.recorder.base import Recorder
 
@@ -94,8 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _record(settings: Settings) -> None:
     # Nothing is deleted before the list of topics and the environment proved fit for recording.
-    load_topics(settings.recording.topics_file)
     recording = settings.recording
+    load_topics(recording.topics_file)
     if recording.split_duration_s > recording.session_duration_s:
         _log.warning(
             "split_longer_than_session",
@@ -105,14 +104,12 @@ def _record(settings: Settings) -> None:
         )
     if settings.retention.max_total_gb < SMALL_BUDGET_GB:
         _log.warning("budget_small", reason=small_budget(settings.retention.max_total_gb))
-    bag_dir = settings.recording.bag_dir.absolute()
-    reader = build_reader(settings, cache_mb=CACHE_MB)
-    reader = BagDirReader(reader, bag_dir, every_message=True)
+    bag_dir = recording.bag_dir.absolute()
+    reader = BagDirReader(build_reader(settings, cache_mb=CACHE_MB), bag_dir, every_message=True)
     own = OwnRecordings(bag_dir)
     background = Background()
     housekeeper = build_housekeeper(settings, bag_dir, reader, own, background)
-    clear = settings.recording.clear_on_startup
-    if clear:
+    if recording.clear_on_startup:
         refuse_homes(bag_dir)
     make_bag_dir(bag_dir)
     lock = BagDirLock.acquire(bag_dir)
@@ -131,8 +128,13 @@ def _record(settings: Settings) -> None:
         )
         recorder.check()
         own.claim()
-        if clear:
-            _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
+        if recording.clear_on_startup:
+            cleared = clear_bags(bag_dir, own if settings.retention.foreign == "keep" else None)
+            _log.warning("bags_cleared", files=cleared.files, bytes=cleared.bytes)
+            for fault in cleared.faults:
+                _log.error("not_cleared", reason=fault)
+            if cleared.more:
+                _log.error("not_cleared", reason=f"{cleared.more} more cannot be deleted")
         try:
             housekeeper.prepare()
         except (EpisodicError, OSError) as error:
@@ -147,15 +149,6 @@ def _record(settings: Settings) -> None:
         _log.warning("config_unused", reason=unused)
     _record_until_signal(recorder, lock)
     _log.info("stopped")
-
-
-def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:
-    cleared = clear_bags(bag_dir, own)
-    _log.warning("bags_cleared", files=cleared.files, bytes=cleared.bytes)
-    for fault in cleared.faults:
-        _log.error("not_cleared", reason=fault)
-    if cleared.more:
-        _log.error("not_cleared", reason=f"{cleared.more} more cannot be deleted")
 
 
 def _record_until_signal(recorder: Recorder, lock: BagDirLock) -> None:

@@ -12,7 +12,7 @@ import re
 import time
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, is_dataclass, replace
 from itertools import chain, repeat, starmap
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -131,6 +131,7 @@ class MemoryLimits(NamedTuple):
     max_age_ns: Ns = 400 * 86_400 * NS_PER_S
 
 
+@dataclass(eq=False, repr=False)
 class MemoryDays:
     """Writes and deletes the days of one bag directory, whose lock its caller holds.
 
@@ -141,30 +142,25 @@ class MemoryDays:
         limits: which messages stay; None: none, and the days that exist are deleted.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        reader: BagReader,
-        writer: BagWriter,
-        own: OwnRecordings,
-        extractor: SchemaExtractor,
-        *,
-        limits: MemoryLimits | None,
-        static_topics: Collection[str],
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._folder = bag_dir / MEMORY_FOLDER
-        self._reader = reader
-        self._writer = writer
-        self._own = own
-        self._extractor = extractor
-        self.keeps = limits is not None
-        self._limits = limits or MemoryLimits()
+    bag_dir: Path
+    reader: BagReader
+    writer: BagWriter
+    own: OwnRecordings
+    extractor: SchemaExtractor
+    _: KW_ONLY
+    limits: MemoryLimits | None
+    static_topics: Collection[str]
+    monotonic: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self._folder = self.bag_dir / MEMORY_FOLDER
+        self.keeps = self.limits is not None
+        self._limits = self.limits or MemoryLimits()
         self._people = _PEOPLE.union(map(caseless, self._limits.people))
-        self._static_topics = frozenset(static_topics)
+        self._static_topics = frozenset(self.static_topics)
         self._minutes: set[Path] = set()
-        self._monotonic = monotonic
-        self._failing = FailingFiles(monotonic)
+        self._failing = FailingFiles(self.monotonic)
         self._leaving_since: float | None = None
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
@@ -238,7 +234,7 @@ class MemoryDays:
         for path in self._days():
             if path.name < month_ago and path not in self._minutes:
                 self._minutes.add(path)
-                channels = self._reader.channels(path)
+                channels = self.reader.channels(path)
                 is_thinned = all(_BY_MINUTE in channel.metadata for channel in channels)
                 # A damaged day written anew would not tell that something is missing.
                 if not is_thinned and self._is_whole(path):
@@ -263,7 +259,7 @@ class MemoryDays:
 
     def _thin_to_minutes(self, path: Path) -> None:
         """Writes a day anew in which numbers have one message a minute, and their extremes."""
-        detections = DetectionColumns(self._extractor)
+        detections = DetectionColumns(self.extractor)
         numbers: dict[tuple[str, str], TopicThinning] = {}
         for table in self._tables(path):
             if has_numbers(table) and not table.channel.latched:
@@ -293,7 +289,7 @@ class MemoryDays:
             if (bag_dir / LEAVING_FILE).exists():
                 LEAVING.remove(bag_dir)
             return
-        now, since = self._monotonic(), self._leaving_since
+        now, since = self.monotonic(), self._leaving_since
         left_s = GRACE_S
         with suppress(ValueError):
             left_s = (LEAVING.read(bag_dir) or Leaving(GRACE_S)).left_s
@@ -317,7 +313,7 @@ class MemoryDays:
         if self._folder.is_symlink() or not self._folder.is_dir():
             return []
         paths = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
-        return sorted(path for path in paths if self._own.owns_bag(path))
+        return sorted(path for path in paths if self.own.owns_bag(path))
 
     def _read_thinned(self) -> Thinned:
         """Returns what is known of deleted bags; nothing, which is logged, of a damaged file."""
@@ -331,7 +327,7 @@ class MemoryDays:
         """Returns which messages of some bags stay, also beside the pauses that these show."""
         chosen = _Staying()
         thinned: dict[tuple[str, str], TopicThinning] = {}
-        detections = DetectionColumns(self._extractor)
+        detections = DetectionColumns(self.extractor)
         for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
             topic, kind = table.channel.topic, table.channel.type
             if why := self._why_left_out(table):
@@ -373,7 +369,11 @@ class MemoryDays:
         """Yields the messages that stay, without people whose label may not."""
         topics = [*{topic for (topic, _), times in chosen.times.items() if times}]
         for bag in bags:
-            for record in self._readable_records(bag.path, topics):
+            for record in or_errors(self.reader.records(bag.path, topics, _EVERYTHING)):
+                if isinstance(record, BagError):
+                    if self._failing.may_recover(bag.path, record):
+                        raise record
+                    continue
                 channel = record.channel
                 if record.log_time not in chosen.times.get((channel.topic, channel.type), ()):
                     continue
@@ -393,22 +393,13 @@ class MemoryDays:
         Raises:
             BagUnreachableError: the disk fails to read the bag, and may recover.
         """
-        groups = undecoded(self._reader, path, skip_undecodable=True)
-        for group in or_errors(groups):
-            if isinstance(group, BagError):
-                if self._failing.may_recover(path, group):
-                    raise group
-                _log.warning("memory_not_read", path=str(path), reason=group.reason)
-            else:
+        for group in or_errors(undecoded(self.reader, path, skip_undecodable=True)):
+            if not isinstance(group, BagError):
                 yield from group.tables()
-
-    def _readable_records(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
-        """Yields the messages of a bag that can be read; raises as `_tables` does."""
-        for record in or_errors(self._reader.records(path, topics, _EVERYTHING)):
-            if not isinstance(record, BagError):
-                yield record
-            elif self._failing.may_recover(path, record):
-                raise record
+            elif self._failing.may_recover(path, group):
+                raise group
+            else:
+                _log.warning("memory_not_read", path=str(path), reason=group.reason)
 
     def _without_people(self, record: Record, *, rounds: bool) -> Record | None:
         """Returns a message without people whose label may not stay, maybe with rounded numbers.
@@ -416,22 +407,22 @@ class MemoryDays:
         None where it cannot be parted from them, or where no transform of it is left.
         """
         try:
-            whole, channel = self._reader.decode(record), record.channel
+            whole, channel = self.reader.decode(record), record.channel
             message = _without_hidden(whole, self._is_hidden)
             if message is not whole and getattr(message, "transforms", None) == []:
                 return None
             if self._names_people(message, channel.type):
                 return None
             if rounds:
-                message = rounded(message, self._reader.definition(channel))
+                message = rounded(message, self.reader.definition(channel))
             if message is whole:
                 return record
-            return record._replace(payload=self._reader.encode(channel, message))
+            return record._replace(payload=self.reader.encode(channel, message))
         except UndecodableError:
             return None
 
     def _names_people(self, message: object, type_name: str) -> bool:
-        extracted = self._extractor.exact(message, type_name)
+        extracted = self.extractor.exact(message, type_name)
         texts = [value for _, value in fields_in(message) if isinstance(value, str)]
         labels = [
             detection.label for value in (extracted, *texts) for detection in detections_of(value)
@@ -465,7 +456,7 @@ class MemoryDays:
             raise BagError(str(self._folder), "a symbolic link, which is not followed: remove it")
         self._folder.mkdir(exist_ok=True)
         path = self._writable_file(day)
-        self._own.hold(self._folder, [path.name])
+        self.own.hold(self._folder, [path.name])
         self._replace_day(path, self._merged_by_hour(path, records), bags)
 
     def _replace_day(self, path: Path, records: Iterator[Record], bags: Sequence[BagFile]) -> None:
@@ -475,7 +466,7 @@ class MemoryDays:
         """
         bag_dir, name = self._folder.parent, f"{MEMORY_FOLDER}/{path.name}"
         with beside(path) as new:
-            self._writer.write(new, records, dense=True)
+            self.writer.write(new, records, dense=True)
             status, before = new.stat(), Superseded()
             with suppress(ValueError):  # a damaged list is replaced
                 before = SUPERSEDED.read(bag_dir) or before
@@ -497,12 +488,12 @@ class MemoryDays:
             if not path.exists():
                 return path
             with suppress(BagError):
-                if self._is_whole(path) and self._own.owns_bag(path):
+                if self._is_whole(path) and self.own.owns_bag(path):
                     return path
             number += 1
 
     def _is_whole(self, path: Path) -> bool:
-        summary = self._reader.summarize(path)
+        summary = self.reader.summarize(path)
         return summary.complete and not summary.notes
 
     def _merged_by_hour(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
@@ -510,18 +501,18 @@ class MemoryDays:
 
         So what is alike lies together, and compresses.
         """
-        topics = [channel.topic for channel in self._reader.channels(path)] if path.exists() else []
+        topics = [channel.topic for channel in self.reader.channels(path)] if path.exists() else []
         hours: defaultdict[int, list[Record]] = defaultdict(list)
         for record in added:
             hours[record.log_time // HOUR_NS].append(record)
         if topics:
             # Not all from the first to the last: where the clock was set, years lie between.
-            batches = self._reader.batches(path, topics, _EVERYTHING, bare=topics)
+            batches = self.reader.batches(path, topics, _EVERYTHING, bare=topics)
             for hour in {at // HOUR_NS for batch in batches for at in batch.log_times.tolist()}:
                 hours.setdefault(hour, [])
         for hour in sorted(hours):
             window = TimeWindow(hour * HOUR_NS, (hour + 1) * HOUR_NS)
-            before = [*self._reader.records(path, topics, window)] if topics else []
+            before = [*self.reader.records(path, topics, window)] if topics else []
             identities: set[tuple[str, Ns, Ns, bytes]] = set()
             by_topic = attrgetter("channel.topic", "log_time")
             for record in sorted([*before, *hours[hour]], key=by_topic):

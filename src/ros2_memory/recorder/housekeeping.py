@@ -25,7 +25,7 @@ from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_since, ns_from_uni
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
-from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
+from ros2_memory.retention.collect import Collected, GarbageCollector
 from ros2_memory.retention.delete import remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.recorder.background import Background
+    from ros2_memory.recorder.days import MemoryDays
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.topic_ages import TopicCutter
     from ros2_memory.storage.base import BagReader, BagWriter
@@ -109,7 +110,7 @@ class Housekeeping:
         grace_s: float = 0.0,
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
-        memory: Outliving | None = None,
+        memory: MemoryDays | None = None,
         cutter: TopicCutter | None = None,
         background: Background,
     ) -> None:
@@ -336,8 +337,15 @@ class Housekeeping:
         self._clear_memory()
         before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
+        limit = f"{self._limits.max_age_ns / (3600 * NS_PER_S):g} h"
+        age_held = (
+            f"{counted(collected.held, 'bag is', 'bags are')} older than {limit} "
+            "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
+            "They are deleted when it is synchronised with a time server (timedatectl shows that), "
+            f"or when {limit} have been recorded after them"
+        )
         self._status = self._status._replace(
-            age_held=self._describe_held(collected.held) if collected.held else None,
+            age_held=age_held if collected.held else None,
             counted_bytes=collected.total_bytes,
             state_bytes=collected.state_bytes,
         )
@@ -361,21 +369,18 @@ class Housekeeping:
             self._triggers.note_deleted(collected.needed)
         return collected
 
-    def _describe_held(self, bags: int) -> str:
-        limit = f"{self._limits.max_age_ns / (3600 * NS_PER_S):g} h"
-        return (
-            f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
-            "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
-            "They are deleted when it is synchronised with a time server (timedatectl shows that), "
-            f"or when {limit} have been recorded after them"
-        )
-
     def _collect(self, free_bytes_wanted: int | None) -> Collected:
         with self._index.undisturbed(patrolling=True) as snapshot:
             heartbeat = self._index.heartbeat()
             begun = heartbeat.recordings if heartbeat else self._own.in_order()[-_WRITTEN_AT_ONCE:]
             known = self._index.known_bags(begun, snapshot)
-            needed = self._needed_by_rules(snapshot)
+            needed = frozenset[str]()
+            try:
+                if self._triggers is not None:
+                    needed = self._triggers.needed(snapshot)
+            except OSError:  # which was reported when moments were minded
+                # Age deletes none then, and the budget the oldest, so that the disk does not fill.
+                needed = frozenset(bag.file for bag in snapshot.bags)
             collected = self._collector.apply(known, snapshot, needed, free_bytes_wanted)
         if collected.bags or collected.cut:
             self._index.refresh()
@@ -383,8 +388,17 @@ class Housekeeping:
 
     def _report(self, before: Collected, collected: Collected) -> None:
         """Reports what began or ended with a pass, and what it deleted unshipped."""
-        if collected.unshipped:
-            self._report_unshipped(collected.unshipped)
+        if unshipped := collected.unshipped:
+            self._unshipped += len(unshipped)
+            bags = counted(self._unshipped, "bag was", "bags were")
+            newest = unshipped[: -MAX_NAMED - 1 : -1]
+            sentence = (
+                f"since the recorder started, {bags} deleted unshipped, to make room "
+                f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
+            )
+            self._status = self._status._replace(unshipped=sentence)
+            names = [*unshipped]
+            _log.warning("unshipped_deleted", bags=len(names), names=names, reason=sentence)
         if collected.held and not before.held:
             _log.warning("age_held", bags=collected.held, reason=self._status.age_held)
         elif before.held and not collected.held:
@@ -397,45 +411,18 @@ class Housekeeping:
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
-        if before.total_bytes <= self._limits.max_total_bytes < collected.total_bytes:
-            self._report_budget_not_held(collected)
-
-    def _report_unshipped(self, unshipped: tuple[str, ...]) -> None:
-        self._unshipped += len(unshipped)
-        bags = counted(self._unshipped, "bag was", "bags were")
-        newest = unshipped[: -MAX_NAMED - 1 : -1]
-        sentence = (
-            f"since the recorder started, {bags} deleted unshipped, to make room "
-            f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
-        )
-        self._status = self._status._replace(unshipped=sentence)
-        _log.warning("unshipped_deleted", bags=len(unshipped), names=[*unshipped], reason=sentence)
-
-    def _report_budget_not_held(self, collected: Collected) -> None:
-        most = self._limits.max_total_bytes
-        state, saved = collected.state_bytes, collected.saved_bytes
-        others = collected.total_bytes - state - saved
-        _log.error(
-            "budget_not_held",
-            total_bytes=collected.total_bytes,
-            state_bytes=state,
-            reason=f"files that are never deleted exceed {most / _MB:.3g} MB: "
-            f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
-            f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
-            "raise retention.max_total_gb",
-        )
-
-    def _needed_by_rules(self, snapshot: Snapshot) -> frozenset[str]:
-        """Returns the bags that rules may still need: all where the disk does not tell.
-
-        Then age deletes none, and the budget the oldest, so that the disk does not fill.
-        """
-        if self._triggers is None:
-            return frozenset()
-        try:
-            return self._triggers.needed(snapshot)
-        except OSError:  # which was reported when moments were minded
-            return frozenset(bag.file for bag in snapshot.bags)
+        total, most = collected.total_bytes, self._limits.max_total_bytes
+        if before.total_bytes <= most < total:
+            state, saved = collected.state_bytes, collected.saved_bytes
+            _log.error(
+                "budget_not_held",
+                total_bytes=total,
+                state_bytes=state,
+                reason=f"files that are never deleted exceed {most / _MB:.3g} MB: "
+                f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
+                f"{saved / _MB:.3g} MB, open, damaged or newest bags "
+                f"{(total - state - saved) / _MB:.3g} MB; raise retention.max_total_gb",
+            )
 
     def _repair_unfinished(self, snapshot: Snapshot) -> int:
         """Repairs files that the index found unfinished and nothing writes; returns how many."""

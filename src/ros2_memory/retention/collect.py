@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -57,7 +57,6 @@ class Collected:
         carried: how many latched messages are carried, if their bag was rewritten.
         total_bytes: what the budget counts afterwards.
         saved_bytes: how much of it saved moments take.
-        fits: whether the limits are kept.
         held: how many bags are too old by their dates and stay, since the clock is not known to be
             right.
         cut: out of how many bags topics were cut.
@@ -77,7 +76,6 @@ class Collected:
     foreign_bytes: int = 0
     state_bytes: int = 0
     saved_bytes: int = 0
-    fits: bool = True
     held: int = 0
     cut: int = 0
     needed: int = 0
@@ -112,9 +110,6 @@ class _Pass:
 class Outliving(Protocol):
     """What stays of bags that are deleted."""
 
-    keeps: bool
-    """Whether anything is to stay; otherwise all that stayed before is deleted."""
-
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
         """Makes durable what stays of some bags.
 
@@ -130,14 +125,8 @@ class Outliving(Protocol):
             OSError: it cannot be deleted.
         """
 
-    def clear(self) -> None:
-        """Deletes all where nothing is to stay, some time after the first call.
 
-        Raises:
-            OSError: it cannot be deleted.
-        """
-
-
+@dataclass(eq=False, repr=False)
 class GarbageCollector:
     """Keeps one bag directory within its limits. Not thread-safe.
 
@@ -148,35 +137,26 @@ class GarbageCollector:
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        limits: RetentionLimits,
-        carrier: Carrier,
-        own: OwnRecordings,
-        *,
-        recorded: RecordedTime,
-        is_synchronised: Callable[[], bool],
-        static_topics: Collection[str],
-        grace_s: float,
-        measure_free: Callable[[Path], int],
-        monotonic: Callable[[], float],
-        memory: Outliving | None,
-        cutter: TopicCutter | None,
-    ) -> None:
-        self._bag_dir = bag_dir
-        self._cutter = cutter
-        self._limits = limits
-        self._memory = memory
+    bag_dir: Path
+    limits: RetentionLimits
+    carrier: Carrier
+    own: OwnRecordings
+    _: KW_ONLY
+    recorded: RecordedTime
+    is_synchronised: Callable[[], bool]
+    static_topics: Collection[str]
+    grace_s: float
+    measure_free: Callable[[Path], int]
+    monotonic: Callable[[], float]
+    memory: Outliving | None
+    cutter: TopicCutter | None
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
         self._memory_fails_since: float | None = None
-        self._carrier = carrier
-        self._own = own
-        self._recorded = recorded
-        self._is_synchronised = is_synchronised
-        self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
-        self._grace_s = grace_s
-        self._measure_free = measure_free
-        self._monotonic = monotonic
+        self._inventory = Inventory(
+            self.bag_dir, self.static_topics, self.own if self.limits.keeps_foreign else None
+        )
         self._carried_since: dict[str, float] = {}
         self._reported: set[str] = set()
         self._emptied: set[Path] = set()
@@ -201,24 +181,26 @@ class GarbageCollector:
             OSError: the free space cannot be measured, or the list of the recorder's own recordings
                 cannot be read.
         """
-        limits = self._limits
+        limits = self.limits
         if free_bytes_wanted is not None:
             limits = replace(limits, min_free_bytes=free_bytes_wanted)
         run = _Pass(urgent=free_bytes_wanted is not None)
-        result = run.result
         while True:
             contents = replace(self._contents(known, limits, run), needed=needed)
             if free_bytes_wanted is not None:
-                contents = replace(contents, free_bytes=self._measure_free(self._bag_dir))
+                contents = replace(contents, free_bytes=self.measure_free(self.bag_dir))
             plan = plan_deletions(contents, limits)
-            result.foreign_bytes, result.state_bytes = contents.foreign_bytes, contents.state_bytes
-            result.saved_bytes = sum(contents.saved.values())
-            result.total_bytes, result.fits = plan.total_bytes, plan.fits
-            result.most_free = plan.most_free
-            going = plan.to_delete if self._memory is None else by_hours(plan, contents)
-            to_delete = going[: MOST_AT_ONCE - len(run.deleted)]
-            if to_delete:
-                self._delete_bags(to_delete, contents, snapshot, run, plan)
+            going = plan.to_delete if self.memory is None else by_hours(plan, contents)
+            going = going[: MOST_AT_ONCE - len(run.deleted)]
+            if going:
+                run.saved |= {
+                    bag.path
+                    for bag in going
+                    if any(file.inode in contents.saved for file in bag.files)
+                }
+                self._carry(going, snapshot, run)
+                left = [bag for bag in going if bag.path not in run.remaining]
+                self._delete_bags(self._keep_memory(left, plan, snapshot, run), run)
                 run.unshipped += sorted(contents.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
@@ -227,116 +209,83 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
         self._remove_emptied(known, run)
-        self._limit_memory(snapshot, is_synchronised=contents.synchronised)
-        if free_bytes_wanted is None and result.fits:
-            self._cut_topics(contents, limits, snapshot, run)
-        result.needed = len(needed & run.deleted)
-        result.unshipped = tuple(
-            self._own.name_of(path) for path in run.unshipped if path not in run.saved
+        if self.memory is not None:
+            # As bags do, days age by the newest that is recorded, and by a clock that is right.
+            newest = snapshot.latest if contents.synchronised else None
+            try:
+                self.memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
+            except (EpisodicError, OSError) as error:
+                _log.error("memory_not_limited", reason=str(error))
+        if self.cutter is not None and free_bytes_wanted is None and plan.fits:
+            left = [bag for bag in contents.bags if bag.path not in run.deleted]
+            try:
+                run.result.cut = self.cutter.cut(replace(contents, bags=left), limits, snapshot)
+            except OSError as error:
+                _log.error("topics_not_cut", reason=error.strerror or str(error))
+        return replace(
+            run.result,
+            total_bytes=plan.total_bytes,
+            foreign_bytes=contents.foreign_bytes,
+            state_bytes=contents.state_bytes,
+            saved_bytes=sum(contents.saved.values()),
+            needed=len(needed & run.deleted),
+            unshipped=tuple(
+                self.own.name_of(path) for path in run.unshipped if path not in run.saved
+            ),
+            most_free=plan.most_free,
         )
-        return result
-
-    def _limit_memory(self, snapshot: Snapshot, *, is_synchronised: bool) -> None:
-        if self._memory is None:
-            return
-        # As bags do, days age by the newest that is recorded, and by a clock that is right.
-        newest = snapshot.latest if is_synchronised else None
-        try:
-            self._memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
-        except (EpisodicError, OSError) as error:
-            _log.error("memory_not_limited", reason=str(error))
 
     def _contents(self, known: KnownBags, limits: RetentionLimits, run: _Pass) -> DirContents:
         """Returns what is stored, how long was recorded after it, and where the clock was right."""
         contents = self._inventory.contents(known, deleted=run.deleted, remaining=run.remaining)
-        root = f"{self._bag_dir}{os.sep}"
-        names = {bag.recording: self._own.name_of(bag.recording) for bag in contents.bags}
-        since = self._recorded.since(names.values())
-        doubtful = self._recorded.doubtful(names.values())
-        order = {name: place for place, name in enumerate(self._own.in_order())}
-        missing = frozenset[str]()
-        if limits.require_shipped:
-            bags = ((bag.path.removeprefix(root), bag.size) for bag in contents.bags)
-            missing = frozenset(root + path for path in unshipped(self._bag_dir, bags))
+        root = f"{self.bag_dir}{os.sep}"
+        names = {bag.recording: self.own.name_of(bag.recording) for bag in contents.bags}
+        since = self.recorded.since(names.values())
+        doubtful = self.recorded.doubtful(names.values())
+        order = {name: place for place, name in enumerate(self.own.in_order())}
+        bags = ((bag.path.removeprefix(root), bag.size) for bag in contents.bags)
+        missing = unshipped(self.bag_dir, bags) if limits.require_shipped else ()
         contents = replace(
             contents,
             recorded_since={path: since[name] for path, name in names.items()},
             doubtful=frozenset(path for path, name in names.items() if name in doubtful),
             places={path: order[name] for path, name in names.items() if name in order},
-            unshipped=missing,
+            unshipped=frozenset(root + path for path in missing),
         )
         old = too_old(contents, limits, limits.max_age_ns)
         # Asking starts a program, so only where it matters.
-        asks = self._recorded.asks_for_clock() or self._cutter is not None
+        asks = self.recorded.asks_for_clock() or self.cutter is not None
         if run.synchronised is None and (old[True] != old[False] or asks):
-            run.synchronised = self._is_synchronised()
+            run.synchronised = self.is_synchronised()
             if run.synchronised:
-                self._recorded.confirm_clock()
+                self.recorded.confirm_clock()
         synchronised = bool(run.synchronised)
         run.result.held = 0 if synchronised else len(old[True] - old[False])
         return replace(contents, synchronised=synchronised)
 
-    def _cut_topics(
-        self, contents: DirContents, limits: RetentionLimits, snapshot: Snapshot, run: _Pass
-    ) -> None:
-        """Cuts topics with a shorter life out of bags that stay."""
-        if self._cutter is None:
-            return
-        left = [bag for bag in contents.bags if bag.path not in run.deleted]
-        try:
-            run.result.cut = self._cutter.cut(replace(contents, bags=left), limits, snapshot)
-        except OSError as error:
-            _log.error("topics_not_cut", reason=error.strerror or str(error))
-
-    def _delete_bags(
-        self,
-        to_delete: Sequence[StoredBag],
-        contents: DirContents,
-        snapshot: Snapshot,
-        run: _Pass,
-        plan: DeletionPlan,
-    ) -> None:
-        run.saved |= {
-            bag.path for bag in to_delete if any(file.inode in contents.saved for file in bag.files)
-        }
-        self._carry(to_delete, snapshot, run)
-        going = [bag for bag in to_delete if bag.path not in run.remaining]
-        going = self._keep_memory(going, plan, snapshot, run)
-        self._write_down(going)
-        for bag in going:
-            self._delete_bag(bag, run)
-        # Where the disk was full, there is room now.
-        self._write_down(())
-
     def _carry(self, to_delete: Sequence[StoredBag], snapshot: Snapshot, run: _Pass) -> None:
         """Carries latched messages on; bags remain of which that failed, or was just done."""
         paths = {Path(path) for path in (*run.deleted, *(bag.path for bag in to_delete))}
-        latched = {bag.file for bag in self._carrier.with_latched(snapshot, paths)}
+        files = {bag.file for bag in self.carrier.with_latched(snapshot, paths)}
+        latched = [bag for bag in to_delete if bag.path in files]
         try:
-            carried = self._carrier.carry(snapshot, paths, {*map(Path, run.saved)})
+            carried = self.carrier.carry(snapshot, paths, {*map(Path, run.saved)})
         except (EpisodicError, OSError) as error:
             # Bags without latched messages can still be deleted, and may free enough space.
-            for bag in to_delete:
-                if bag.path in latched:
-                    self._keep_failed(
-                        bag, f"its latched messages cannot be carried on: {error}", run
-                    )
+            for bag in latched:
+                self._keep_failed(bag, f"its latched messages cannot be carried on: {error}", run)
         else:
             run.result.carried = run.result.carried if carried is None else carried
-        now = self._monotonic()
-        for path in (bag.path for bag in to_delete if bag.path in latched):
+        now = self.monotonic()
+        for bag in latched:
             # Queries may still look for latched messages there, though they are carried.
-            since = self._carried_since.setdefault(path, now)
-            if not run.urgent and now - since < self._grace_s:
-                run.remaining.add(path)
-                run.waiting.add(path)
+            since = self._carried_since.setdefault(bag.path, now)
+            if not run.urgent and now - since < self.grace_s:
+                run.remaining.add(bag.path)
+                run.waiting.add(bag.path)
 
     def _keep_memory(
-        self,
-        to_delete: list[StoredBag],
-        plan: DeletionPlan,
-        snapshot: Snapshot,
-        run: _Pass,
+        self, going: list[StoredBag], plan: DeletionPlan, snapshot: Snapshot, run: _Pass
     ) -> list[StoredBag]:
         """Writes what stays of bags; returns those that go now.
 
@@ -344,39 +293,46 @@ class GarbageCollector:
         and not those that would go with them, in the same hour; few at first, as that makes room to
         write what stays of the others.
         """
-        if self._memory is None:
-            return to_delete
-        # A moment has all messages of its bags.
-        alone = {bag.path for bag in to_delete} - run.saved
+        if self.memory is None:
+            return going
+        paths = {bag.path for bag in going}
         try:
-            self._memory.keep(snapshot, alone)
+            # A moment has all messages of its bags.
+            self.memory.keep(snapshot, paths - run.saved)
         except (EpisodicError, OSError) as error:
-            now = self._monotonic()
+            now = self.monotonic()
             since = now if self._memory_fails_since is None else self._memory_fails_since
             self._memory_fails_since = since
             must_go = {bag.path for bag in plan.to_delete}
             must_go -= plan.aged if now - since < RETRIED_S else frozenset()
-            waiting = {bag.path for bag in to_delete} - must_go
+            waiting = paths - must_go
             run.remaining |= waiting
-            going = [bag for bag in to_delete if bag.path in must_go]
+            going = [bag for bag in going if bag.path in must_go]
             if not run.gave_up:
                 run.gave_up, going = True, going[: 1 + len(going) // 8]
             _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=len(going))
-            return going
-        self._memory_fails_since = None
-        return to_delete
+        else:
+            self._memory_fails_since = None
+        return going
+
+    def _delete_bags(self, going: Sequence[StoredBag], run: _Pass) -> None:
+        self._write_down(going)
+        for bag in going:
+            self._delete_bag(bag, run)
+        # Where the disk was full, there is room now.
+        self._write_down(())
 
     def _write_down(self, going: Sequence[StoredBag]) -> None:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""
         splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
         for bag in going:
-            name = self._own.name_of(bag.recording)
+            name = self.own.name_of(bag.recording)
             splits[name].append((bare_name(bag.path), bag.start, bag.end))
         self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
         if not self._unwritten:
             return
         try:
-            append_deleted(self._bag_dir, self._unwritten)
+            append_deleted(self.bag_dir, self._unwritten)
         except OSError as error:
             if not going:
                 _log.warning("deletions_not_written", reason=error.strerror or str(error))
@@ -388,7 +344,7 @@ class GarbageCollector:
         size = 0
         for path, file in zip((bag.path, other_form(bag.path)), bag.files, strict=False):
             try:
-                freed = remove_bag(self._bag_dir, Path(path), file.inode)
+                freed = remove_bag(self.bag_dir, Path(path), file.inode)
                 size += 0 if path in run.saved else freed
             except FileNotFoundError:
                 continue
@@ -404,9 +360,9 @@ class GarbageCollector:
     def _remove_emptied(self, known: KnownBags, run: _Pass) -> None:
         """Deletes what is left of recordings without a bag, except those being written."""
         self._emptied |= {Path(path).parent for path in run.deleted}
-        for recording in self._emptied - {self._bag_dir / name for name in known.named}:
+        for recording in self._emptied - {self.bag_dir / name for name in known.named}:
             try:
-                remove_emptied(self._bag_dir, recording)
+                remove_emptied(self.bag_dir, recording)
             except OSError as error:
                 self._report(str(recording), str(error))
             else:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections import Counter, defaultdict
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -110,6 +110,7 @@ class Kept(NamedTuple):
     notes: tuple[str, ...]
 
 
+@dataclass(eq=False, repr=False)
 class Eraser:
     """Takes messages out of the bags of one bag directory.
 
@@ -120,29 +121,20 @@ class Eraser:
         recorder: why a recorder holds the directory; None where none does, nor can begin to.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        reader: BagReader,
-        writer: BagWriter,
-        own: OwnRecordings | None,
-        *,
-        written: Mapping[Path, TimeWindow | None],
-        recorder: str | None,
-    ) -> None:
-        self._bag_dir = bag_dir
-        self._reader = reader
-        self._writer = writer
-        self._own = own
-        self._written = written
-        self._recorder = recorder
+    bag_dir: Path
+    reader: BagReader
+    writer: BagWriter
+    own: OwnRecordings | None
+    _: KW_ONLY
+    written: Mapping[Path, TimeWindow | None]
+    recorder: str | None
 
     def topics(self) -> frozenset[str]:
         """Returns the topics of all bags that can be read; of those that do not count too."""
         topics: set[str] = set()
         for paths in self._paths_by_inode().values():
             with suppress(BagError):
-                topics.update(channel.topic for channel in self._reader.channels(paths[0]))
+                topics.update(channel.topic for channel in self.reader.channels(paths[0]))
         return frozenset(topics)
 
     def survey(self, erasure: Erasure) -> Survey:
@@ -173,16 +165,16 @@ class Eraser:
             BagError: it cannot be read.
             OSError: it has gone.
         """
-        if not self._reader.reads(paths[0]):
+        if not self.reader.reads(paths[0]):
             return reason_unread(paths[0])
-        if paths[0] in self._written:
-            span = self._written[paths[0]]
+        if paths[0] in self.written:
+            span = self.written[paths[0]]
             if span is not None and span.start >= erasure.windows[-1][1]:
                 return None
             return "it is being written; forget again when it is closed"
         if not paths[0].lstat().st_size:
             return None
-        summary = self._reader.summarize(paths[0])
+        summary = self.reader.summarize(paths[0])
         topics = [
             topic
             for topic in erasure.topics
@@ -214,7 +206,7 @@ class Eraser:
             counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
             paths = chain.from_iterable(holder.paths for holder in survey.holders)
             erasure = replace(erasure, files=tuple(map(self._relative, paths)), counts=counts)
-        ERASING.write(self._bag_dir, erasure)
+        ERASING.write(self.bag_dir, erasure)
         kept: list[str] = []
         linked: list[str] = []
         for holder in survey.holders:
@@ -224,46 +216,31 @@ class Eraser:
                     (kept if again else linked).append(line)
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
-        bags = [self._bag_dir / name for name in erasure.files]
+        bags = [self.bag_dir / name for name in erasure.files]
         recordings = {path.parent for path in bags}
-        notes = [*metadata_corrected(self._bag_dir, recordings, self._reader)]
+        notes = [*metadata_corrected(self.bag_dir, recordings, self.reader)]
         try:
-            self._delete_left_over(bags)
+            for path in bags:  # what an interrupted erasure left beside them
+                with (
+                    suppress(FileNotFoundError, NotADirectoryError),
+                    directories.opened(self.bag_dir, path.parent) as folder,
+                ):
+                    os.unlink(repair_name(path.name), dir_fd=folder)
             self._forget_silences(erasure)
             forgotten(erasure)
-            self._add_losses(erasure)
+            # Answers report them as lost.
+            known = read_losses(self.bag_dir, MIN_NS, MAX_NS)
+            losses = (
+                Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
+                for gone in erasure.counts
+            )
+            append_losses(self.bag_dir, [loss for loss in losses if loss not in known])
             # Another attempt takes nothing out of links elsewhere, as a backup has them.
             if not kept:
-                ERASING.remove(self._bag_dir)
+                ERASING.remove(self.bag_dir)
         except (EpisodicError, OSError) as error:
             kept.append(reason_of(error))
         return Kept((*kept, *linked), tuple(notes))
-
-    def _delete_left_over(self, bags: Sequence[Path]) -> None:
-        """Deletes what an interrupted erasure left beside bags.
-
-        Raises:
-            OSError: it cannot be deleted.
-        """
-        for path in bags:
-            with (
-                suppress(FileNotFoundError, NotADirectoryError),
-                directories.opened(self._bag_dir, path.parent) as folder,
-            ):
-                os.unlink(repair_name(path.name), dir_fd=folder)
-
-    def _add_losses(self, erasure: Erasure) -> None:
-        """Notes the messages that went as lost, so that answers report it.
-
-        Raises:
-            OSError: that cannot be written.
-        """
-        known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
-        losses = [
-            Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
-            for gone in erasure.counts
-        ]
-        append_losses(self._bag_dir, [loss for loss in losses if loss not in known])
 
     def _forget_silences(self, erasure: Erasure) -> None:
         """Takes the silences of topics in the windows out of what is known of deleted bags.
@@ -273,24 +250,24 @@ class Eraser:
             OSError: it cannot be read or written.
         """
         try:
-            thinned = THINNED.read(self._bag_dir) or Thinned()
+            thinned = THINNED.read(self.bag_dir) or Thinned()
         except ValueError as error:
             raise BagError(THINNED_FILE, f"it is damaged, delete it: {error}") from error
         left = tuple(
-            (topic, first, last, on_ns, goes_on)
-            for topic, first, last, on_ns, goes_on in thinned.silences
-            if topic not in erasure.topics
-            or not any(start <= last and first < stop for start, stop in erasure.windows)
+            silence
+            for silence in thinned.silences
+            if silence[0] not in erasure.topics
+            or not any(start <= silence[2] and silence[1] < stop for start, stop in erasure.windows)
         )
         if left != thinned.silences:
-            if self._recorder is not None:
-                raise BagError(THINNED_FILE, _recorder_refuses(self._recorder))
-            THINNED.write(self._bag_dir, replace(thinned, silences=left))
+            if self.recorder is not None:
+                raise BagError(THINNED_FILE, _recorder_refuses(self.recorder))
+            THINNED.write(self.bag_dir, replace(thinned, silences=left))
 
     def _paths_by_inode(self) -> dict[Identity, list[Path]]:
         """Returns the paths of every bag file by device and inode, the recorded one first."""
         by_inode: defaultdict[Identity, list[Path]] = defaultdict(list)
-        for folder, entries in directories.walk(self._bag_dir):
+        for folder, entries in directories.walk(self.bag_dir):
             for entry in entries:
                 with suppress(OSError):
                     if bag_kind(entry.name) and entry.is_file(follow_symlinks=False):
@@ -308,19 +285,19 @@ class Eraser:
             reason = _FOREIGN
         elif path.name.endswith(COMPRESSED):
             reason = "it is compressed as a whole; decompress it (zstd -d --rm), and forget again"
-        elif self._reader.closing(path) is Closing.OPEN or not summary.complete:
+        elif self.reader.closing(path) is Closing.OPEN or not summary.complete:
             reason = "a crash left it open; ros2-memory recover closes it"
         # Such a file does not show whether its writer has finished.
         elif path.suffix == ".db3" and inode in open_files():
             reason = "a program has it open; close that, and forget again"
         elif summary.notes:
             reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"
-        elif is_derived(path) and self._recorder is not None:
-            reason = _recorder_refuses(self._recorder)
+        elif is_derived(path) and self.recorder is not None:
+            reason = _recorder_refuses(self.recorder)
         return reason
 
     def _may_change(self, path: Path) -> bool:
-        return self._own is None or self._own.owns_bag(path)
+        return self.own is None or self.own.owns_bag(path)
 
     def _read_holder(
         self, erasure: Erasure, topics: Sequence[str], paths: Sequence[Path], inode: Identity
@@ -332,12 +309,10 @@ class Eraser:
             handover = read_handover(path.parent).handover
             for message_list in (handover.also_counts, handover.counts_elsewhere):
                 listed.update(message_list.get(path.name, ()))
+        all_windows = TimeWindow(erasure.windows[0][0], erasure.windows[-1][1])
         for topic in topics:
-            first, last = erasure.windows[0][0], erasure.windows[-1][1]
-            span = (
-                TimeWindow(MIN_NS, MAX_NS) if topic in erasure.latched else TimeWindow(first, last)
-            )
-            for record in self._reader.records(paths[0], (topic,), span):
+            span = TimeWindow.everything() if topic in erasure.latched else all_windows
+            for record in self.reader.records(paths[0], (topic,), span):
                 window = erasure.window_of(topic, record.log_time, record.publish_time)
                 if window is not None:
                     holder.counts[topic] += 1
@@ -362,10 +337,10 @@ class Eraser:
             if (before.st_dev, before.st_ino) != holder.inode:
                 raise BagError(str(path), "it is another file now; forget again")
             with rewritten(
-                self._bag_dir,
+                self.bag_dir,
                 path,
                 before,
-                self._writer,
+                self.writer,
                 takes=erasure.takes,
                 expected=holder.counts,
             ) as new:
@@ -379,14 +354,14 @@ class Eraser:
         if left:
             links = counted(left, "more hard link", "more hard links")
             return f"{self._relative(path)}: all of it is still in {links} of it"
-        if is_carried(path) and self._reader.summarize(path).empty:
+        if is_carried(path) and self.reader.summarize(path).empty:
             path.unlink()
             flush(path.parent)
         return None
 
     def _replace_link(self, new: Path, path: Path, inode: Identity) -> None:
         """Puts a new file in place of one name of the old one."""
-        with opened_folder(self._bag_dir, path) as here, beside(here) as name:
+        with opened_folder(self.bag_dir, path) as here, beside(here) as name:
             os.link(new, name, follow_symlinks=False)
             replace_file(name, here, inode)
 
@@ -403,24 +378,21 @@ class Eraser:
         target = folder / HANDOVER_FILE
         if not target.is_file() or target.is_symlink():
             return
-        with directories.opened(self._bag_dir, folder):
+        with directories.opened(self.bag_dir, folder):
             before = target.stat()
             handover = handover_to_change(folder)
             also = _without_messages(handover.also_counts, path.name, ids)
             elsewhere = _without_messages(handover.counts_elsewhere, path.name, ids)
             if (also, elsewhere) == (handover.also_counts, handover.counts_elsewhere):
                 return
-            if (
-                self._own is None
-                or self._own.name_of(folder) in read_heartbeat(self._bag_dir).recordings
-            ):
+            written = read_heartbeat(self.bag_dir).recordings
+            if self.own is None or self.own.name_of(folder) in written:
                 raise BagError(str(target), "its recorder still writes it; forget again later")
-
             write_handover(folder, replace(handover, also_counts=also, counts_elsewhere=elsewhere))
             os.utime(target, ns=(before.st_atime_ns, before.st_mtime_ns))
 
     def _relative(self, path: Path) -> str:
-        return os.path.relpath(path, self._bag_dir)
+        return os.path.relpath(path, self.bag_dir)
 
 
 def _without_messages(listed: MessageList, file: str, ids: Ids) -> MessageList:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import suppress
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -83,18 +84,15 @@ class ForeignBags:
         return foreign
 
     def _measure(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
-        judges: dict[str, Callable[[str], bool]] = {}
+        judge = cache(partial(self._judge, recording=recording))
 
         def is_foreign(file: str) -> bool:
             folder, _, name = file.rpartition("/")
-            if folder not in judges:
-                judges[folder] = self._judge(folder, recording)
-            return not judges[folder](name)
+            return not judge(folder)(name)
 
-        segments = snapshot.timeline.segments
         bags = {
             bag.file: bag.size
-            for segment in segments
+            for segment in snapshot.timeline.segments
             for bag in segment.bags
             if is_foreign(bag.file)
         }
@@ -175,34 +173,35 @@ class Inventory:
         named = {str(self._root / name) for name in known.named}
         if self._own is not None:
             self._own.names()
-        judges: dict[str, Callable[[str], bool]] = {}
+        judge = cache((lambda _: bool) if self._own is None else self._own.judge_of)
         for state, bag in chain(self._changing(known), self._settled(known)):
             path, recording = bag.path, bag.recording
             if path in deleted:
                 continue
-            if self._own is not None and recording not in judges:
-                judges[recording] = self._own.judge_of(recording)
             name, is_named = path[len(recording) + 1 :], recording in named
-            is_own = self._own is None or judges[recording](name)
-            is_saved = path in known.saved
+            is_own, is_saved = judge(recording)(name), path in known.saved
             # One is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
-            may_go = _may_be_deleted(state, path, is_named=is_named)
             if not (is_own or is_saved or is_new):
                 foreign_bytes += sum(file.size for file in bag.files)
                 continue
             recordings.add(recording)
-            if is_own and may_go and not is_saved and path not in remaining:
+            if is_saved:
+                continue
+            may_go = _may_be_deleted(state, path, is_named=is_named)
+            if is_own and may_go and path not in remaining:
                 bags.append(bag)
-            elif self._counts(state, bag) and not is_saved:
+            elif self._counts(state, bag):
                 other_bytes += sum(file.size for file in bag.files)
         other_bytes += sum(self._folder_at(path, known.now).size for path in recordings)
-        saved = self._moment_files(known)
+        device = -1
+        with suppress(OSError):
+            device = (self._root / MOMENTS_FOLDER).stat().st_dev
         return DirContents(
             bags,
             known.now,
             other_bytes,
-            saved=saved,
+            saved={(device, stamp.inode): stamp.size for stamp in known.saved.values()},
             foreign_bytes=foreign_bytes,
             state_bytes=state_bytes,
         )
@@ -258,14 +257,6 @@ class Inventory:
             # Where all bags may be deleted, only its name shows whether the recorder made it.
             return self._own is not None or has_own_name(Path(bag.recording).name)
         return state is not FileState.UNREAD
-
-    def _moment_files(self, known: KnownBags) -> dict[tuple[int, int], int]:
-        """Returns the sizes of the files of moments, by inode."""
-        try:
-            device = (self._root / MOMENTS_FOLDER).stat().st_dev
-        except OSError:
-            device = -1
-        return {(device, stamp.inode): stamp.size for stamp in known.saved.values()}
 
     def _dating_span(self, bag: BagFile) -> Span:
         """Returns the log times of the first and last message that dates a bag (inclusive)."""

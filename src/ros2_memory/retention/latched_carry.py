@@ -26,7 +26,7 @@ import os
 import time
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -168,6 +168,7 @@ def worth_carrying(
     return needed
 
 
+@dataclass(eq=False, repr=False)
 class Carrier:
     """Writes the bag of carried messages of one bag directory.
 
@@ -175,23 +176,19 @@ class Carrier:
         static_topics: carried though no publisher is known to have offered them as transient local.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        reader: BagReader,
-        writer: BagWriter,
-        static_topics: Collection[str],
-        own: OwnRecordings,
-        *,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.path = bag_dir / CARRY_FOLDER / CARRY_FILE
-        self._bag_dir = bag_dir
-        self._reader = reader
-        self._writer = writer
-        self._static_topics = frozenset(static_topics)
-        self._own = own
-        self._failing = FailingFiles(monotonic)
+    bag_dir: Path
+    reader: BagReader
+    writer: BagWriter
+    static_topics: Collection[str]
+    own: OwnRecordings
+    _: KW_ONLY
+    monotonic: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self.path = self.bag_dir / CARRY_FOLDER / CARRY_FILE
+        self._static_topics = frozenset(self.static_topics)
+        self._failing = FailingFiles(self.monotonic)
         self._late: _LateMessages = {}
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
@@ -266,18 +263,13 @@ class Carrier:
         for record in self._records(bag.path, [topic for topic in here if topic not in frequent]):
             yield latched_message(record, self._frames(record)), Origin((folder,), often=False)
         for topic in frequent:
-            for record in self._newest(bag.path, topic):
-                yield latched_message(record, ()), Origin((folder,), often=True)
-
-    def _newest(self, path: Path, topic: str) -> Iterator[Record]:
-        """Yields the newest readable message of a topic, if any."""
-        try:
-            newest = self._reader.newest(path, topic, TimeWindow.everything())
-        except BagError:
-            readable = self._records(path, (topic,))
-            newest = max(readable, key=lambda record: record.log_time, default=None)
-        if newest is not None:
-            yield newest
+            try:
+                newest = self.reader.newest(bag.path, topic, TimeWindow.everything())
+            except BagError:
+                readable = self._records(bag.path, (topic,))
+                newest = max(readable, key=attrgetter("log_time"), default=None)
+            if newest is not None:
+                yield latched_message(newest, ()), Origin((folder,), often=True)
 
     def _is_frequent(self, snapshot: Snapshot, topic: str, recording: Path) -> bool:
         """Whether a recording has frequent messages of a topic; never if they are transforms."""
@@ -287,8 +279,8 @@ class Carrier:
 
     def _folder(self, recording: Path) -> str:
         """Returns the directory of a recording, relative to the bag directory."""
-        recorded = HardLinks(self._bag_dir).recorded_as(str(recording))
-        return os.path.relpath(recorded, self._bag_dir)
+        recorded = HardLinks(self.bag_dir).recorded_as(str(recording))
+        return os.path.relpath(recorded, self.bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
         """Yields the messages of these topics; of a damaged bag, those that can be read.
@@ -298,7 +290,7 @@ class Carrier:
                 it must not be replaced by a bag without them.
             BagUnreachableError: the disk fails to read a bag, and may recover.
         """
-        for record in or_errors(self._reader.records(path, topics, TimeWindow.everything())):
+        for record in or_errors(self.reader.records(path, topics, TimeWindow.everything())):
             if not isinstance(record, BagError):
                 yield record
             elif isinstance(record, BagVanishedError):
@@ -332,7 +324,7 @@ class Carrier:
         if not _is_tf(record.channel.type):
             return ()
         try:
-            message = self._reader.decode(record)
+            message = self.reader.decode(record)
         except UndecodableError:
             return ()
         transforms: Iterable[object] = getattr(message, "transforms", ())
@@ -381,7 +373,7 @@ class Carrier:
         folder.mkdir(exist_ok=True)
         try:
             with beside(self.path) as new:
-                self._writer.write(new, records)
+                self.writer.write(new, records)
                 new.replace(self.path)
         except BaseException:
             with suppress(OSError):
@@ -389,7 +381,7 @@ class Carrier:
             raise
         flush(folder)
         flush(folder.parent)
-        self._own.hold(folder, [CARRY_FILE])
+        self.own.hold(folder, [CARRY_FILE])
 
 
 def _is_tf(type_name: str) -> bool:

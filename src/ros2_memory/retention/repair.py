@@ -11,6 +11,7 @@ import fcntl
 import os
 import stat
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -45,16 +46,16 @@ class Repaired(NamedTuple):
     rewritten: Rewritten | None = None
 
 
+@dataclass(eq=False, repr=False)
 class Repairer:
     """Repairs MCAP files in place. The caller must know that nothing writes them any more.
 
     Files must lie below `root`, and no symbolic link below it is followed.
     """
 
-    def __init__(self, reader: BagReader, writer: BagWriter, root: Path = Path("/")) -> None:
-        self._reader = reader
-        self._writer = writer
-        self._root = root
+    reader: BagReader
+    writer: BagWriter
+    root: Path = Path("/")
 
     def is_whole(self, path: Path) -> bool:
         """Whether the writer of a file finished it, so that there is nothing to repair.
@@ -63,10 +64,10 @@ class Repairer:
             BagVanishedError: it does not exist.
             BagError: it cannot be opened, or is no MCAP file.
         """
-        is_closed = self._reader.closing(path) is Closing.CLOSED
+        is_closed = self.reader.closing(path) is Closing.CLOSED
         if is_closed:
             # A file that is no bag at all counts as closed; this raises for it.
-            self._reader.channels(path)
+            self.reader.channels(path)
         return is_closed
 
     def repair(self, path: Path) -> Repaired | None:
@@ -77,7 +78,7 @@ class Repairer:
             BagError: it cannot be repaired, and is unchanged.
         """
         try:
-            with opened_folder(self._root, path.absolute()) as here:
+            with opened_folder(self.root, path.absolute()) as here:
                 return self._rewrite_if_open(here, path)
         except BagError as error:
             # With the name of the file in place of that of the open directory.
@@ -91,21 +92,23 @@ class Repairer:
 
     def correct_metadata(self, recording: Path) -> bool:
         """Rewrites metadata.yaml from the files' contents; returns whether it had to be."""
-        with directories.opened(self._root, recording.absolute()):
-            return correct(recording, self._reader)
+        with directories.opened(self.root, recording.absolute()):
+            return correct(recording, self.reader)
 
     def _rewrite_if_open(self, here: Path, path: Path) -> Repaired | None:
-        before = _status(here)
+        before = here.lstat()
+        if not stat.S_ISREG(before.st_mode):
+            raise BagError(str(here), "not a regular file")
         if not before.st_size:
             here.unlink()
             flush(here.parent)
             return Repaired(0)
-        if self._reader.closing(path) is Closing.CLOSED:
+        if self.reader.closing(path) is Closing.CLOSED:
             return None
         with beside(here) as new:
-            result = self._writer.rewrite(here, new)
-            give_attributes(new, before, before.st_mtime_ns)
-            after = _status(here)
+            result = self.writer.rewrite(here, new)
+            _give_attributes(new, before, before.st_mtime_ns)
+            after = here.lstat()
             if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):
                 raise BagError(str(here), "it was written to while it was being repaired")
             new.replace(here)
@@ -124,7 +127,7 @@ def opened_folder(root: Path, path: Path) -> Iterator[Path]:
         yield Path(f"/proc/self/fd/{folder}", path.name)
 
 
-def give_attributes(new: Path, before: os.stat_result, mtime_ns: Ns) -> None:
+def _give_attributes(new: Path, before: os.stat_result, mtime_ns: Ns) -> None:
     """Gives a file the mode and, where that is allowed, the owner of another; and its times."""
     new.chmod(stat.S_IMODE(before.st_mode))
     with suppress(OSError):
@@ -156,30 +159,18 @@ def rewritten(
         EpisodicError: it cannot be rewritten, or another program rewrites it; nothing is changed.
         OSError: likewise, or it is another file now.
     """
-    with opened_folder(bag_dir, path) as here, _rewrite_lock(here), beside(here) as new:
-        taken = writer.cut(here, new, takes)
-        if taken != expected:
-            raise BagError(str(path), "its contents changed meanwhile")
-        # A nanosecond later: nobody may take the new file for the old one.
-        give_attributes(new, before, before.st_mtime_ns + 1)
-        yield new
-        replace_file(new, here, (before.st_dev, before.st_ino))
-
-
-@contextmanager
-def _rewrite_lock(path: Path) -> Iterator[None]:
-    """Holds the lock under which a bag is rewritten: `forget` runs beside the recorder.
-
-    Raises:
-        BagError: another program holds it.
-        OSError: the file cannot be opened.
-    """
-    with path.open("rb") as old:
+    with opened_folder(bag_dir, path) as here, here.open("rb") as old:
         try:
-            fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)  # `forget` runs beside the recorder
         except BlockingIOError as error:
             raise BagError(str(path), "another program rewrites it; try again") from error
-        yield
+        with beside(here) as new:
+            if writer.cut(here, new, takes) != expected:
+                raise BagError(str(path), "its contents changed meanwhile")
+            # A nanosecond later: nobody may take the new file for the old one.
+            _give_attributes(new, before, before.st_mtime_ns + 1)
+            yield new
+            replace_file(new, here, (before.st_dev, before.st_ino))
 
 
 def replace_file(new: Path, path: Path, inode: Identity) -> None:
@@ -230,19 +221,6 @@ def open_files() -> frozenset[tuple[int, int]]:
                     status = descriptor.stat()
                     inodes.add((status.st_dev, status.st_ino))
     return frozenset(inodes)
-
-
-def _status(path: Path) -> os.stat_result:
-    """Returns the status of a regular file.
-
-    Raises:
-        BagError: it is something else.
-        OSError: its status cannot be read.
-    """
-    status = path.lstat()
-    if not stat.S_ISREG(status.st_mode):
-        raise BagError(str(path), "not a regular file")
-    return status
 
 
 def reason_of(error: Exception) -> str:

@@ -141,6 +141,7 @@ def unrecorded(window: TimeWindow, bags: Iterable[BagFile]) -> tuple[str, ...]:
     )
 
 
+@dataclass(eq=False, repr=False)
 class MomentKeeper:
     """The moments of one bag directory. Not thread-safe, except for `has_work`.
 
@@ -149,21 +150,16 @@ class MomentKeeper:
         rule_bytes: how much of that is set aside for each rule.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        share_bytes: int,
-        clock: Clock,
-        own: OwnRecordings,
-        rule_bytes: Mapping[str, int],
-    ) -> None:
-        self._bag_dir = bag_dir
-        self._share = share_bytes
-        self._rule_bytes = rule_bytes
-        self._clock = clock
-        self._own = own
-        self._queue = RequestQueue(bag_dir)
-        self._links = HardLinks(bag_dir)
+    bag_dir: Path
+    share_bytes: int
+    clock: Clock
+    own: OwnRecordings
+    rule_bytes: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self._queue = RequestQueue(self.bag_dir)
+        self._links = HardLinks(self.bag_dir)
         self._refused: set[Path] = set()  # moments of which the disk refused a link
         # Until the first call of `keep` shows that nothing is pending.
         self._waiting = True
@@ -182,7 +178,7 @@ class MomentKeeper:
         Raises:
             OSError: the folders cannot be listed or written to; the next call tries again.
         """
-        now, stored = self._clock.now(), self._read_moments()
+        now, stored = self.clock.now(), self._read_moments()
         for name, moment in stored.items():
             if moment.moment.pending:
                 stored[name] = self._continue_moment(moment, stored, snapshot)
@@ -200,7 +196,7 @@ class MomentKeeper:
                 begun = self._begin_moment(SavedMoment(request), stored, snapshot)
             except OSError as error:
                 begun = (
-                    f"the bags cannot be saved in {self._bag_dir / MOMENTS_FOLDER} by hard "
+                    f"the bags cannot be saved in {self.bag_dir / MOMENTS_FOLDER} by hard "
                     f"links: {error.strerror or error}"
                 )
         if isinstance(begun, str):
@@ -238,7 +234,7 @@ class MomentKeeper:
 
         Which messages of a bag count is decided when its recording is over, which may be later.
         """
-        moments = self._bag_dir / MOMENTS_FOLDER
+        moments = self.bag_dir / MOMENTS_FOLDER
         if moments.is_symlink():
             return
         for root, _ in directories.walk(moments):
@@ -251,36 +247,36 @@ class MomentKeeper:
 
     def _read_moments(self) -> dict[str, StoredMoment]:
         """Returns the moments by the names of their folders."""
-        return {moment.folder.name: moment for moment in stored_moments_in(self._bag_dir)}
+        return {moment.folder.name: moment for moment in stored_moments_in(self.bag_dir)}
 
     def _begin_moment(
         self, begun: SavedMoment, stored: dict[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment | str:
         """Begins a moment and adds it to `stored`, or returns why it is refused."""
-        need = needed_bags(begun.request, snapshot, self._clock.now())
-        window = need.window
+        need = needed_bags(begun.request, snapshot, self.clock.now())
         group = self._group(begun, stored)
-        if len(group) >= MAX_MOMENTS // (1 + len(self._rule_bytes)):
+        if len(group) >= MAX_MOMENTS // (1 + len(self.rule_bytes)):
             return (
                 f"there are {len(group)} moments, the maximum; delete folders in "
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
-            if overlaps_any(snapshot.timeline.thinned_times, window.start, window.stop - 1):
+            thinned = snapshot.timeline.thinned_times
+            if overlaps_any(thinned, need.window.start, need.window.stop - 1):
                 return "the bags of that time were deleted, and memory/ has what stayed of them"
             return "nothing was recorded then: ask for a time at which something was"
         # Those that may belong to the moment, as large as they are now.
         growing = [
             size_of(aside.path)
             for aside in snapshot.active
-            if need.waits and _may_overlap(snapshot.unread_spans[aside], window)
+            if need.waits and _may_overlap(snapshot.unread_spans[aside], need.window)
         ]
         share = self._share_of(begun, group)
         files = filter(None, (_file_of(bag.path) for bag in need.bags))
         refused = share.refusal(files, sum(growing))
         if refused is not None:
             return refused
-        folder = make_moment_folder(self._bag_dir, begun.request)
+        folder = make_moment_folder(self.bag_dir, begun.request)
         try:
             write_saved_moment(folder, begun)
             links = self._link_bags(folder, need.bags, share)
@@ -303,13 +299,13 @@ class MomentKeeper:
 
         Where the disk refuses a link, as when it is full, the moment waits and it is tried again.
         """
-        need = needed_bags(before.moment.request, snapshot, self._clock.now())
+        need = needed_bags(before.moment.request, snapshot, self.clock.now())
         share = self._share_of(before.moment, self._group(before.moment, stored))
         try:
             after = _with_links(before, need, *self._link_bags(before.folder, need.bags, share))
         except OSError as error:
             reason = error.strerror or str(error)
-            if abs(self._clock.now() - before.moment.request.asked) < LONGEST_WAIT_NS:
+            if abs(self.clock.now() - before.moment.request.asked) < LONGEST_WAIT_NS:
                 if before.folder not in self._refused:
                     _log.error("moment_not_followed", path=str(before.folder), reason=reason)
                 self._refused.add(before.folder)
@@ -333,15 +329,15 @@ class MomentKeeper:
         return [other for other in stored.values() if self._rule_of(other.moment) == rule]
 
     def _rule_of(self, moment: SavedMoment) -> str | None:
-        return moment.rule if moment.rule in self._rule_bytes else None
+        return moment.rule if moment.rule in self.rule_bytes else None
 
     def _share_of(self, moment: SavedMoment, group: Sequence[StoredMoment]) -> Share:
         """Returns what such moments, of which there are these, may take together."""
         stored = {inode: size for other in group for inode, size in other.files.items()}
         rule = self._rule_of(moment)
         if rule is not None:
-            return Share(self._rule_bytes[rule], f"max_gb of the rule {rule}", stored)
-        return Share(max(self._share - sum(self._rule_bytes.values()), 0), _SHARE, stored)
+            return Share(self.rule_bytes[rule], f"max_gb of the rule {rule}", stored)
+        return Share(max(self.share_bytes - sum(self.rule_bytes.values()), 0), _SHARE, stored)
 
     def _link_bags(
         self, folder: Path, bags: Sequence[BagFile], share: Share
@@ -357,7 +353,7 @@ class MomentKeeper:
         linked: dict[int, int] = {}
         by_folder: defaultdict[Path, list[tuple[Path, _BagInode]]] = defaultdict(list)
         for bag in bags:
-            name = os.path.relpath(self._links.recorded_as(bag.file), self._bag_dir)
+            name = os.path.relpath(self._links.recorded_as(bag.file), self.bag_dir)
             target, file = folder / name, _file_of(bag.path)
             if file is None:
                 # `forget` deletes in another process, since the index was made.
@@ -368,12 +364,12 @@ class MomentKeeper:
             else:
                 missing[share.exhausted] = None
         for parent, sources in by_folder.items():
-            directories.make(self._bag_dir, parent)
+            directories.make(self.bag_dir, parent)
             # Listed first, so that `forget`, in another process, knows whose the new links are.
             free = (
                 path.name for path, file in sources if _file_of(parent / path.name) in {None, file}
             )
-            self._own.hold(parent, free)
+            self.own.hold(parent, free)
             for recorded, file in sources:
                 target = parent / recorded.name
                 if _link_bag(recorded, target, file.inode):

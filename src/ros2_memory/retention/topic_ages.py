@@ -15,8 +15,7 @@ import os
 import time
 from collections import Counter, defaultdict
 from contextlib import suppress
-from dataclasses import replace
-from itertools import groupby
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, SHIPPED_FILE
@@ -96,6 +95,7 @@ def plan_cuts(
     ]
 
 
+@dataclass(eq=False, repr=False)
 class TopicCutter:
     """Cuts topics out of the bags of one bag directory, some in each pass. Not thread-safe.
 
@@ -110,26 +110,18 @@ class TopicCutter:
         monotonic: a clock that never steps, in seconds.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        topic_ages: Sequence[TopicAge],
-        reader: BagReader,
-        writer: BagWriter,
-        *,
-        static_topics: Collection[str],
-        is_quiet: Callable[[], bool],
-        measure_free: Callable[[Path], int] = free_bytes,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._topic_ages = tuple(topic_ages)
-        self._static_topics = static_topics
-        self._bag_dir = bag_dir
-        self._reader = reader
-        self._writer = writer
-        self._is_quiet = is_quiet
-        self._measure_free = measure_free
-        self._monotonic = monotonic
+    bag_dir: Path
+    topic_ages: Sequence[TopicAge]
+    reader: BagReader
+    writer: BagWriter
+    _: KW_ONLY
+    static_topics: Collection[str]
+    is_quiet: Callable[[], bool]
+    measure_free: Callable[[Path], int] = free_bytes
+    monotonic: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
         self._done: dict[str, tuple[Ns, frozenset[str]]] = {}
         self._waits_since_s: float | None = None
 
@@ -144,29 +136,29 @@ class TopicCutter:
         Raises:
             OSError: the free space cannot be measured, or the receipts of `ship` not be read.
         """
-        cuts = plan_cuts(self._topic_ages, contents, limits, snapshot, self._static_topics)
+        cuts = plan_cuts(self.topic_ages, contents, limits, snapshot, self.static_topics)
         done = self._done
         waiting = [cut for cut in cuts if done.get(cut.bag.file) != (cut.bag.mtime_ns, cut.topics)]
         self._done = {cut.bag.file: done[cut.bag.file] for cut in cuts if cut.bag.file in done}
-        if (self._bag_dir / ERASING_FILE).exists() or not self._may_begin(waiting):
+        if (self.bag_dir / ERASING_FILE).exists() or not self._may_begin(waiting):
             return 0
         begun = time.perf_counter_ns()
-        until_s = self._monotonic() + SLICE_S
-        receipts = read_receipts(self._bag_dir) if (self._bag_dir / SHIPPED_FILE).exists() else {}
+        until_s = self.monotonic() + SLICE_S
+        receipts = read_receipts(self.bag_dir) if (self.bag_dir / SHIPPED_FILE).exists() else {}
         gone, bags = Counter[str](), 0
-        for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            bags_before = bags
-            for cut in of_recording:
-                free = self._measure_free(self._bag_dir)
-                if self._monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
-                    break
-                gone_here = self._cut_if_held(cut, receipts)
-                gone += gone_here or Counter()
-                bags += gone_here is not None
-            if bags > bags_before and (reason := why_not_corrected(recording, self._reader)):
-                _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
-            if self._monotonic() >= until_s:
+        recordings: dict[Path, None] = {}
+        for cut in waiting:
+            if self.monotonic() >= until_s:
                 break
+            if self.measure_free(self.bag_dir) - cut.bag.size < limits.min_free_bytes:
+                continue
+            if gone_here := self._cut_if_held(cut, receipts):
+                gone += gone_here
+                bags += 1
+                recordings[cut.bag.recording] = None
+        for recording in recordings:
+            if reason := why_not_corrected(recording, self.reader):
+                _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
         if bags:
             ms = ms_since(begun)
             _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)
@@ -174,8 +166,8 @@ class TopicCutter:
 
     def _may_begin(self, waiting: Sequence[TopicCut]) -> bool:
         """Whether something waits, and the machine is quiet, or has not been since for too long."""
-        now_s = self._monotonic()
-        if not waiting or self._is_quiet():
+        now_s = self.monotonic()
+        if not waiting or self.is_quiet():
             self._waits_since_s = None
             return bool(waiting)
         if self._waits_since_s is None:
@@ -184,18 +176,19 @@ class TopicCutter:
             _log.info("topics_wait", reason=reason)
         return now_s - self._waits_since_s >= PATIENCE_S
 
-    def _cut_if_held(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str] | None:
+    def _cut_if_held(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str]:
         """Cuts a bag that has messages of the topics; returns what went, by topic.
 
-        None where it has none, or cannot be cut: then it is not looked at again until it changes.
+        Nothing where it has none, or cannot be cut: it is not looked at again until it changes.
         """
+        gone = Counter[str]()
         try:
-            if gone := self._cut_bag(cut, receipts):
-                return gone
+            gone = self._cut_bag(cut, receipts)
         except (EpisodicError, OSError) as error:
             _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
-        self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
-        return None
+        if not gone:
+            self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
+        return gone
 
     def _cut_bag(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str]:
         """Cuts one bag; returns the messages that went, by topic.
@@ -206,56 +199,48 @@ class TopicCutter:
         """
         path = cut.bag.path
         before = path.lstat()
-        summary = self._reader.summarize(path)
+        summary = self.reader.summarize(path)
         going = [topic for topic in summary.topics if topic.topic in cut.topics]
         gone = Counter[str]()
         for topic in going:
             gone[topic.topic] += topic.count
         if not gone:
             return gone
-        bag = os.path.relpath(path, self._bag_dir)
-        expired = self._expired()
+        bag = os.path.relpath(path, self.bag_dir)
+        try:
+            expired = EXPIRED.read(self.bag_dir) or Expired()
+        except ValueError as error:  # a damaged file is replaced
+            damaged = str(self.bag_dir / EXPIRED_FILE)
+            _log.warning("expired_list_damaged", path=damaged, reason=str(error))
+            expired = Expired()
         losses = [
             Loss(topic.topic, topic.first, topic.last + 1, topic.count, "expired")
             for topic in going
         ]
-        EXPIRED.write(self._bag_dir, expired.then(bag, losses))
+        EXPIRED.write(self.bag_dir, expired.then(bag, losses))
         receipt = receipts.get(bag)
         if receipt is not None and receipt.size != before.st_size:
             receipt = None
         try:
             with rewritten(
-                self._bag_dir,
+                self.bag_dir,
                 path,
                 before,
-                self._writer,
+                self.writer,
                 takes=lambda name, _logged, _published: name in cut.topics,
                 expected=gone,
             ) as new:
                 # Before the bag is smaller: else `ship` would take what went out of the lake, too.
                 if receipt is not None:
                     shipped = replace(receipt, size=new.stat().st_size)
-                    SHIPPED.append(self._bag_dir, [shipped])
+                    SHIPPED.append(self.bag_dir, [shipped])
         except (EpisodicError, OSError):
-            EXPIRED.write(self._bag_dir, expired)
+            EXPIRED.write(self.bag_dir, expired)
             if receipt is not None:
                 with suppress(OSError):
-                    SHIPPED.append(self._bag_dir, [receipt])
+                    SHIPPED.append(self.bag_dir, [receipt])
             raise
         return gone
-
-    def _expired(self) -> Expired:
-        """Returns what went before; nothing where its file is damaged, which is then replaced.
-
-        Raises:
-            OSError: it cannot be read.
-        """
-        try:
-            return EXPIRED.read(self._bag_dir) or Expired()
-        except ValueError as error:
-            path = str(self._bag_dir / EXPIRED_FILE)
-            _log.warning("expired_list_damaged", path=path, reason=str(error))
-            return Expired()
 
 
 def is_quiet() -> bool:

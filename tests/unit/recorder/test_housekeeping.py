@@ -200,25 +200,28 @@ class TestRetention:
 
 
 class TestWhatIsNeverDeleted:
-    def test_an_unknown_file_and_the_directory_that_it_lies_in(self, tmp_path: Path) -> None:
-        recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
-        (tmp_path / "a/notes.txt").write_text("mine")
-        (tmp_path / "a/.hidden.tmp").write_text("mine")
-        (tmp_path / "elsewhere").mkdir()
-        keeper_of(tmp_path, max_bytes=1).apply()
-        assert files_in(tmp_path)[:4] == ["a", "a/.hidden.tmp", "a/notes.txt", "b"]
-        assert (tmp_path / "elsewhere").is_dir()
-
-    def test_the_bag_being_written_and_its_directory(self, tmp_path: Path) -> None:
-        closed = bag(tmp_path / "a/a_0.mcap", 0)
-        active = left_open(tmp_path / "a/a_1.mcap", 10)
-        (tmp_path / "a/handover.json").write_text("{}")
-        bag(tmp_path / "b/b_0.mcap", 100)
-        recording_now(tmp_path, "a")
-        keeper_of(tmp_path, max_bytes=1).apply()
-        assert not closed.exists()
-        assert active.exists()
-        assert (tmp_path / "a/handover.json").exists()
+    def test_all_that_is_no_closed_bag_of_a_recording_and_what_is_being_written(
+        self, tmp_path: Path
+    ) -> None:
+        bags, outside = tmp_path / "bags", tmp_path / "outside"
+        kept = recording(outside, "x", 0)
+        recording(bags, "a", 0)
+        (bags / "a/notes.txt").write_text("mine")
+        (bags / "a/.hidden.tmp").write_text("mine")
+        bag(bags / "b/b_0.mcap", 50)
+        left_open(bags / "b/b_1.mcap", 60)
+        (bags / "b/handover.json").write_text("{}")
+        (bags / "c").mkdir()
+        (bags / "c/c_0.mcap").write_bytes(b"no bag at all")
+        bag(bags / "z/z_0.mcap", 100)
+        (bags / "z/z_9.mcap").symlink_to(kept[0])
+        (bags / "x").symlink_to(outside / "x", target_is_directory=True)
+        recording_now(bags, "b", clock=later(0))  # though its heartbeat is old
+        keeper_of(bags, max_bytes=1).apply()
+        left = ["a/.hidden.tmp", "a/notes.txt", "b/b_1.mcap", "b/handover.json", "c/c_0.mcap"]
+        left += ["z/z_0.mcap", "z/z_9.mcap"]
+        assert [name for name in files_in(bags) if name.count("/") and name[0] != "x"] == left
+        assert all(path.exists() for path in (*kept, bags / "x" / kept[0].name))
 
     def test_the_directory_of_a_recording_that_is_being_written_though_no_bag_is_in_it(
         self, tmp_path: Path
@@ -232,33 +235,6 @@ class TestWhatIsNeverDeleted:
         recording_now(tmp_path, "b")
         keeper.apply()
         assert files_in(tmp_path)[0] == "b"
-
-    def test_an_open_bag_that_the_recorder_named_last_though_its_heartbeat_is_old(
-        self, tmp_path: Path
-    ) -> None:
-        active = left_open(tmp_path / "a/a_0.mcap", 0)
-        bag(tmp_path / "b/b_0.mcap", 100)
-        recording_now(tmp_path, "a", clock=later(0))
-        keeper_of(tmp_path, max_bytes=1).apply()
-        assert active.exists()
-
-    def test_a_bag_that_cannot_be_read(self, tmp_path: Path) -> None:
-        damaged = tmp_path / "a/a_0.mcap"
-        damaged.parent.mkdir()
-        damaged.write_bytes(b"no bag at all")
-        bag(tmp_path / "b/b_0.mcap", 100)
-        keeper_of(tmp_path, max_bytes=1).apply()
-        assert damaged.exists()
-
-    def test_what_lies_behind_a_link(self, tmp_path: Path) -> None:
-        bags, outside = tmp_path / "bags", tmp_path / "outside"
-        kept = recording(outside, "x", 0)
-        recording(bags, "b", 100)
-        (bags / "x").symlink_to(outside / "x", target_is_directory=True)
-        (bags / "b/b_9.mcap").symlink_to(kept[0])
-        keeper_of(bags, max_bytes=1).apply()
-        assert all(path.exists() for path in kept)
-        assert (bags / "b/b_9.mcap").is_symlink()
 
 
 class TestDeletionsThatFail:
