@@ -13,8 +13,8 @@ from ros2_memory.core.errors import ConfigError
 from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
-    from ros2_memory.triggers.exclusion import ExclusionRule
     from ros2_memory.triggers.rules import Rule
+    from ros2_memory.triggers.screening import ExclusionRule
 
 BUMPER: Final = "topic: /bumper, condition_type: equals, value: true"
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 import hashlib
 import heapq
 import time
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.conditions import refusal_for
@@ -250,21 +250,20 @@ class _Event(NamedTuple):
     record: Record | None
 
 
+@dataclass(eq=False, repr=False)
 class SplitSearch:
     """Searches on behalf of some rules."""
 
-    def __init__(
-        self,
-        reader: BagReader,
-        extractor: SchemaExtractor,
-        rules: Sequence[Rule],
-        *,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._failing = FailingFiles(monotonic)
-        self._reader = reader
-        self._extractor = extractor
-        self._rules = [rule for rule in rules if not rule.is_of_restarts]
+    reader: BagReader
+    extractor: SchemaExtractor
+    rules: Sequence[Rule]
+    _: KW_ONLY
+    monotonic: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self._failing = FailingFiles(self.monotonic)
+        self._rules = [rule for rule in self.rules if not rule.is_of_restarts]
         self._watching: dict[str, tuple[Rule, ...]] = {}
         self._tested: set[tuple[str, str]] = set()
 
@@ -317,7 +316,7 @@ class SplitSearch:
                 return
             if any(rule.condition is not None for rule in rules):
                 try:
-                    value = self._extractor.exact(self._reader.decode(record), record.channel.type)
+                    value = self.extractor.exact(self.reader.decode(record), record.channel.type)
                 except UndecodableError as error:
                     value = error
         for rule in rules:
@@ -327,7 +326,7 @@ class SplitSearch:
             if rule.condition is not None:
                 condition = rule.condition
                 if record is not None:
-                    condition = condition.of_type(record.channel.type, self._extractor)
+                    condition = condition.of_type(record.channel.type, self.extractor)
                 matches = self._test(rule, condition, event.topic, value, state)
             runs = state.rules[rule.name].runs
             fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)
@@ -398,9 +397,9 @@ class SplitSearch:
             if topic in latched or any(rule.condition is not None for rule in rules):
                 read.append(topic)
                 continue
-            for batch in self._reader.batches(bag.path, [topic], part.window, bare=[topic]):
+            for batch in self.reader.batches(bag.path, [topic], part.window, bare=[topic]):
                 times += ((time, topic) for time in batch.log_times.tolist())
-        records = self._reader.records(bag.path, read, part.window) if read else ()
+        records = self.reader.records(bag.path, read, part.window) if read else ()
         with_records = (
             _Event(record.log_time, record.channel.topic, part.recording, record)
             for record in records

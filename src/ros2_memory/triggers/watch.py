@@ -12,6 +12,7 @@ import threading
 import time
 import uuid
 from copy import deepcopy
+from dataclasses import KW_ONLY, dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Final
 
@@ -53,6 +54,7 @@ MOST_SEARCHED: Final = 64
 _log = get_logger(__name__)
 
 
+@dataclass(eq=False, repr=False)
 class Triggers:
     """The rules of one bag directory. Not thread-safe, except for `note_restart`.
 
@@ -64,26 +66,20 @@ class Triggers:
         restarts: those of the recording that are still to be evaluated; from when to when.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        rules: Sequence[Rule],
-        search: SplitSearch,
-        own: OwnRecordings,
-        moments: MomentKeeper,
-        *,
-        clock: Clock,
-        split_duration_s: float,
-        is_recorded: Callable[[str], bool],
-    ) -> None:
-        self._bag_dir = bag_dir
-        self._rules = {rule.name: rule for rule in rules}
-        self._search = search
-        self._moments = moments
-        self._own = own
-        self._clock = clock
-        self._split = ns_from_unix(split_duration_s)
-        self._is_recorded = is_recorded
+    bag_dir: Path
+    rules: Sequence[Rule]
+    search: SplitSearch
+    own: OwnRecordings
+    moments: MomentKeeper
+    _: KW_ONLY
+    clock: Clock
+    split_duration_s: float
+    is_recorded: Callable[[str], bool]
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self._rules = {rule.name: rule for rule in self.rules}
+        self._split = ns_from_unix(self.split_duration_s)
         self._state: TriggerState | None = None
         self._lock = threading.Lock()
         self.restarts: list[Span] = []
@@ -131,14 +127,14 @@ class Triggers:
         self._is_written &= state == self._state
         self._state = state
         if not self._is_written:
-            TRIGGERS.write(self._bag_dir, state)
+            TRIGGERS.write(self.bag_dir, state)
             self._is_written = True
 
     def _search_closed(self, state: TriggerState, snapshot: Snapshot) -> None:
         deadline = time.monotonic() + LOOK_S
         closed, live = self._closed_bags(snapshot, state)
         for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
-            fired, stopped = self._search.search(chain, state, lambda: time.monotonic() > deadline)
+            fired, stopped = self.search.search(chain, state, lambda: time.monotonic() > deadline)
             for firing in fired:
                 self._add_firing(firing, state, snapshot)
             for part in chain.parts:
@@ -176,39 +172,30 @@ class Triggers:
         if state is None:
             problem = None
             try:
-                state = TRIGGERS.read(self._bag_dir)
+                state = TRIGGERS.read(self.bag_dir)
             except ValueError as error:
                 problem = f"the state of the rules is lost: .episodic/triggers.json: {error}"
                 _log.error("trigger_state_lost", reason=problem)
             if state is None:
-                state = self._first_state(snapshot)
+                closed, live = self._closed_bags(snapshot, TriggerState())
+                ended = [name for name in self.own.names() if name not in live]
+                newest = {name: max(bag.end for bag in bags) for name, bags in closed.items()}
+                searched = {name: end + 1 for name, end in newest.items() if name in live}
+                state = TriggerState(before=ended[-1] if ended else None, searched=searched)
             state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
-            for record in state.rules.values():
+            for name, record in state.rules.items():
                 record.problem = problem or record.problem
-            self._note_unrecorded(state)
+                topic = self._rules[name].topic
+                if topic is None or any(mark in topic for mark in GLOB_MARKS):
+                    continue
+                never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
+                if not self.is_recorded(topic):
+                    record.problem = never
+                    _log.warning("rule_not_recorded", rule=name, reason=never)
+                elif record.problem == never:
+                    record.problem = None
             self._state = state
         return state
-
-    def _note_unrecorded(self, state: TriggerState) -> None:
-        """Notes rules on a topic that is not recorded: they can never fire."""
-        for name, record in state.rules.items():
-            topic = self._rules[name].topic
-            if topic is None or any(mark in topic for mark in GLOB_MARKS):
-                continue
-            reason = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
-            if not self._is_recorded(topic):
-                record.problem = reason
-                _log.warning("rule_not_recorded", rule=name, reason=reason)
-            elif record.problem == reason:
-                record.problem = None
-
-    def _first_state(self, snapshot: Snapshot) -> TriggerState:
-        closed, live = self._closed_bags(snapshot, TriggerState())
-        ended = [name for name in self._own.names() if name not in live]
-        searched = {
-            name: max(bag.end for bag in bags) + 1 for name, bags in closed.items() if name in live
-        }
-        return TriggerState(before=ended[-1] if ended else None, searched=searched)
 
     def _closed_bags(
         self, snapshot: Snapshot, state: TriggerState
@@ -217,14 +204,14 @@ class Triggers:
 
         With them the recordings that are being written.
         """
-        active = (self._own.name_of(aside.path.parent) for aside in snapshot.active)
-        live = frozenset((*read_heartbeat(self._bag_dir).recordings, *active))
-        names = [*self._own.names()]
+        active = (self.own.name_of(aside.path.parent) for aside in snapshot.active)
+        live = frozenset((*read_heartbeat(self.bag_dir).recordings, *active))
+        names = [*self.own.names()]
         positions = {name: number for number, name in enumerate(names)}
         searched = (positions[name] for name in state.searched if name in positions)
         before = positions.get(state.before or "")
         first = min(searched, default=0) if before is None else before + 1
-        folders = {str(self._bag_dir / name): name for name in names[first:]}
+        folders = {str(self.bag_dir / name): name for name in names[first:]}
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
             if folders.keys().isdisjoint(segment.bags.folders):
@@ -236,7 +223,7 @@ class Triggers:
         return {name: bags for name, bags in closed.items() if bags}, live
 
     def _previous(self, recording: str) -> str | None:
-        handover = read_handover(self._bag_dir / recording).handover
+        handover = read_handover(self.bag_dir / recording).handover
         return handover.previous if handover.state is Counting.COUNTS else None
 
     def _add_firing(self, firing: Firing, state: TriggerState, snapshot: Snapshot) -> None:
@@ -285,10 +272,10 @@ class Triggers:
     ) -> bool:
         """Has a moment stored, if the disk can; returns False where it is refused for good."""
         request = SaveRequest(
-            moment.number, self._rules[name].label, moment.start, moment.end, self._clock.now()
+            moment.number, self._rules[name].label, moment.start, moment.end, self.clock.now()
         )
         try:
-            refused = self._moments.keep_for_rule(request, name, moment.matches, snapshot)
+            refused = self.moments.keep_for_rule(request, name, moment.matches, snapshot)
         except OSError as error:
             self._report(name, record, f"its moments cannot be stored: {error.strerror}")
             return True

@@ -9,13 +9,12 @@ import pytest
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE
 from ros2_memory.bag_dir.state_files import SCREENED, read_withheld
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.background import Background
 from ros2_memory.storage.mcap.writer import McapWriter
 from tests.support.bags import McapLayout
 from tests.support.fakes import failing
 from tests.support.housekeepers import keeper_of, recording_now
-from tests.support.screened_bags import T0, S, ScreenedBags, mode, privacy, words
+from tests.support.screened_bags import ScreenedBags, mode, privacy, words
 from tests.support.simulated_recorders import assert_each_counts_once, rotating
 
 if TYPE_CHECKING:
@@ -97,21 +96,6 @@ class TestTheHouse:
         recording_now(bags.bag_dir)
         keeper_of(bags.bag_dir, max_bytes=1).apply()
         assert not held.exists()
-
-    def test_no_moment_is_kept_of_what_is_held_back(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(-2, value=False), *words(0, 10)])
-        held = bags.split(name, [mode(12, value=True), *words(10, 20)])
-        bags.step()
-        keeper = keeper_of(bags.bag_dir)
-        recording_now(bags.bag_dir, name)
-        keeper.apply()
-        snapshot = keeper._index.snapshot()
-        window = TimeWindow(T0 - 10 * S, T0 + 60 * S)
-        [served] = snapshot.timeline.overlapping(window)
-        assert served.path.name == f"{name}_0.mcap"
-        assert [each.path for each in snapshot.active] == [held]
 
     def test_a_step_runs_in_the_background_and_its_fault_is_reported(self, tmp_path: Path) -> None:
         bags = ScreenedBags(tmp_path / "bags")

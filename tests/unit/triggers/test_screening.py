@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.triggers.exclusion import ExclusionRule
+    from ros2_memory.triggers.screening import ExclusionRule
 
 VOLATILE = McapLayout(latched=frozenset())
 

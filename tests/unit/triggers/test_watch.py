@@ -9,12 +9,10 @@ from unittest.mock import Mock
 
 import pytest
 
-from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import BagUnreachableError
-from ros2_memory.retention import saved_moments
 from tests.support.bags import McapLayout, Msg, boolean, text
 from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
@@ -238,27 +236,6 @@ def test_the_budget_deletes_it_and_that_is_said(tmp_path: Path) -> None:
     assert "were deleted to make room" in (robot.record().problem or "")
 
 
-def test_a_full_disk_keeps_the_firing_until_there_is_room(
-    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot.begin(T0)
-    robot.split(seconds(0, 10, {6}))
-    robot.clock.at = T0 + 30 * S
-
-    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    with monkeypatch.context() as broken:
-        broken.setattr(saved_moments, "make_moment_folder", full)
-        broken.setattr(json_files, "write_durably", full)
-        robot.close_all()
-        robot.look()
-    assert not robot.moments()
-    [said] = robot.logged("trigger_not_kept")
-    assert "No space left" in said["reason"]
-    robot.look()
-    assert robot.spans() == [(1, 9)]
-    assert (robot.record().fired, robot.record().moments) == (1, 1)
-
-
 def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -321,25 +298,6 @@ def test_messages_that_cannot_be_decoded_are_named(robot: WatchedBags) -> None:
     robot.split([Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, b"")])
     robot.close_all()
     assert "/bumper" in (robot.record().problem or "")
-
-
-def test_a_kill_between_moment_and_state_doubles_nothing(
-    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot.begin(T0)
-    robot.split(seconds(0, 30, {6, 9, 20}))
-    robot.clock.at = T0 + 60 * S
-
-    robot.beat(state=RecorderState.STOPPED)
-    with monkeypatch.context() as broken:
-        broken.setattr(TRIGGERS, "write", Mock(side_effect=SystemExit))
-        with pytest.raises(SystemExit):
-            robot.look()
-    assert len(robot.moments()) == 2
-    robot.house = robot.new_house()
-    robot.look()
-    assert robot.spans() == [(1, 12), (15, 23)]
-    assert (robot.record().fired, robot.record().moments) == (3, 2)
 
 
 def test_what_was_published_by_a_clock_that_was_ahead_makes_nothing_a_repeat(
