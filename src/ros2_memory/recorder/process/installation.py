@@ -123,14 +123,16 @@ def advice_on_rmw(env: Mapping[str, str]) -> str | None:
     return None
 
 
-def advice_on_users(env: Mapping[str, str]) -> str | None:
-    """Returns what a recorder needs to hear nodes of another user; None where it needs nothing.
+def advice_on_silence(env: Mapping[str, str]) -> str:
+    """Returns advice for subscriptions that receive nothing, by the environment.
 
     rmw_fastrtps sets its own transports in the discovery range LOCALHOST, whatever
     FASTDDS_BUILTIN_TRANSPORTS is, and among them shared memory that another user cannot read.
     """
+    if advice := advice_on_rmw(env):
+        return advice
     if "fastrtps" not in rmw_of(env):
-        return None
+        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
     local = env.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     if local or env.get("ROS_LOCALHOST_ONLY") == "1":
         return (
@@ -144,32 +146,20 @@ def advice_on_users(env: Mapping[str, str]) -> str | None:
             "if the publishers run under another user, set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 "
             "for the recorder: Fast DDS does not share memory between users"
         )
-    return None
-
-
-def advice_on_silence(env: Mapping[str, str]) -> str:
-    """Returns advice for subscriptions that receive nothing, by the environment."""
-    if advice := advice_on_rmw(env) or advice_on_users(env):
-        return advice
-    if "fastrtps" not in rmw_of(env):
-        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
     return "do the publishers publish, and does a firewall block DDS?"
 
 
-def find_ros2(env: Mapping[str, str], *, sourced: bool = False) -> str:
+def find_ros2(env: Mapping[str, str]) -> str:
     """Returns the path of the `ros2` program.
-
-    `sourced`: the environment is that after the setup files.
 
     Raises:
         RecorderError: it is not on the environment's PATH.
     """
     program = shutil.which("ros2", path=env.get("PATH", os.defpath))
     if program is None:
-        where = "after sourcing recorder.setup_files" if sourced else "on PATH"
         raise RecorderError(
-            f"`ros2` was not found {where}; name the setup.bash of the ROS 2 distribution, and of "
-            "the workspace with the robot's own messages, in recorder.setup_files"
+            "`ros2` was not found on PATH, nor by recorder.setup_files; name there the setup.bash "
+            "of the ROS 2 distribution, and of the workspace with the robot's own messages"
         )
     return str(Path(program).absolute())
 
@@ -188,20 +178,16 @@ def _sourced(setup_files: Sequence[Path], base: Mapping[str, str]) -> dict[str, 
     begun, ended, entries = os.fsdecode(finished.stdout).partition("\0\0")
     printed = finished.stderr.decode("utf-8", errors="replace")
     if finished.returncode != 0 or not ended:
-        raise RecorderError(_failure(begun, finished.returncode, printed))
+        name = begun.rstrip("\0").rpartition("\0")[2] or "the shell"
+        said = " ".join(printed.split())[-300:]
+        raise RecorderError(
+            f"{name} failed with status {finished.returncode}{f' ({said})' if said else ''}; "
+            "correct it, or recorder.setup_files"
+        )
     for line in printed.splitlines():
         _log.warning("setup_file_said", text=line)
     pairs = (entry.partition("=") for entry in entries.split("\0") if entry)
     return {name: value for name, _, value in pairs if name not in _SHELLS_OWN}
-
-
-def _failure(begun: str, status: int, errors: str) -> str:
-    name = begun.rstrip("\0").rpartition("\0")[2] or "the shell"
-    printed = " ".join(errors.split())[-300:]
-    return (
-        f"{name} failed with status {status}"
-        f"{f' ({printed})' if printed else ''}; correct it, or recorder.setup_files"
-    )
 
 
 HELP_TIMEOUT_S: Final = 60.0
@@ -228,7 +214,7 @@ def find_installation(setup_files: Sequence[Path], log_dir: Path) -> Installatio
         RecorderError: a setup file fails, there is no `ros2`, or it cannot record MCAP.
     """
     env = robot_environment(setup_files, log_dir)
-    ros2 = find_ros2(env, sourced=bool(setup_files))
+    ros2 = find_ros2(env)
     # Nothing is recorded yet, or never (`ros2-memory doctor`): no log goes beside the bags.
     with TemporaryDirectory() as elsewhere:
         finished = run_bounded(

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
 import yaml
 
@@ -35,7 +35,7 @@ MAX_REGEX: Final = 60_000
 """Characters in the regular expression: the C++ library fails on patterns not much larger."""
 
 SERVICE_EVENT: Final = "/_service_event"
-_PART = re.compile(r"[A-Za-z_*][A-Za-z0-9_*]*")
+_NAME: Final = re.compile(r"(/(?!\d)(\w|\*(?!\*))+)+", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,26 +147,8 @@ def load_topics(path: Path) -> TopicSelection:
 
     Raises:
         ConfigError: the file is missing, is not such a list, lists nothing, or an entry is no
-            topic name; the message names the file, the entry and the reason.
+            topic name; the message names the file and the entry.
     """
-    entries, excluded = _entries(path)
-    for entry in (*entries, *excluded):
-        reason = _fault(entry)
-        if reason is not None:
-            raise ConfigError(f"{path}: {entry!r} cannot be recorded: {reason}")
-    selection = TopicSelection(
-        *(tuple(dict.fromkeys(map(str, names))) for names in (entries, excluded))
-    )
-    if len(selection.regex) > MAX_REGEX:
-        raise ConfigError(
-            f"{path}: {len(selection.entries)} topics make a pattern of more than {MAX_REGEX} "
-            "characters, which ROS 2 does not take; use globs such as /vision/*/detections_meta"
-        )
-    return selection
-
-
-def _entries(path: Path) -> tuple[list[object], list[object]]:
-    """Returns what the file lists to be recorded, and what not to be."""
     try:
         content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -176,43 +158,28 @@ def _entries(path: Path) -> tuple[list[object], list[object]]:
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: it is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict) or {*content} - {"exclude"} != {"topics"}:
+    lists = content if isinstance(content, dict) else {}
+    topics, excluded = lists.get("topics"), lists.get("exclude") or []
+    are_lists = isinstance(topics, list) and isinstance(excluded, list)
+    if not (are_lists and topics and {*lists} <= {"topics", "exclude"}):
         raise ConfigError(
-            f"{path}: it must hold the key topics, and below it a list of topics; beside it, if "
-            "anything, exclude with such a list"
+            f"{path}: it must hold the key topics, and below it a list of at least one topic, each "
+            "on a line: - /odom; beside it, if anything, exclude with such a list"
         )
-    listed: object = content["topics"]
-    excluded: object = content.get("exclude") or []
-    if listed is None or listed == []:
-        raise ConfigError(f"{path}: no topic is listed, so nothing would be recorded; list some")
-    for name, value in (("topics", listed), ("exclude", excluded)):
-        if not isinstance(value, list):
-            raise ConfigError(f"{path}: {name} must be a list, one topic to a line: - /odom")
-    return cast("list[object]", listed), cast("list[object]", excluded)
-
-
-def _fault(entry: object) -> str | None:
-    """Returns why an entry is neither a topic name nor a glob; None if it is one."""
-    if not isinstance(entry, str):
-        return "an entry must be text, such as /odom"
-    if not entry.startswith("/"):
-        return "the name must be fully qualified: it begins with /"
-    if len(entry) > MAX_NAME:
-        return f"the name is longer than {MAX_NAME} characters"
-    faults = (_fault_of_part(part) for part in entry[1:].split("/"))
-    return next((fault for fault in faults if fault is not None), None)
-
-
-def _fault_of_part(part: str) -> str | None:
-    if not part:
-        return "a part of the name is empty: no // and no / at the end"
-    if "**" in part:
-        return "a glob's * matches inside one part of the name; write one * for each part"
-    if part[0].isdigit():
-        return f"the part {part!r} begins with a digit"
-    if not _PART.fullmatch(part):
-        return f"the part {part!r} holds more than ASCII letters, digits, _ and *"
-    return None
+    for entry in (*topics, *excluded):
+        if not isinstance(entry, str) or len(entry) > MAX_NAME or not _NAME.fullmatch(entry):
+            raise ConfigError(
+                f"{path}: {entry!r} cannot be recorded: it must be a fully qualified name such as "
+                f"/odom, of at most {MAX_NAME} characters, whose parts have ASCII letters, digits "
+                "and _, and begin with no digit; a * matches inside one part"
+            )
+    selection = TopicSelection(*(tuple(dict.fromkeys(names)) for names in (topics, excluded)))
+    if len(selection.regex) > MAX_REGEX:
+        raise ConfigError(
+            f"{path}: {len(selection.entries)} topics make a pattern of more than {MAX_REGEX} "
+            "characters, which ROS 2 does not take; use globs such as /vision/*/detections_meta"
+        )
+    return selection
 
 
 def _pattern(entry: str) -> str:
