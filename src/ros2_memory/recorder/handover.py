@@ -24,8 +24,8 @@ the log time), and not at all on latched channels, whose repeats are recognised 
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import replace
+from collections import Counter, defaultdict
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from itertools import groupby, islice
 from operator import itemgetter
@@ -59,8 +59,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.recorder.session import RecordingSession
-    from ros2_memory.recorder.sessions import Orders
+    from ros2_memory.recorder.sessions import Orders, RecordingSession
 
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
 READY_TIMEOUT_S: Final = 120.0
@@ -161,6 +160,7 @@ class Step(Enum):
     ABANDON = auto()
 
 
+@dataclass(eq=False, repr=False)
 class HandoverTransfer:
     """A handover from one running session to another.
 
@@ -170,18 +170,19 @@ class HandoverTransfer:
         began: the time just before the new recorder was started.
     """
 
-    def __init__(
-        self, old: RecordingSession, new: RecordingSession, began: ClockReading, orders: Orders
-    ) -> None:
-        self._orders = orders
-        self.old = old
-        self.new = new
-        self.directories = old.splits.directory, new.splits.directory
-        self._began = self._last = began
+    old: RecordingSession
+    new: RecordingSession
+    began: ClockReading
+    orders: Orders
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self.directories = self.old.splits.directory, self.new.splits.directory
+        self._last = self.began
         # Since when both record.
         self._both_since: ClockReading | None = None
         self._marked = False
-        self._closed_before = old.splits.closed_names
+        self._closed_before = self.old.splits.closed_names
 
     @staticmethod
     def announce(old: RecordingSession, new_name: str) -> None:
@@ -199,7 +200,7 @@ class HandoverTransfer:
     @property
     def missing(self) -> frozenset[str]:
         """Topics that the old recorder has subscribed to, and the new one has still to."""
-        is_listed = self._orders.topics.selection.matches
+        is_listed = self.orders.topics.selection.matches
         return frozenset(filter(is_listed, self.old.subscribed - self.new.subscribed))
 
     def advance(self, now: ClockReading) -> Step:
@@ -215,7 +216,7 @@ class HandoverTransfer:
         if set_back(before, now):
             return Step.ABANDON
         is_ready = self._marked and self.new.is_recording
-        age_s = now.monotonic_s - self._began.monotonic_s
+        age_s = now.monotonic_s - self.began.monotonic_s
         if self.missing and age_s < SUBSCRIBE_TIMEOUT_S:
             # Also if a publisher appears while both run: what it sends before the new recorder has
             # subscribed is in the old recording alone, and must not lie after the cut.
@@ -237,20 +238,20 @@ class HandoverTransfer:
             return False
         old, new = self.directories
         closed = self.old.splits.closed_names
-        clock = cut_clock(old / max(closed), self._orders.reader) if closed else CutClock.PUBLISH
-        if self._orders.simulated and clock is CutClock.LOG:
+        clock = cut_clock(old / max(closed), self.orders.reader) if closed else CutClock.PUBLISH
+        if self.orders.simulated and clock is CutClock.LOG:
             # No time of the wall clock separates them: the old one counts up to its end.
             return True
         of_old, of_new = complete_sidecars(
             handover_to_change(old),
             self.old.name,
             self.new.name,
-            began=self._began.wall,
+            began=self.began.wall,
             both=self._both_since.wall,
             ended=now.wall,
             old_files=self._old_files(),
             new_files=self.new.splits.names(),
-            simulated=self._orders.simulated,
+            simulated=self.orders.simulated,
             clock=clock,
         )
         write_handovers({new: of_new, old: of_old})
@@ -428,9 +429,8 @@ def _unlatched_records(bag: Path, reader: BagReader) -> Iterator[Record]:
 
 _Copies: TypeAlias = "Counter[tuple[str, bool]]"
 """How often a recording holds one message, by file, and by whether the cut counts it there."""
-_Wrong: TypeAlias = "dict[bool, set[tuple[str, str, str]]]"
-"""Messages for which the cut is wrong, as file, topic and identity, by whether they count."""
-_NOWHERE: Final[_Copies] = Counter()
+_Wrong: TypeAlias = "tuple[Path, bool, str, str, str]"
+"""A message for which the cut is wrong: its recording, whether it counts, file, topic, identity."""
 
 
 class _Side(NamedTuple):
@@ -463,29 +463,18 @@ class _Side(NamedTuple):
                 if span[0] <= span[1]:
                     yield span
 
-    def copies(
+    def records(
         self, window: TimeWindow, reader: BagReader, *, latched: bool
-    ) -> dict[tuple[str, str], _Copies | None]:
-        """Returns what the recording holds in a window, by topic and identity.
-
-        None stands for a message without a publish time of its own.
-        """
-        by_message: dict[tuple[str, str], _Copies | None] = {}
+    ) -> Iterator[tuple[str, bool, Record]]:
+        """Yields the messages in a window, each with its file and whether the cut counts it."""
         for name, bag in self.bags.items():
             if not window.overlaps(bag.start, bag.end):
                 continue
             topics, rule = [topic.topic for topic in bag.topics], self.cut.rule(name)
             for record in _readable(reader.records(self.recording / name, topics, window)):
-                published, logged = record.publish_time, record.log_time
-                if record.channel.latched and not (latched and logged - published <= FRESH_NS):
-                    continue
-                key = record.channel.topic, message_id(published, record.payload)
-                copies = by_message.setdefault(key, Counter())
-                if published in {0, logged}:
-                    by_message[key] = None
-                elif copies is not None:
-                    copies[name, rule is None or rule.counts(record)] += 1
-        return by_message
+                late = record.log_time - record.publish_time > FRESH_NS
+                if not record.channel.latched or (latched and not late):
+                    yield name, rule is None or rule.counts(record), record
 
 
 def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) -> bool:
@@ -512,53 +501,58 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
         not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
     ):
         return False
-    of_old, of_new = _against_the_cut(old_side, new_side, reader, latched=is_void)
-    messages = sum(map(len, (*of_old.values(), *of_new.values())))
-    if messages <= MOST_LISTED:
-        settled, after = _with_listed(before, of_old), _with_listed(after, of_new)
-    else:
+    wrong = _against_the_cut(old_side, new_side, reader, latched=is_void)
+    changed = {new: _with_listed(after, new, wrong), old: _with_listed(before, old, wrong)}
+    if len(wrong) > MOST_LISTED:
         # Without a cut all of both count.
         begin = None if after.begin is None else replace(after.begin, files=())
-        settled, after = before, replace(after, state=Counting.COUNTS, begin=begin)
+        changed = {new: replace(after, state=Counting.COUNTS, begin=begin), old: before}
         if before.end is not None and before.next == new.name:
-            settled = replace(before, end=replace(before.end, files=()))
-    changed = {new: replace(after, compared=True)}
-    write_handovers(changed if settled == before else {**changed, old: settled})
-    if messages:
-        _log.info("handover_compared", recording=old.name, next=new.name, messages=messages)
+            changed[old] = replace(before, end=replace(before.end, files=()))
+    changed[new] = replace(changed[new], compared=True)
+    if changed[old] == before:
+        del changed[old]
+    write_handovers(changed)
+    if wrong:
+        _log.info("handover_compared", recording=old.name, next=new.name, messages=len(wrong))
     return True
 
 
-def _against_the_cut(
-    old: _Side, new: _Side, reader: BagReader, *, latched: bool
-) -> tuple[_Wrong, _Wrong]:
-    """Returns what counts against the cut, for the sidecars of the old and the new recording.
+def _against_the_cut(old: _Side, new: _Side, reader: BagReader, *, latched: bool) -> set[_Wrong]:
+    """Returns the messages of two recordings for which the cut is wrong.
 
     `latched`: also of latched messages. The cut does not apply to them, but all of a recording
     without effect is hidden.
     """
-    of_old: _Wrong = {True: set(), False: set()}
-    of_new: _Wrong = {True: set(), False: set()}
     spans = [*old.hidden(), *new.hidden()]
     if old.bags and new.bags and (start := max(old.start, new.start)) <= min(old.end, new.end):
         spans.append((start, min(old.end, new.end)))
     if not spans:
-        return of_old, of_new
+        return set()
     first, last = enclosing(spans)
     window = TimeWindow(first - STALL_NS, last + STALL_NS + 1)
-    in_old, in_new = (side.copies(window, reader, latched=latched) for side in (old, new))
-    for message in in_old.keys() | in_new.keys():
-        old_copies, new_copies = in_old.get(message, _NOWHERE), in_new.get(message, _NOWHERE)
-        if old_copies is None or new_copies is None:
-            continue
+    by_message: defaultdict[tuple[str, str], tuple[_Copies, _Copies]] = defaultdict(
+        lambda: (Counter(), Counter())
+    )
+    undecided: set[tuple[str, str]] = set()  # without a publish time of their own
+    for nth, side in enumerate((old, new)):
+        for file, counts, record in side.records(window, reader, latched=latched):
+            message = record.channel.topic, message_id(record.publish_time, record.payload)
+            by_message[message][nth][file, counts] += 1
+            if record.publish_time in {0, record.log_time}:
+                undecided.add(message)
+    wrong: set[_Wrong] = set()
+    for message in by_message.keys() - undecided:
+        of_old, of_new = by_message[message]
         # Where both hold it as often, the cut decides.
-        is_old = _weight(old_copies) >= _weight(new_copies)
-        for wrong, copies, counts in (
-            (of_old, old_copies, is_old),
-            (of_new, new_copies, not is_old),
-        ):
-            wrong[counts].update((file, *message) for file, by_cut in copies if by_cut != counts)
-    return of_old, of_new
+        is_old = _weight(of_old) >= _weight(of_new)
+        for side, copies, counts in ((old, of_old, is_old), (new, of_new, not is_old)):
+            wrong.update(
+                (side.recording, counts, file, *message)
+                for file, by_cut in copies
+                if by_cut != counts
+            )
+    return wrong
 
 
 def _weight(copies: _Copies) -> tuple[int, int]:
@@ -566,26 +560,27 @@ def _weight(copies: _Copies) -> tuple[int, int]:
     return copies.total(), sum(times for (_, counts), times in copies.items() if counts)
 
 
-def _with_listed(handover: Handover, wrong: _Wrong) -> Handover:
-    """Returns a sidecar that lists those messages, too."""
+def _with_listed(handover: Handover, recording: Path, wrong: Collection[_Wrong]) -> Handover:
+    """Returns the sidecar of a recording that lists those messages of it, too."""
+
+    def merged(listed: MessageList, counts: bool) -> MessageList:
+        messages = {
+            (file, topic, message)
+            for file, by_topic in listed.items()
+            for topic, of_topic in by_topic.items()
+            for message in of_topic
+        }
+        messages |= {message[2:] for message in wrong if message[:2] == (recording, counts)}
+        lists: MessageList = {}
+        for (file, topic), of_topic in groupby(sorted(messages), itemgetter(0, 1)):
+            lists.setdefault(file, {})[topic] = tuple(message for _, _, message in of_topic)
+        return lists
+
     return replace(
         handover,
-        also_counts=_merged(handover.also_counts, wrong[True]),
-        counts_elsewhere=_merged(handover.counts_elsewhere, wrong[False]),
+        also_counts=merged(handover.also_counts, counts=True),
+        counts_elsewhere=merged(handover.counts_elsewhere, counts=False),
     )
-
-
-def _merged(listed: MessageList, more: Collection[tuple[str, str, str]]) -> MessageList:
-    before = {
-        (file, topic, message)
-        for file, by_topic in listed.items()
-        for topic, messages in by_topic.items()
-        for message in messages
-    }
-    merged: MessageList = {}
-    for (file, topic), of_topic in groupby(sorted(before.union(more)), itemgetter(0, 1)):
-        merged.setdefault(file, {})[topic] = tuple(message for _, _, message in of_topic)
-    return merged
 
 
 def _readable(records: Iterator[Record]) -> Iterator[Record]:
