@@ -114,21 +114,17 @@ class EventLog:
                 topic = {} if line.topic is None else {"topic": line.topic}
                 self.info(line.kind.value, recording=recording, **topic)
             elif line.kind in _ADVICE:
-                self._advise(recording, line)
+                # What to do about it; of a topic that stays unrecorded, once as a fault: each new
+                # recorder says it again, which is no newer fault than why it was started.
+                about, known = f"{line.topic}: " if line.topic else "", False
+                if line.topic is not None and line.kind in _LASTING:
+                    known = (line.kind, line.topic) in self._of_topics
+                    if len(self._of_topics) < _MOST_TOPICS:
+                        self._of_topics.add((line.kind, line.topic))
+                report = self.remark if known else self.warn
+                sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
+                report(line.kind.value, sentence, recording=recording)
             elif line.kind is LineKind.ERROR:
                 self.fail("recorder_error", line.text, recording=recording)
             else:
                 self.warn("recorder_warning", line.text, recording=recording)
-
-    def _advise(self, recording: str, line: Line) -> None:
-        """Logs what to do about a line; of a topic that stays unrecorded once as a fault."""
-        about = f"{line.topic}: " if line.topic else ""
-        report = self.warn
-        if line.topic is not None and line.kind in _LASTING:
-            # Each new recorder says it again, which is no newer fault than why it was started.
-            if (line.kind, line.topic) in self._of_topics:
-                report = self.remark
-            elif len(self._of_topics) < _MOST_TOPICS:
-                self._of_topics.add((line.kind, line.topic))
-        sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
-        report(line.kind.value, sentence, recording=recording)

@@ -101,7 +101,11 @@ class IndexManager:
         it and share its result.
         """
         current = self.published
-        if current is not None and not self._is_stale(current, reach):
+        if (
+            current is not None
+            and 0 <= self._clock.now() - current.scanned_at < self._refresh
+            and (reach is None or (current.latest is not None and reach <= current.latest))
+        ):
             return current
         with self._lock:
             if self.published is not None and self.published is not current:
@@ -152,11 +156,6 @@ class IndexManager:
     def heartbeat(self) -> Heartbeat | None:
         """Returns the recorder's last heartbeat, live or not; None if it cannot be read."""
         return read_heartbeat(self.bag_dir).heartbeat
-
-    def _is_stale(self, snapshot: Snapshot, reach: Ns | None) -> bool:
-        if not 0 <= self._clock.now() - snapshot.scanned_at < self._refresh:
-            return True
-        return reach is not None and (snapshot.latest is None or reach > snapshot.latest)
 
     # The methods below run under the lock.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, deque
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import yaml
@@ -137,6 +137,7 @@ class _Anew(NamedTuple):
     recordings: int = ASKED_FOR
 
 
+@dataclass(eq=False, repr=False)
 class Reception:
     """How the topics of one bag directory arrive, across its recordings.
 
@@ -149,22 +150,16 @@ class Reception:
         may_write: whether losses are written; those that are not wait.
     """
 
-    def __init__(
-        self,
-        reader: BagReader,
-        queue_bytes: int,
-        *,
-        bag_dir: Path,
-        latched: Collection[str] = (),
-        volatile: Collection[str] = (),
-        background: Background,
-    ) -> None:
-        self._reader = reader
-        self._queue_bytes = queue_bytes
-        self._latched = latched
-        self._volatile = volatile
-        self._background = background
-        self._bag_dir = bag_dir
+    reader: BagReader
+    queue_bytes: int
+    _: KW_ONLY
+    bag_dir: Path
+    latched: Collection[str] = ()
+    volatile: Collection[str] = ()
+    background: Background
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
         self._losses = LossCounter()
         self._unwritten: deque[Loss] = deque(maxlen=_MOST_UNWRITTEN)
         self._arrivals = Arrivals()
@@ -187,7 +182,7 @@ class Reception:
         """Returns the QoS overrides (YAML) for a recording that is about to start."""
         with self._lock:
             plan, anew = self._plan_queues(), self._asked_anew
-            topics = {*self._flows, *anew, *self._latched}
+            topics = {*self._flows, *anew, *self.latched}
             profiles = {topic: self._profile_of(topic, plan) for topic in topics}
             self._recordings[recording] = _Recording(plan, asked_anew=frozenset(anew))
             self._losses.begin(recording)
@@ -211,7 +206,7 @@ class Reception:
         all messages are asked for, unless its publishers are known to be volatile.
         """
         flow, asked = self._flows.get(topic), self._asked_anew.get(topic)
-        counts_as_latched, depth = topic in self._latched, plan.depth(topic)
+        counts_as_latched, depth = topic in self.latched, plan.depth(topic)
         if asked is not None and counts_as_latched and not asked.best_effort:
             # As volatile it would lose what was published before: rosbag2 decides by the publishers
             # that it finds.
@@ -220,7 +215,7 @@ class Reception:
             return {**ALL_MESSAGES} if asked is None else _profile(depth)
         reliable, latched, publishers = flow.offered
         is_skipped = topic in self._skipped and publishers == 1
-        latched &= asked is None and topic not in self._volatile and not is_skipped
+        latched &= asked is None and topic not in self.volatile and not is_skipped
         return _profile(
             None if latched and counts_as_latched else depth,
             reliable=reliable and not (asked is not None and asked.best_effort),
@@ -245,11 +240,11 @@ class Reception:
 
     def learn(self, recording: str, path: Path) -> None:
         """Measures a closed split of a recording, later."""
-        self._background.add(_TASK, lambda: self._measure(recording, path))
+        self.background.add(_TASK, lambda: self._measure(recording, path))
 
     def flush(self) -> None:
         """Counts what no further split can fill; called when nothing is recorded any more."""
-        self._background.add(_TASK, lambda: self._report_losses(self._losses.flush))
+        self.background.add(_TASK, lambda: self._report_losses(self._losses.flush))
 
     def lost(self, recording: str, topic: str, count: int) -> None:
         """Notes that rosbag2 itself lost messages of a topic in a recording that ends."""
@@ -259,7 +254,7 @@ class Reception:
             start, stop = (0, 0) if state is None else state.span
             return self._losses.reported(topic, start, stop, count)
 
-        self._background.add(_TASK, lambda: self._report_losses(reported))
+        self.background.add(_TASK, lambda: self._report_losses(reported))
 
     def lost_in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are known to be missing of the last hour."""
@@ -288,7 +283,7 @@ class Reception:
         self._unwritten += losses
         if self.may_write and self._unwritten:
             try:
-                append_losses(self._bag_dir, self._unwritten)
+                append_losses(self.bag_dir, self._unwritten)
             except OSError as error:
                 reason = error.strerror or error
                 raise RecorderError(f"losses cannot be written: {reason}") from error
@@ -355,16 +350,16 @@ class Reception:
         return {
             topic: flow
             for topic, flow in self._flows.items()
-            if not (topic in self._latched and flow.offered.latched)
+            if not (topic in self.latched and flow.offered.latched)
         }
 
     def _plan_queues(self) -> QueuePlan:
-        return plan_queues(self._planned_for(), self._queue_bytes)
+        return plan_queues(self._planned_for(), self.queue_bytes)
 
     def _measure(self, recording: str, path: Path) -> None:
         try:
-            split = measure_split(self._reader, path, end_only=not recording)
-            summary = self._reader.summarize(path)
+            split = measure_split(self.reader, path, end_only=not recording)
+            summary = self.reader.summarize(path)
         except (EpisodicError, OSError) as error:
             # The file is reported where it matters; its successor shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))

@@ -1,19 +1,25 @@
 """Runs the recordings: mostly one, two during a handover, and those that are ending.
 
-This module does each step; `supervisor` decides when. Nothing here waits, except `stop`.
+This module does each step; `supervisor` decides when. Nothing here waits, except `stop`. Only the
+end of a bag file shows whether it is closed: distributions number splits differently, and a new
+file appears some milliseconds before the old one is closed.
 """
 
 from __future__ import annotations
 
+import os
 import signal
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections import deque
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush_bags
-from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
-from ros2_memory.core.errors import RecorderError
+from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, recording_name
+from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import MAX_NS, Clock, Ns
 from ros2_memory.recorder.handover import (
     READY_TIMEOUT_S,
     HandoverTransfer,
@@ -24,22 +30,253 @@ from ros2_memory.recorder.handover import (
 )
 from ros2_memory.recorder.policies import ClockReading, describe_death
 from ros2_memory.recorder.process.child import Child, end_all
-from ros2_memory.recorder.process.output import LineKind
-from ros2_memory.recorder.session import RecordingSession, SessionState, SplitChanges, Splits
+from ros2_memory.recorder.process.command import MESSAGES_LOST
+from ros2_memory.recorder.process.output import Line, LineKind, parse_line
 from ros2_memory.retention.clear import remove_if_empty
+from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
-    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception import Reception
-    from ros2_memory.storage.base import BagReader
+
+
+MAX_DISTINCT: Final = 200
+"""How many warnings that differ in more than their numbers are reported for one recording."""
+EMPTY_GRACE_S: Final = 5.0
+"""A file that is still 0 bytes so long after a newer one appeared was lost to a full disk."""
+_LAST_LINES: Final = 6
+
+
+class SplitChanges(NamedTuple):
+    """What changed since the last observation.
+
+    `closed` names splits in the order in which they were recorded, and `empty` all those that are
+    empty though a newer one was seen. `gone`: the directory existed and does not any more. `faults`
+    are sentences about what could not be read.
+    """
+
+    closed: tuple[str, ...] = ()
+    empty: tuple[str, ...] = ()
+    gone: bool = False
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Split:
+    first_seen_s: float
+    size: int = 0
+    closed: bool = False
+    start: Ns = MAX_NS
+
+
+@dataclass(slots=True)
+class Splits:
+    """The splits of one recording, as of the last observation.
+
+    Attributes:
+        received: the topics of which a closed split has a message.
+        messages: how many messages all closed splits have.
+    """
+
+    directory: Path
+    reader: BagReader
+    exists: bool = False
+    received: set[str] = field(default_factory=set)
+    messages: int = 0
+    _files: dict[str, _Split] = field(default_factory=dict)
+
+    def observe(self, now_s: float) -> SplitChanges:
+        """Reads the directory again. Raises nothing."""
+        try:
+            sizes = self._sizes()
+        except (FileNotFoundError, NotADirectoryError):
+            existed, self.exists = self.exists, False
+            return SplitChanges(gone=existed)
+        except OSError as error:
+            return SplitChanges(faults=(f"{self.directory}: {error.strerror or error}",))
+        self.exists = True
+        for name, size in sizes.items():
+            split = self._files.setdefault(name, _Split(now_s))
+            split.size = max(split.size, size)
+        faults: list[str] = []
+        closed = [name for name in sizes if self._note_closed(name, faults)]
+        closed.sort(key=lambda name: (self._files[name].start, name))
+        newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
+        overdue = now_s - newest_s >= EMPTY_GRACE_S
+        empty = tuple(
+            name
+            for name, size in sizes.items()
+            if overdue and not size and newest_s > self._files[name].first_seen_s
+        )
+        return SplitChanges(tuple(closed), empty, faults=tuple(faults))
+
+    @property
+    def bytes_written(self) -> int:
+        """The size of all splits in bytes, deleted ones included; it never shrinks."""
+        return sum(split.size for split in self._files.values())
+
+    @property
+    def closed_names(self) -> frozenset[str]:
+        """The splits that were closed at the last observation."""
+        return frozenset(name for name, split in self._files.items() if split.closed)
+
+    @property
+    def seen(self) -> Collection[str]:
+        """The names of all splits that were ever observed."""
+        return self._files.keys()
+
+    def names(self) -> frozenset[str]:
+        """Returns the names of all splits, seen before or present now."""
+        with suppress(OSError):
+            return frozenset(self._files) | frozenset(self._sizes())
+        return frozenset(self._files)
+
+    def _sizes(self) -> dict[str, int]:
+        sizes: dict[str, int] = {}
+        with os.scandir(self.directory) as entries:
+            for entry in entries:
+                if bag_kind(entry.name) and entry.is_file(follow_symlinks=False):
+                    sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
+        return sizes
+
+    def _note_closed(self, name: str, faults: list[str]) -> bool:
+        """Takes what a split has that was closed since the last observation; returns if it was."""
+        split = self._files[name]
+        if split.closed or split.size == 0:
+            return False
+        path = self.directory / name
+        try:
+            if self.reader.closing(path) is not Closing.CLOSED:
+                return False
+            split.closed = True
+            summary = self.reader.summarize(path)
+        except BagError as error:
+            if split.closed:
+                faults.append(str(error))
+            return split.closed
+        except OSError as error:
+            faults.append(f"{path}: {error.strerror or error}")
+            return split.closed
+        if not summary.empty:
+            split.start = summary.start
+        self.received.update(topic.topic for topic in summary.topics)
+        self.messages += summary.count
+        return True
+
+
+class SessionState(Enum):
+    """How far a session has come."""
+
+    STARTING = auto()
+    RECORDING = auto()
+    ENDING = auto()
+    ENDED = auto()
+
+
+@dataclass(eq=False, repr=False)
+class RecordingSession:
+    """One recording: its name, its child process and its splits.
+
+    Attributes:
+        is_listed: whether it is in the list of the recorder's own recordings, as a directory.
+        has_recorded: whether its child ever reported that it records.
+        subscribed: the topics that its child reported as subscribed, which does not mean that it
+            receives any of them.
+        of_unknown_type: the topics that its child reported as of an unknown type: one of each type.
+    """
+
+    name: str
+    child: Child
+    splits: Splits
+    began: ClockReading
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self.state = SessionState.STARTING
+        self.is_listed = False
+        self.has_recorded = False
+        self.grew_at = self.began.wall
+        self.subscribed: set[str] = set()
+        self.of_unknown_type: set[str] = set()
+        self._reported: set[tuple[str | None, str]] = set()
+        self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether its child records, and has not been asked to end."""
+        return self.state is SessionState.RECORDING
+
+    @property
+    def last_output(self) -> str:
+        """The last warnings and errors of the child, at most 600 characters.
+
+        Not its INFO lines, nor what it said of a single topic, which is no reason to end.
+        """
+        return " | ".join(self._last_lines)[-600:]
+
+    def age_s(self, now: ClockReading) -> float:
+        """Returns for how long it has lived, in seconds."""
+        return now.monotonic_s - self.began.monotonic_s
+
+    def end(self) -> None:
+        """Asks its child to end. Does nothing the second time."""
+        if self.state in {SessionState.STARTING, SessionState.RECORDING}:
+            self.state = SessionState.ENDING
+            self.child.end()
+
+    def new_lines(self) -> Sequence[Line]:
+        """Returns what the child printed since the last call and is worth reporting.
+
+        Each warning comes once: some recorders repeat one ten times a second for as long as its
+        cause lasts.
+        """
+        lines: list[Line] = []
+        for raw in self.child.take_lines():
+            line = parse_line(raw)
+            if line.text and line.topic is None and "[INFO]" not in raw:
+                self._last_lines.append(line.text)
+            if line.kind is LineKind.READY:
+                if not self.has_recorded:
+                    lines.append(line)
+                self._note_recording()
+            elif line.kind is LineKind.SUBSCRIBED and line.topic is not None:
+                # A child that subscribes records, in whatever words it reports its beginning.
+                self._note_recording()
+                # Its own topic says nothing of whether it hears the robot.
+                if line.topic != MESSAGES_LOST:
+                    self.subscribed.add(line.topic)
+                    lines.append(line)
+            elif line.kind is not LineKind.OTHER and self._is_new(line):
+                if line.kind is LineKind.UNKNOWN_TYPE and line.topic is not None:
+                    self.of_unknown_type.add(line.topic)
+                lines.append(line)
+        return lines
+
+    def silent_topics(self) -> frozenset[str]:
+        """Returns topics subscribed to that no closed split contains; none before the first."""
+        if not self.splits.closed_names:
+            return frozenset()
+        return frozenset(self.subscribed - self.splits.received)
+
+    def _note_recording(self) -> None:
+        self.has_recorded = True
+        if self.state is SessionState.STARTING:
+            self.state = SessionState.RECORDING
+
+    def _is_new(self, line: Line) -> bool:
+        without_numbers = "".join(char for char in line.text if not char.isdigit())
+        key = (line.topic, without_numbers)
+        if key in self._reported or len(self._reported) >= MAX_DISTINCT:
+            return False
+        self._reported.add(key)
+        return True
 
 
 class Required(NamedTuple):
@@ -83,6 +320,7 @@ WHOLE_RECORDING_S: Final = 15.0
 """A recording that lived for less is too short to report topics without messages."""
 
 
+@dataclass(eq=False, repr=False)
 class RecordingSessions:
     """The sessions of one bag directory.
 
@@ -101,18 +339,14 @@ class RecordingSessions:
         grew_s: when a recording last grew by more than its beginning, by that clock.
     """
 
-    def __init__(
-        self,
-        orders: Orders,
-        announce: Callable[[str], None],
-        interrupted: Callable[[Ns, Interruption], None],
-        events: EventLog,
-    ) -> None:
-        self._orders = orders
-        self._bag_dir = orders.bag_dir
-        self._announce = announce
-        self._interrupted = interrupted
-        self._events = events
+    orders: Orders
+    announce: Callable[[str], None]
+    interrupted: Callable[[Ns, Interruption], None]
+    events: EventLog
+
+    def __post_init__(self) -> None:
+        """Sets what is known at the beginning."""
+        self._bag_dir = self.orders.bag_dir
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
         self.running: tuple[RecordingSession, ...] = ()
@@ -158,8 +392,8 @@ class RecordingSessions:
             self._unsettled.append((old.splits.directory, self._bag_dir / name))
             self.settle_handovers()
             raise
-        self.handover = HandoverTransfer(old, new, now, self._orders)
-        self._events.info("rotation_begun", recording=old.name, next=name)
+        self.handover = HandoverTransfer(old, new, now, self.orders)
+        self.events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:
         """Reads what the children printed and wrote; returns whether a split was closed."""
@@ -171,7 +405,7 @@ class RecordingSessions:
             if changes.gone and session.state is not SessionState.ENDING:
                 name = session.name
                 sentence = f"the directory of recording {name} is missing; a new recording starts"
-                self._events.fail("recording_vanished", sentence, recording=name)
+                self.events.fail("recording_vanished", sentence, recording=name)
                 self.restarts += 1
                 self._go_on_without(session)
         if has_closed:
@@ -200,7 +434,7 @@ class RecordingSessions:
             return False
         said = current.last_output or "it prints no reason"
         sentence = f"ros2 bag record does not begin to record: {said}"
-        self._events.fail("recorder_not_ready", sentence, recording=current.name)
+        self.events.fail("recorder_not_ready", sentence, recording=current.name)
         self.restarts += 1
         current.end()
         self.current = None
@@ -221,16 +455,20 @@ class RecordingSessions:
                 continue
             if not is_ending:
                 deaths += 1
-                self._report_death(session, status, now)
+                self._report_output(session)
+                sentence, lived_s = describe_death(status, session.last_output), session.age_s(now)
+                self.events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
+                self.restarts += 1
+                self.interrupted(session.grew_at, "died")
                 self._go_on_without(session)
             elif session.has_recorded and status == -signal.SIGKILL:
                 sentence = (
                     f"the ros2 bag record of {session.name} hung: it did not end when it was asked "
                     "to, and was killed (SIGKILL); what it had not written yet is lost"
                 )
-                self._events.fail("recorder_hung", sentence, recording=session.name)
+                self.events.fail("recorder_hung", sentence, recording=session.name)
                 self.restarts += 1
-                self._interrupted(session.grew_at, "hung")
+                self.interrupted(session.grew_at, "hung")
             self._finalize(session, now)
         if self.running != running:
             self.settle_handovers()
@@ -253,31 +491,31 @@ class RecordingSessions:
         """Ends all sessions, and waits for that within the patience of the children."""
         self.end_all(now)
         for child in end_all([session.child for session in self.running]):
-            self._events.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
+            self.events.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
         self.collect_ended(now)
         self.running = ()
 
     def _launch(self, name: str, now: ClockReading) -> RecordingSession:
-        self._orders.own.begin(name)
-        self._announce(name)
+        self.orders.own.begin(name)
+        self.announce(name)
         directory = self._bag_dir / name
         try:
-            child = self._orders.start_child(name, directory)
+            child = self.orders.start_child(name, directory)
         except OSError as error:
             raise RecorderError(f"ros2 bag record cannot be started: {error}") from error
-        self._events.info("recorder_started", recording=name, pid=child.pid)
-        session = RecordingSession(name, child, Splits(directory, self._orders.reader), now)
+        self.events.info("recorder_started", recording=name, pid=child.pid)
+        session = RecordingSession(name, child, Splits(directory, self.orders.reader), now)
         self.running += (session,)
         return session
 
     def _update_list(self, session: RecordingSession) -> None:
         """Lists the directory that the child made, and its splits; a fault is retried."""
-        with self._events.lasting_if_refused("recording_not_listed", session.name):
-            session.is_listed = session.is_listed or self._orders.own.complete(session.name)
+        with self.events.lasting_if_refused("recording_not_listed", session.name):
+            session.is_listed = session.is_listed or self.orders.own.complete(session.name)
             # Else another disk may lie there.
             if session.is_listed and session.splits.exists:
                 has_ended = session.state is SessionState.ENDED
-                self._orders.own.note(session.name, session.splits.seen, ended=has_ended)
+                self.orders.own.note(session.name, session.splits.seen, ended=has_ended)
 
     def _observe_session(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
         self._report_output(session)
@@ -289,8 +527,8 @@ class RecordingSessions:
             if session.is_recording and session.age_s(now) >= SETTLE_S:
                 self.grew_s = now.monotonic_s
         for name in changes.closed:
-            self._events.info("split_closed", recording=session.name, file=name)
-            self._orders.reception.learn(session.name, session.splits.directory / name)
+            self.events.info("split_closed", recording=session.name, file=name)
+            self.orders.reception.learn(session.name, session.splits.directory / name)
         if changes.closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s
@@ -298,15 +536,15 @@ class RecordingSessions:
         for name in changes.empty:
             file = f"{session.name}/{name}"
             sentence = f"{file} is empty although a newer split was started"
-            self._events.lasting("split_empty", file, sentence, recording=session.name)
+            self.events.lasting("split_empty", file, sentence, recording=session.name)
         for fault in changes.faults:
-            self._events.lasting("unreadable", session.name, fault, recording=session.name)
+            self.events.lasting("unreadable", session.name, fault, recording=session.name)
         return changes
 
     def _report_output(self, session: RecordingSession) -> None:
         lines = session.new_lines()
-        self._events.report_output(session.name, lines)
-        reception = self._orders.reception
+        self.events.report_output(session.name, lines)
+        reception = self.orders.reception
         for line in lines:
             if line.topic is None:
                 continue
@@ -325,14 +563,14 @@ class RecordingSessions:
     ) -> None:
         def flush() -> None:
             for fault in flush_bags(directory, names):
-                self._events.warn("not_flushed", fault, recording=session.name)
+                self.events.warn("not_flushed", fault, recording=session.name)
 
-        self._orders.background.add("flush", flush)
+        self.orders.background.add("flush", flush)
 
     def _take_over(self, handover: HandoverTransfer, now: ClockReading) -> None:
         if handover.missing:
             missing = ", ".join(sorted(handover.missing))
-            self._events.remark(
+            self.events.remark(
                 "rotated_without",
                 f"the new recording does not subscribe to {missing} yet: their publishers have "
                 "gone, or were not discovered in time",
@@ -343,7 +581,7 @@ class RecordingSessions:
         self._unsettled.append(handover.directories)
         handover.old.end()
         self.current, self.handover = handover.new, None
-        self._events.info("rotated", recording=handover.old.name, next=handover.new.name)
+        self.events.info("rotated", recording=handover.old.name, next=handover.new.name)
 
     def _abandon(self, handover: HandoverTransfer) -> None:
         """Ends the new session; the old one continues."""
@@ -385,17 +623,9 @@ class RecordingSessions:
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
             name = old.name
-            with self._events.lasting_if_refused("handover_not_settled", name, recording=name):
-                if settle_handover(old, new, self._orders.reader, running):
+            with self.events.lasting_if_refused("handover_not_settled", name, recording=name):
+                if settle_handover(old, new, self.orders.reader, running):
                     self._unsettled.remove((old, new))
-
-    def _report_death(self, session: RecordingSession, status: int, now: ClockReading) -> None:
-        self._report_output(session)
-        lived_s = session.age_s(now)
-        sentence = describe_death(status, session.last_output)
-        self._events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
-        self.restarts += 1
-        self._interrupted(session.grew_at, "died")
 
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, and makes it durable."""
@@ -407,17 +637,23 @@ class RecordingSessions:
             with self._reporting_failures(session):
                 handover.add_late_splits()
         self._update_list(session)
-        self._events.ended(session.name)
+        self.events.ended(session.name)
         splits = session.splits
         if remove_if_empty(splits.directory):
-            self._events.info("recording_empty", recording=session.name)
+            self.events.info("recording_empty", recording=session.name)
         self._flush_later(session, splits.directory, (METADATA_FILE,))
         self._flush_later(session, self._bag_dir, ())
         self._ended_bytes += splits.bytes_written
         lived_s = session.age_s(now)
-        if lived_s >= WHOLE_RECORDING_S:
-            self._report_silent_topics(session)
-        self._events.info(
+        silent = sorted(session.subscribed - splits.received)
+        if silent and lived_s >= WHOLE_RECORDING_S:
+            sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
+            if not splits.received:
+                topics = counted(len(silent), "topic")
+                sentence = f"subscribed to {topics} and received nothing from any of them; "
+                sentence += self.orders.advice()
+            self.events.warn("topics_silent", sentence, recording=session.name)
+        self.events.info(
             "recording_ended",
             recording=session.name,
             splits=len(splits.closed_names),
@@ -426,21 +662,10 @@ class RecordingSessions:
             lived_s=round(lived_s, 3),
         )
 
-    def _report_silent_topics(self, session: RecordingSession) -> None:
-        silent = sorted(session.subscribed - session.splits.received)
-        if not silent:
-            return
-        sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
-        if not session.splits.received:
-            topics = counted(len(silent), "topic")
-            sentence = f"subscribed to {topics} and received nothing from any of them; "
-            sentence += self._orders.advice()
-        self._events.warn("topics_silent", sentence, recording=session.name)
-
     @contextmanager
     def _reporting_failures(self, session: RecordingSession) -> Iterator[None]:
         """Reports an error of the handover from this session, and continues after the block."""
         try:
             yield
         except (RecorderError, OSError) as error:
-            self._events.fail("rotation_failed", str(error), recording=session.name)
+            self.events.fail("rotation_failed", str(error), recording=session.name)

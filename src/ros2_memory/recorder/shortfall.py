@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.session import RecordingSession
-    from ros2_memory.recorder.sessions import Orders, RecordingSessions
+    from ros2_memory.recorder.sessions import Orders, RecordingSession, RecordingSessions
 
 UNHEARD_S: Final = 30.0
 """A topic that is offered for so long, and of which nothing came, is not recorded."""

@@ -277,9 +277,8 @@ class TopicThinning:
         named: list[dict[Name, Scored]] = [{} for _ in range(len(table))]
         counts = Counter[tuple[int, str]]()
         for row, label, score in labels:
-            first = named[row].get((label, 0))
             scored = _stepped(score)
-            named[row][label, 0] = scored if first is None else max(first, scored)
+            named[row][label, 0] = max(scored, named[row].get((label, 0), scored))
             if repeat := counts[row, label]:
                 named[row][label, repeat] = _UNSCORED
             counts[row, label] += 1
@@ -370,13 +369,10 @@ class TopicThinning:
 
 def is_sampled(table: Table) -> bool:
     """Returns whether messages have a long array of numbers, other than a covariance."""
-    lengths = (
-        column
+    return any(
+        not isinstance(column, Texts) and column.size and column.max() > _LONG
         for path, column in table.columns.items()
         if path.endswith(".length") and "covariance" not in path
-    )
-    return any(
-        not isinstance(column, Texts) and column.size and column.max() > _LONG for column in lengths
     )
 
 

@@ -26,15 +26,6 @@ pytestmark = pytest.mark.usefixtures("no_flushing")
 
 
 class TestStart:
-    def test_it_records_once_the_recorder_reports_it(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started()
-        assert world.heartbeat()["state"] == "starting"
-        world.run(3)
-        assert world.supervisor.is_recording
-        beat = world.heartbeat()
-        assert beat["state"] == "recording"
-        assert beat["subscribed"] == ["/bumper", "/door"]
-
     def test_one_whose_words_for_it_are_not_known_records_once_it_subscribes(
         self, tmp_path: Path
     ) -> None:
@@ -58,19 +49,6 @@ class TestStart:
 
 
 class TestRotation:
-    @pytest.mark.parametrize(("age_s", "recordings"), [(599.9, 1), (600.0, 2)])
-    def test_a_session_is_over_when_it_has_lasted_for_its_duration(
-        self, tmp_path: Path, age_s: float, recordings: int
-    ) -> None:
-        # Splits so long that a jump in time is no silence.
-        world = World(tmp_path, split_duration_s=600, session_duration_s=600)
-        began_s = world.mono
-        world.started(5)
-        world.wall += round((began_s + age_s - world.mono) * NS_PER_S)
-        world.mono = began_s + age_s
-        world.supervisor.tick()
-        assert len(world.recorders) == recordings
-
     def test_a_topic_that_appears_while_both_record_is_waited_for_again(
         self, tmp_path: Path
     ) -> None:
@@ -507,13 +485,6 @@ class TestShortfall:
         world.running[-1].heard = ("/door",)
         world.run(30)
         assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
-
-    def test_a_child_that_lives_and_writes_nothing_is_replaced_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path, defaults={"deaf": True}).started(10)
-        world.defaults["deaf"] = False
-        world.run(40)
-        assert [each.deaf for each in world.running] == [False]
-        assert world.heartbeat()["state"] == "recording"
 
     def test_a_robot_that_says_nothing_is_not_asked_again_and_again(self, tmp_path: Path) -> None:
         world = World(tmp_path, silent=True).started(300)

@@ -24,18 +24,6 @@ def asked(
     return is_synchronised()
 
 
-@pytest.mark.parametrize(("answer", "expected"), [("yes", True), ("no", False)])
-@pytest.mark.parametrize("error_us", [DISCIPLINED, UNDISCIPLINED, None])
-def test_timedated_is_believed_before_the_kernel(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    answer: str,
-    error_us: int | None,
-    expected: bool,
-) -> None:
-    assert asked(monkeypatch, tmp_path, f"echo {answer}", error_us) is expected
-
-
 def test_it_is_asked_for_the_one_property_and_inherits_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -46,21 +34,23 @@ def test_it_is_asked_for_the_one_property_and_inherits_nothing(
     assert "secret" not in heard.read_text()
 
 
+@pytest.mark.parametrize("error_us", [DISCIPLINED, UNDISCIPLINED, None])
 @pytest.mark.parametrize(
-    "script",
-    ["exit 1", "echo yes; exit 1", "echo perhaps", "true", "kill -9 $$"],
-    ids=["fails", "fails after all", "says something else", "says nothing", "is killed"],
+    ("script", "timedated"),
+    [
+        ("echo yes", True),
+        ("echo no", False),
+        *((script, None) for script in ("exit 1", "echo yes; exit 1", "true", "kill -9 $$")),
+    ],
 )
-@pytest.mark.parametrize(
-    ("error_us", "expected"), [(DISCIPLINED, True), (UNDISCIPLINED, False), (None, False)]
-)
-def test_where_timedated_cannot_say_the_kernel_does(
+def test_timedated_is_believed_before_the_kernel_which_is_asked_where_it_cannot_say(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     script: str,
+    timedated: bool | None,
     error_us: int | None,
-    expected: bool,
 ) -> None:
+    expected = error_us == DISCIPLINED if timedated is None else timedated
     assert asked(monkeypatch, tmp_path, script, error_us) is expected
 
 

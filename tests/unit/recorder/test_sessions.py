@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.recorder.session import SplitChanges, Splits
+from ros2_memory.recorder.sessions import SplitChanges, Splits
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import boolean, write_mcap
 
