@@ -370,7 +370,7 @@ def _events_of(tree: ast.AST) -> Iterator[Event]:
 def _is_log(node: ast.AST) -> bool:
     name = node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
     is_own_method = name == "self"  # of EventLog
-    return name in {"log", "_log", "_events"} or is_own_method
+    return name in {"log", "_log", "events", "_events"} or is_own_method
 
 
 def event_list(page: str) -> str:

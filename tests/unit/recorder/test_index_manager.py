@@ -15,7 +15,7 @@ from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
-from tests.support.plain_text_bags import PlainReader, plain
+from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -81,6 +81,18 @@ def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yar
     assert snapshot.silent_topics == {"/lost", "/idle"}
 
 
+def test_the_active_bag_stays_out_until_it_is_closed_in_place(yard: Yard) -> None:
+    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
+    yard.age(NOW - 5 * S)
+    assert _names(yard.scan_after().active) == ["rec_0.mcap"]
+    grow(path, 2, 3)
+    close(path)
+    yard.age(NOW - 5 * S)  # no name came or went
+    snapshot = yard.scan_after(1)
+    assert snapshot.active == ()
+    assert [(bag.start, bag.end) for bag in snapshot.bags] == [(1, 3)]
+
+
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
     for split in range(3):
         plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
@@ -92,6 +104,40 @@ def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
         assert len(yard.scan_after(10).bags) == 4
     assert yard.reader.summaries == {f"rec_{split}.mcap": 1 for split in range(4)}
     assert yard.reader.closings == yard.reader.summaries
+
+
+@pytest.mark.parametrize(
+    ("plain_closed", "packed_closed", "answers"),
+    [
+        (True, False, "rec_0.mcap"),
+        (False, True, "rec_0.mcap.zstd"),
+        (False, False, "rec_0.mcap"),
+    ],
+)
+def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
+    tmp_path: Path, plain_closed: bool, packed_closed: bool, answers: str
+) -> None:
+    yard = Yard(tmp_path, ".mcap", ".mcap.zstd")
+    plain(tmp_path / "rec_0.mcap", [1, 2], closed=plain_closed)
+    plain(tmp_path / "rec_0.mcap.zstd", [1, 2], closed=packed_closed)
+    yard.age()
+    snapshot = yard.scan_after()
+    assert _names(snapshot.bags) == [answers]
+    assert snapshot.active == snapshot.damaged == snapshot.unread == ()
+
+
+def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_other(
+    tmp_path: Path,
+) -> None:
+    yard = Yard(tmp_path, ".mcap")
+    plain(tmp_path / "rec_0.mcap", [1])
+    plain(tmp_path / "rec_1.mcap.zstd", [1])
+    yard.age()
+    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1]), ns=(NOW, NOW))
+    snapshot = yard.scan_after()
+    assert _names(snapshot.bags) == ["rec_0.mcap"]
+    assert _names(snapshot.unread) == ["rec_1.mcap.zstd"]
+    assert _names(yard.scan_after(31).unread) == ["rec_0.mcap.zstd", "rec_1.mcap.zstd"]
 
 
 def test_a_snapshot_is_kept_until_it_is_older_than_refresh_s(yard: Yard) -> None:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
+from ros2_memory.core.spans import lies_inside, united, without
 from ros2_memory.triggers.screening import (
     Cut,
     ExclusionRule,
@@ -209,6 +210,18 @@ def test_latched_messages_go_by_when_they_were_published() -> None:
 SPANS = st.lists(
     st.tuples(st.integers(0, 30), st.integers(1, 8)).map(lambda each: (each[0], sum(each)))
 )
+
+
+@given(SPANS, SPANS)
+def test_spans_are_sets_of_moments(
+    spans: list[tuple[int, int]], others: list[tuple[int, int]]
+) -> None:
+    def moments(of: Sequence[tuple[int, int]]) -> set[int]:
+        return {at for start, stop in of for at in range(start, stop)}
+
+    one, other = united(spans), united(others)
+    assert moments(one) == moments(spans) == {at for at in range(50) if lies_inside(one, at)}
+    assert moments(without(one, other)) == moments(spans) - moments(others)
 
 
 def test_what_was_excluded_is_joined_over_splits() -> None:
