@@ -87,34 +87,15 @@ def _in_config_dir(path: Path, info: ValidationInfo[Sequence[Path]]) -> Path:
     return next((file for file in files if file.is_file()), files[-1])
 
 
-def _below(name: str) -> str:
-    if name.startswith("/") or ".." in name.split("/") or not name.strip("/. "):
-        raise ValueError("must be a path below recording.bag_dir, such as rec_20261120T043000Z")
-    return name
+def _written_as(pattern: str, what: str) -> AfterValidator:
+    """Returns the check that a whole text matches a pattern; `what` says what it must be."""
 
+    def checked(text: str) -> str:
+        if not re.fullmatch(pattern, text, re.DOTALL):
+            raise ValueError(f"must {what}")
+        return text
 
-def _message_type(name: str) -> str:
-    if not re.fullmatch(r"\w+/msg/\w+", name):
-        raise ValueError("must be a message type such as nav_msgs/msg/Odometry")
-    return name
-
-
-def _one_topic(name: str) -> str:
-    if any(mark in name for mark in "*?["):
-        raise ValueError("must name one topic; make a rule for each")
-    return name
-
-
-def _topic_glob(glob: str) -> str:
-    if not glob.startswith(("/", "*")):
-        raise ValueError("must be a topic's name or a glob of such: it begins with / or *")
-    return glob
-
-
-def _dot_path(path: str) -> str:
-    if not re.fullmatch(r"\w+(\.\w+)*", path):
-        raise ValueError("must be a dot-path such as pose.pose.position")
-    return path
+    return AfterValidator(checked)
 
 
 def is_robot_name(name: str) -> bool:
@@ -206,10 +187,22 @@ Span: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=3600)]
 AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
 Folder: TypeAlias = Annotated[AnyPath, PathType("dir")]
 ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
-MessageType: TypeAlias = Annotated[Text, AfterValidator(_message_type)]
-BelowBagDir: TypeAlias = Annotated[Text, AfterValidator(_below)]
-TopicGlob: TypeAlias = Annotated[Text, AfterValidator(_topic_glob)]
-DotPath: TypeAlias = Annotated[Text, AfterValidator(_dot_path)]
+MessageType: TypeAlias = Annotated[
+    Text, _written_as(r"\w+/msg/\w+", "be a message type such as nav_msgs/msg/Odometry")
+]
+BelowBagDir: TypeAlias = Annotated[
+    Text,
+    _written_as(
+        r"(?!/|(.*/)?\.\.(/|$)).*[^/. ].*",
+        "be a path below recording.bag_dir, such as rec_20261120T043000Z",
+    ),
+]
+TopicGlob: TypeAlias = Annotated[
+    Text, _written_as("[/*].*", "be a topic's name or a glob of such: it begins with / or *")
+]
+DotPath: TypeAlias = Annotated[
+    Text, _written_as(r"\w+(\.\w+)*", "be a dot-path such as pose.pose.position")
+]
 RobotName: TypeAlias = Annotated[Text, AfterValidator(_robot_name)]
 
 
@@ -617,7 +610,7 @@ class ExcludeRule:
     `on_unknown`: what becomes of a time in which it is not known whether the condition holds.
     """
 
-    topic: Annotated[Text, AfterValidator(_one_topic)]
+    topic: Annotated[Text, _written_as(r"[^*?\[]*", "name one topic; make a rule for each")]
     condition_type: Text
     value: bool | int | float | str | dict[str, float]
     field: Text | None = None

@@ -9,6 +9,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
@@ -84,10 +85,6 @@ plot = typer.Typer(
     rich_markup_mode=None,
 )
 
-Out = Annotated[
-    Path, "--out", "-o", "FILE", "Write the picture here: .svg, .png or .pdf; overwrites the file."
-]
-
 
 class Asked(NamedTuple):
     """What all pictures are asked for: a window in a memory."""
@@ -122,20 +119,78 @@ class Asked(NamedTuple):
         return path.frame, line
 
 
+@dataclass(frozen=True, kw_only=True)
+class Picture(Bags, Times):
+    """The options of a picture."""
+
+    out: Annotated[
+        Path,
+        "--out",
+        "-o",
+        "FILE",
+        "Write the picture here: .svg, .png or .pdf; overwrites the file.",
+    ]
+    as_json: AsJson = False
+
+    def asked(self, *, day: bool = False) -> Asked:
+        """Returns what is asked for; without times all, or the newest `day`.
+
+        Raises:
+            ConfigError: the optional dependency is missing.
+            InvalidArgumentsError: the file's name has a suffix of no picture.
+            NoDataError: nothing was recorded in that time.
+        """
+        require_extra("plot", "plot", "matplotlib")
+        if self.out.suffix.lower() not in FORMATS:
+            raise InvalidArgumentsError(
+                f"--out {self.out} is not a picture: its name must end in {', '.join(FORMATS)}"
+            )
+        memory = self.memory()
+        is_day = day and (self.start, self.end, self.last) == (None, None, None)
+        return asked_in(memory, newest_day(memory) if is_day else self.window(memory))
+
+    @contextmanager
+    def drawn(self, title: str, size: Seconds, notes: Sequence[str]) -> Iterator["Figure"]:
+        """Yields a figure, writes what the block has drawn, and prints the file and the notes.
+
+        `size` is its width and height in inches.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        # It warns of fonts, of its own limits, and where it finds no place for its list of fonts.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
+        from matplotlib import rc_context  # noqa: PLC0415 - an extra that few install
+        from matplotlib.figure import Figure  # noqa: PLC0415
+
+        kind = self.out.suffix[1:].lower()
+        with rc_context(_STYLE), warnings.catch_warnings(), made_whole(self.out) as temporary:
+            warnings.simplefilter("ignore")  # on letters that no font here has
+            figure = Figure(figsize=size, layout="constrained")
+            figure.suptitle(title, x=0.01, ha="left")
+            yield figure
+            metadata = {"Date": None} if kind == "svg" else None
+            figure.savefig(temporary, format=kind, dpi=130, metadata=metadata)
+        if self.as_json:
+            print_json({"path": str(self.out), "notes": [*notes]})
+        else:
+            print_line(str(self.out))
+            print_notes(notes)
+
+
 @plot.command("path", epilog=epilog("plot"))
 @as_command("plot path")
-def plot_path(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags) -> None:
+def plot_path(*, picture: Picture) -> None:
     """Draw the driven path in 2D, coloured by time, with named places and standstills.
 
     Another topic of poses is chosen by data.pose_topic=TOPIC, a frame by data.map_frame=FRAME.
     """
-    asked = _asked(out, bags, times)
+    asked = picture.asked()
     with spinner("looking for the path"):
         frame, line = asked.path()
         happened = asked.recap()
-    with _picture(out, f"Path, {asked.title}", (8.5, 7.0)) as figure:
+    with picture.drawn(f"Path, {asked.title}", (8.5, 7.0), happened.notes) as figure:
         _draw_path(figure.add_subplot(), asked, frame, line, happened)
-    _finish(out, happened.notes, as_json=as_json)
 
 
 @plot.command("signal", epilog=epilog("plot"))
@@ -145,88 +200,59 @@ def plot_signal(
         str, typer.Argument(metavar="TOPIC", help="The name of the topic, such as /battery.")
     ],
     *,
-    out: Out,
     field: Annotated[
         list[str] | None, "PATH", "A numeric field; repeatable (default: all that change)."
     ] = None,
-    times: Times,
-    as_json: AsJson = False,
-    bags: Bags,
+    picture: Picture,
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
-    asked = _asked(out, bags, times)
+    asked = picture.asked()
     name = resolve_topic(asked.view, topic)
     with spinner(f"reading {name}"):
         signals, notes = signals_of(asked, name, field or ())
-    with _picture(out, f"{name}, {asked.title}", (10.0, 1.2 + 1.9 * len(signals))) as figure:
+    size = (10.0, 1.2 + 1.9 * len(signals))
+    with picture.drawn(f"{name}, {asked.title}", size, notes) as figure:
         rows = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
         for axes, (field_name, (at, values)) in zip(rows, signals.items(), strict=True):
             axes.plot(at / _DAY_S, values, linewidth=1.1, marker="." if len(at) < 60 else "")
             axes.set_title(field_name)
         _label_times(rows[-1].xaxis, *asked.span)
-    _finish(out, notes, as_json=as_json)
 
 
 @plot.command("timeline", epilog=epilog("plot"))
 @as_command("plot timeline")
-def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags) -> None:
+def plot_timeline(*, picture: Picture) -> None:
     """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
-    asked = _asked(out, bags, times)
+    asked = picture.asked()
     with spinner("looking what was recorded when"):
         happened = asked.recap()
         rows = event_rows(asked, happened) | topic_rows(asked)
     notes = [*happened.notes]
     if (left_out := len(asked.view.timeline.topics()) - _MOST_TOPICS) > 0:
         notes.append(f"{counted(left_out, 'topic')} with the fewest messages left out")
-    with _picture(out, f"Recorded, {asked.title}", (11.0, 1.3 + 0.27 * len(rows))) as figure:
+    with picture.drawn(f"Recorded, {asked.title}", (11.0, 1.3 + 0.27 * len(rows)), notes) as figure:
         _draw_rows(figure.add_subplot(), rows, asked.span)
-    _finish(out, notes, as_json=as_json)
 
 
 @plot.command("recap", epilog=epilog("plot"))
 @as_command("plot recap")
-def plot_recap(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags) -> None:
+def plot_recap(*, picture: Picture) -> None:
     """Draw a day in one picture: where the robot drove, what happened, what was recorded.
 
     Without a time it is the newest day; --start yesterday --end yesterday is the one before today.
     """
-    asked = _asked(out, bags, times, day=True)
+    asked = picture.asked(day=True)
     with spinner("recalling the day"):
         happened = asked.recap()
         rows = event_rows(asked, happened)
     height = 0.35 + 0.3 * len(rows)
-    with _picture(out, f"Recap, {asked.title}", (9.0, 6.0 + height)) as figure:
+    with picture.drawn(f"Recap, {asked.title}", (9.0, 6.0 + height), happened.notes) as figure:
         plane, timeline = figure.subplots(2, 1, height_ratios=[6.0, height])
         plane.set_axis_off()
         with suppress(InvalidArgumentsError, NoDataError):  # the page says why there is none
             _draw_path(plane, asked, *asked.path(), happened)
             plane.set_axis_on()
         _draw_rows(timeline, rows, asked.span)
-    _finish(out, happened.notes, as_json=as_json)
-
-
-@contextmanager
-def _picture(out: Path, title: str, size: Seconds) -> Iterator["Figure"]:
-    """Yields a figure, and writes what the block has drawn in the format that the suffix names.
-
-    `size` is its width and height in inches.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    # It warns of fonts, of its own limits, and where it finds no place for its list of fonts.
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    from matplotlib import rc_context  # noqa: PLC0415 - an extra that few install
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    with rc_context(_STYLE), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on letters that no font here has
-        figure = Figure(figsize=size, layout="constrained")
-        figure.suptitle(title, x=0.01, ha="left")
-        yield figure
-        metadata = {"Date": None} if out.suffix.lower() == ".svg" else None
-        with made_whole(out) as temporary:
-            figure.savefig(temporary, format=out.suffix[1:].lower(), dpi=130, metadata=metadata)
 
 
 def _draw_path(axes: "Axes", asked: Asked, frame: str, line: Line, happened: Recap) -> None:
@@ -278,31 +304,6 @@ def _label_times(axis: "Axis", start: float, end: float) -> None:
     axis.set_major_locator(AutoDateLocator(tz=zone, maxticks=8))
     form = "%H:%M:%S" if end - start < _DAY_S else "%d %b %H:%M"
     axis.set_major_formatter(DateFormatter(form, tz=zone))
-
-
-def _asked(out: Path, bags: Bags, times: Times, *, day: bool = False) -> Asked:
-    """Returns what is asked for, where it can be drawn; without times all, or the newest `day`.
-
-    Raises:
-        ConfigError: the optional dependency is missing.
-        InvalidArgumentsError: the name has a suffix of no picture.
-        NoDataError: nothing was recorded in that time.
-    """
-    require_extra("plot", "plot", "matplotlib")
-    if out.suffix.lower() not in FORMATS:
-        kinds = ", ".join(FORMATS)
-        raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")
-    memory = bags.memory()
-    is_day = day and times == Times()
-    return asked_in(memory, newest_day(memory) if is_day else times.window(memory))
-
-
-def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:
-    if as_json:
-        print_json({"path": str(out), "notes": [*notes]})
-    else:
-        print_line(str(out))
-        print_notes(notes)
 
 
 def asked_in(memory: Memory, window: TimeWindow) -> Asked:

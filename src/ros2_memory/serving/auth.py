@@ -209,37 +209,32 @@ class ForgeryGuard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles an ASGI connection."""
+        app = self._app
         if scope["type"] == "http":
-            refusal = self._refusal(scope)
-            if refusal is not None:
-                await refusal(scope, receive, send)
-                return
-            if self._admits:
+            if refusal := self._refusal(scope):
+                reason, status, sentence = refusal
+                if refused := self._refusals.count(reason):
+                    log.warning("request_refused", reason=reason, refused=refused)
+                app = PlainTextResponse(f"{sentence}\n", status)
+            elif self._admits:
                 admit(scope)
-        await self._app(scope, receive, send)
+        await app(scope, receive, send)
 
-    def _refusal(self, scope: Scope) -> PlainTextResponse | None:
+    def _refusal(self, scope: Scope) -> tuple[str, int, str] | None:
+        """Returns why a request is refused, for the log, with the status and the reply."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         name = _host_name(host)
         if name not in self._names and not (self._is_reachable and _is_address(name)):
-            self._log_refused("the host name of another site")
-            return PlainTextResponse(
-                "Host is not a name of this server; use its address instead.\n", status_code=421
-            )
+            reply = "Host is not a name of this server; use its address instead."
+            return "the host name of another site", 421, reply
         same = {f"http://{host}".lower(), f"https://{host}".lower()}
         if any(origin.lower() not in same for origin in headers.getlist("origin")):
-            self._log_refused("the origin of another site")
-            return PlainTextResponse("Origin is another site.\n", status_code=403)
+            return "the origin of another site", 403, "Origin is another site."
         is_same_site = _SAME_SITE.issuperset(headers.getlist("sec-fetch-site"))
         if not is_same_site and not _is_visit(scope, headers):
-            self._log_refused("a request from another site")
-            return PlainTextResponse("Sec-Fetch-Site is another site.\n", status_code=403)
+            return "a request from another site", 403, "Sec-Fetch-Site is another site."
         return None
-
-    def _log_refused(self, reason: str) -> None:
-        if refused := self._refusals.count(reason):
-            log.warning("request_refused", reason=reason, refused=refused)
 
 
 def _is_visit(scope: Scope, headers: Headers) -> bool:
@@ -279,19 +274,19 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
     Raises:
         ConfigError: it cannot be read, is given twice, or cannot be sent in a header.
     """
-    files: dict[str, Path] = {}
-    if env.get(FILE_VARIABLE):
-        files[FILE_VARIABLE] = Path(env[FILE_VARIABLE])
+    given: dict[str, str | Path] = {}
+    if text := env.get(VARIABLE):
+        given[VARIABLE] = text
+    if file := env.get(FILE_VARIABLE):
+        given[FILE_VARIABLE] = Path(file)
     credentials = env.get("CREDENTIALS_DIRECTORY")
-    if credentials and (Path(credentials) / CREDENTIAL).exists():
-        files[f"the credential {CREDENTIAL}"] = Path(credentials) / CREDENTIAL
-    given = [*([VARIABLE] if env.get(VARIABLE) else []), *files]
-    if not given:
-        return None
+    if credentials and (path := Path(credentials) / CREDENTIAL).exists():
+        given[f"the credential {CREDENTIAL}"] = path
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} both give the API token; leave one of them")
-    source = given[0]
-    return SecretStr(_usable(files.get(source) or env[VARIABLE], source))
+    for source, token in given.items():
+        return SecretStr(_usable(token, source))
+    return None
 
 
 def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[str]]:

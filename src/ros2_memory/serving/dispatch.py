@@ -181,9 +181,8 @@ class Dispatcher:
                     outcome, reply = await self._outcome(
                         tools, name, given, call, client, part=part
                     )
-                except Exception:
-                    log.exception("tool_failed")
-                    outcome, reply = self._internal()
+                except Exception as error:  # noqa: BLE001 - it is logged there
+                    outcome, reply = self._failed(error)
                 text = reply.text
             finally:
                 done = Answered(
@@ -268,31 +267,28 @@ class Dispatcher:
         *,
         part: Callable[[], Memory] | None,
     ) -> tuple[str, Reply]:
-        try:
-            tool = _named(name, tools)
-            if part is not None and tool.writes:
-                raise InvalidArgumentsError(f"{name} writes, and is not asked of one recording")
-            if excess := excess_in_arguments(given):
-                raise InvalidArgumentsError(excess)
-            question = tool.question(given)
+        tool = _named(name, tools)
+        if part is not None and tool.writes:
+            raise InvalidArgumentsError(f"{name} writes, and is not asked of one recording")
+        if excess := excess_in_arguments(given):
+            raise InvalidArgumentsError(excess)
+        question = tool.question(given)
 
-            def answer() -> Reply:
-                memory = self.memory if part is None else part()
-                try:
-                    result = question(memory, call)
-                except GoneError:  # the store has changed since, and is looked at anew
-                    result = question(memory, call)
-                return self._replies.answer(
-                    result,
-                    from_active=call.used_active,
-                    from_memory=call.used_thinned,
-                    now=call.now,
-                )
+        def answer() -> Reply:
+            memory = self.memory if part is None else part()
+            try:
+                result = question(memory, call)
+            except GoneError:  # the store has changed since, and is looked at anew
+                result = question(memory, call)
+            return self._replies.answer(
+                result,
+                from_active=call.used_active,
+                from_memory=call.used_thinned,
+                now=call.now,
+            )
 
-            queue = self.blocking if tool.blocking else self.quick
-            return await self._in_turn(name, queue, client, call, answer)
-        except EpisodicError as error:
-            return error.code, self._replies.error(error)
+        queue = self.blocking if tool.blocking else self.quick
+        return await self._in_turn(name, queue, client, call, answer)
 
     async def _in_turn(
         self, name: str, queue: FairQueue, client: Hashable, call: Call, answer: Callable[[], Reply]
@@ -332,24 +328,26 @@ class Dispatcher:
                 try:
                     return "ok", answer()
                 except QueryTimeoutError as error:
-                    late = QueryTimeoutError(
-                        f"{error}{_with_wait(waited_s)}", error.searched_back_to
-                    )
-                    failure = BusyError(STOPPING) if self._stopping.is_set() else late
-                    return failure.code, self._replies.error(failure)
-                except EpisodicError as error:
-                    reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
-                    return f"{error.code}{reason}", self._replies.error(error)
-                except Exception:
+                    if self._stopping.is_set():
+                        return self._failed(BusyError(STOPPING))
+                    late = f"{error}{_with_wait(waited_s)}"
+                    return self._failed(QueryTimeoutError(late, error.searched_back_to))
+                except Exception as error:  # noqa: BLE001 - it is logged there
                     # Caught here too, because nobody may be waiting for this thread any more.
-                    log.exception("tool_failed")
-                    return self._internal()
+                    return self._failed(error)
         finally:
             if time.monotonic() - begun > _LONG_S:
                 return_free_memory()
 
-    def _internal(self) -> tuple[str, Reply]:
-        """Returns the reply to a call that failed through a fault of this program."""
+    def _failed(self, error: Exception) -> tuple[str, Reply]:
+        """Returns the outcome and the reply of a call that an error ended.
+
+        One that is no domain error is a fault of this program, and is logged.
+        """
+        if isinstance(error, EpisodicError):
+            reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
+            return f"{error.code}{reason}", self._replies.error(error)
+        log.error("tool_failed", exc_info=error)
         context = structlog.contextvars.get_contextvars()
         return "internal", self._replies.internal(str(context.get("correlation_id")))
 
