@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.bootstrap import query_settings_of
 from ros2_memory.config import (
     Settings,
     exit_on_config_error,
@@ -132,15 +131,6 @@ class TestEnvironment:
 
 
 class TestPrecedence:
-    def test_the_overrides_variable_beats_a_named_one_and_a_presets_adapter(self) -> None:
-        env = {
-            "MEMORY_DEPLOYMENT": "replay",
-            "MCP_PORT": "1",
-            "MEMORY_CONFIG_OVERRIDES": "server.port=2 storage=mcap",
-        }
-        settings = load_settings((), env)
-        assert (settings.server.port, settings.storage.target) == (2, MCAP)
-
     def test_the_command_line_beats_all(self) -> None:
         env = {
             "MEMORY_DEPLOYMENT": "robot",
@@ -252,9 +242,6 @@ class TestAdapters:
         assert message.startswith(f"storage._target_: {target!r} is not allowed")
         assert f"{MCAP}, {ROSBAG2}" in message
 
-    def test_an_adapter_of_the_other_port_is_refused(self) -> None:
-        assert f"{ROS2BAG}, {NONE}" in refusal(f"recorder._target_={MCAP}")
-
     def test_an_argument_that_it_does_not_take_is_refused(self) -> None:
         said = refusal("storage.unpack_max_mb=3")
         assert said.startswith("storage.unpack_max_mb: unknown key; use one of: _target_ (")
@@ -272,29 +259,22 @@ class TestRefusals:
             ("server=3", ["server: 3 is not allowed", "must hold keys"]),
             ("data.now=walls", ["data.now: 'walls'", "wall, latest"]),
             ("recording.split_duration_s=-10", ["recording.split_duration_s: -10", "than 0"]),
-            ("recording.split_duration_s=2.5", ["2.5", "must be a whole number"]),
             ("recording.clear_on_startup=perhaps", ["'perhaps'", "boolean"]),
             ("recording.bag_dir=''", ["recording.bag_dir: ''", "must name a path"]),
-            ("recording.bag_dir=7", ["recording.bag_dir: 7", "must be a path"]),
             ("recording.bag_dir='~nobody-here/x'", ["recording.bag_dir", "can be found"]),
             ("data.time_tolerance_s=true", ["data.time_tolerance_s: True", "valid number"]),
-            ("data.time_tolerance_s=-0.1", ["-0.1", "greater than or equal to 0"]),
             ("data.max_plausible_speed_mps=nan", ["nan", "finite"]),
             ("data.pose_topic=''", ["data.pose_topic: ''", "must not be empty"]),
             ("data.tf_topics=/tf", ["data.tf_topics: '/tf'", "must be a list"]),
-            ("data.tf_topics=[1]", ["data.tf_topics.0: 1", "valid string"]),
             ("retention.max_total_gb='2GB'", ["'2GB'", "must be a number in GB, such as 2"]),
             ("recorder.setup_files=[/a", ["is not a setting", "needs quotes as a whole"]),
             ("server.max_reply_chars=10", ["server.max_reply_chars: 10", "1000"]),
             ("data.now=${nothing}", ["data.now: ", "'nothing' not found"]),
             ("server.host=${oc.env:NO_SUCH_VARIABLE}", ["server.host: ", "NO_SUCH_VARIABLE"]),
-            ("data.now=???", ["data.now: ", "issing"]),
             ("storage=parquet", ["storage: 'parquet'", "mcap, rosbag2"]),
-            ("storage=null", ["storage: None", "mcap, rosbag2"]),
             ("storage=[mcap,rosbag2]", ["storage: ['mcap', 'rosbag2']", "mcap, rosbag2"]),
             ("server.port", ["'server.port' is not a setting", "key=value"]),
             ("/bags/monday", ["is not a setting", "recording.bag_dir=/bags/monday"]),
-            ("data.now='wall", ["is not a setting", "key=value"]),
             ("=3", ["'=3' is not one value for one key"]),
             ("data.now=wall,latest", ["is not one value for one key", "key=[a,b]"]),
         ],
@@ -404,14 +384,6 @@ class TestLabels:
             "mug": ("coffee mug", "Mug"),
             "remote control": ("tv-remote",),
         }
-
-    def test_reach_the_queries(self, tmp_path: Path) -> None:
-        path = tmp_path / "labels.yaml"
-        path.write_text("labels: {mug: [coffee mug]}")
-        settings = load_settings([f"data.labels_file='{path}'", "data.min_score=0.3"], {})
-        limits = query_settings_of(settings)
-        assert limits.labels == {"mug": ("coffee mug",)}
-        assert limits.min_score == 0.3
 
     @pytest.mark.parametrize(
         ("text", "fragment"),

@@ -347,7 +347,7 @@ class Dispatcher:
         if isinstance(error, EpisodicError):
             reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
             return f"{error.code}{reason}", self._replies.error(error)
-        log.error("tool_failed", exc_info=error)
+        log.error("tool_failed", exc_info=True)  # noqa: LOG014 - its callers caught it
         context = structlog.contextvars.get_contextvars()
         return "internal", self._replies.internal(str(context.get("correlation_id")))
 

@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
-from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
     from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
@@ -309,30 +307,6 @@ class TestCat:
 @given(st.integers(946_684_800_000_000, 4_102_444_800_000_000))
 def test_a_time_that_is_printed_is_read_back_to_the_microsecond(us: int) -> None:
     assert round(parse_time(format_time(us / 1e6), 0.0) * 1e6) == us
-
-
-def test_times_and_durations_of_tools_may_be_words() -> None:
-    known: dict[str, JsonObject] = {
-        "start": {"type": ["number", "string"]},
-        "timestamps": {"type": "array", "items": {"type": ["number", "string"]}},
-        "seconds": {"type": "number"},
-        "topic": {"type": "string"},
-    }
-    given_words = {
-        "start": "10m",
-        "timestamps": ["1s", "1 hour ago"],
-        "seconds": "2h",
-        "topic": "3d",
-    }
-    assert with_times(given_words, known, 1_700_000_000.0) == {
-        "start": 1_700_000_000.0 - 600,
-        "timestamps": [1_699_999_999.0, 1_700_000_000.0 - 3600],
-        "seconds": 7200.0,
-        "topic": "3d",
-    }
-    assert with_times({"seconds": "0s", "start": 5}, known, 0.0) == {"seconds": 0.0, "start": 5}
-    with pytest.raises(InvalidArgumentsError, match="'soon' is not a time"):
-        with_times({"start": "soon"}, known, 1_700_000_000.0)
 
 
 @pytest.mark.usefixtures("folder")

@@ -2,37 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.demo.questions import QUESTIONS, Exchange
-from ros2_memory.demo.run import format_exchange, run_demo
-
-REPLY = json.dumps(
-    {"samples": [{"timestamp": 1_800_000_000.25 + k, "value": "in the hall"} for k in range(40)]},
-    separators=(",", ":"),
-)
-
-
-def test_the_call_is_shown_as_it_was_made() -> None:
-    question = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
-    lines = format_exchange(
-        3, Exchange(question, '{"x":1,"y":2}', "There.", right=True)
-    ).splitlines()
-    assert lines == [
-        " 3. Where was I 10 s ago?",
-        "    get_position_seconds_ago(seconds_ago=10)",
-        "    => There.",
-        '    {"x":1,"y":2}',
-    ]
-
-
-def test_a_long_reply_is_cut_and_says_so() -> None:
-    last = format_exchange(1, Exchange(QUESTIONS[0], REPLY, "Yes.", right=True)).splitlines()[-1]
-    assert f"{len(REPLY):,} characters in all" in last
+from ros2_memory.demo.run import run_demo
 
 
 @pytest.mark.parametrize("duration_s", [89.9, 86_401.0, float("nan")])

@@ -11,7 +11,6 @@ from collections import deque
 from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-import anyio
 import pytest
 from structlog.testing import capture_logs
 
@@ -19,7 +18,7 @@ from ros2_memory.core.logging_setup import LogThrottle
 from ros2_memory.serving import connection_limits
 from ros2_memory.serving.auth import admit
 from ros2_memory.serving.dispatch import MAX_DEPTH, MAX_VALUES, excess_in_arguments
-from ros2_memory.serving.request_limits import MAX_BODY_BYTES, RequestLimits
+from ros2_memory.serving.request_limits import MAX_BODY_BYTES
 from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import (
     GOOD,
@@ -32,7 +31,7 @@ from tests.unit.serving.test_web_app import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator, Callable
 
     import uvicorn
 
@@ -366,118 +365,6 @@ async def test_peers_that_are_gone_fill_no_log(
     assert tracebacks == []
 
 
-async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> None:
-    async with serving() as served:
-        _, writer = await served.connect()
-        async with asyncio.timeout(BOUND_S):
-            while not served.server.server_state.connections:
-                await asyncio.sleep(0.001)
-        [connection] = served.server.server_state.connections
-        connected = connection.transport.get_extra_info("socket")
-        waits = connected.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
-        assert waits == connection_limits.UNREAD_S * 1000
-        # Linux doubles what it is told, for its own bookkeeping.
-        kept = connected.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
-        assert kept <= 2 * connection_limits.SEND_BUFFER_BYTES
-        writer.close()
-
-
-class Client:
-    """One request: its messages are sent as the application receives, its answer is kept."""
-
-    def __init__(self, *body: bytes, **headers: str) -> None:
-        named = [(name.replace("_", "-").encode(), text.encode()) for name, text in headers.items()]
-        self.scope: Any = {"type": "http", "method": "POST", "path": "/mcp", "headers": named}
-        self.sent: list[Any] = []
-        self.taken = 0
-        self.leaves = anyio.Event()
-        self._messages = [
-            {"type": "http.request", "body": part, "more_body": n < len(body) - 1}
-            for n, part in enumerate(body)
-        ]
-
-    async def receive(self) -> Any:
-        if self._messages:
-            self.taken += 1
-            return self._messages.pop(0)
-        await self.leaves.wait()
-        return {"type": "http.disconnect"}
-
-    async def send(self, message: Any) -> None:
-        self.sent.append(message)
-        if message["type"] == "http.response.body" and not message.get("more_body", False):
-            self.leaves.set()  # as the server says that the answer is complete
-
-    @property
-    def reply(self) -> tuple[int, str]:
-        text = b"".join(each.get("body", b"") for each in self.sent).decode()
-        return int(self.sent[0]["status"]), text
-
-    async def asks(self, app: Callable[..., Awaitable[None]]) -> Client:
-        with anyio.fail_after(20):
-            await RequestLimits(app)(self.scope, self.receive, self.send)
-        return self
-
-
-async def respond(send: Callable[[Any], Awaitable[None]], text: str, status: int = 200) -> None:
-    await send({"type": "http.response.start", "status": status, "headers": []})
-    await send({"type": "http.response.body", "body": text.encode()})
-
-
-async def echo(_scope: Any, receive: Any, send: Any) -> None:
-    """Answers with the length of the body."""
-    message = await receive()
-    assert not message["more_body"]
-    await respond(send, str(len(message["body"])))
-
-
-@pytest.mark.parametrize(("length", "taken"), [("5", 2), (str(MAX_BODY_BYTES + 1), 0)])
-async def test_a_body_too_large_is_refused_by_its_stated_length_or_by_what_is_counted(
-    length: str, taken: int
-) -> None:
-    refused = await Client(*[b"x" * MAX_BODY_BYTES] * 1000, content_length=length).asks(echo)
-    assert refused.reply == (413, f"The request is larger than {MAX_BODY_BYTES} bytes.\n")
-    assert refused.taken == taken
-
-
-async def test_a_client_that_leaves_before_its_body_is_whole_reaches_no_application() -> None:
-    async def never(_scope: Any, _receive: Any, _send: Any) -> None:
-        pytest.fail("there is no whole request")
-
-    leaving = Client(b"half", b"rest")
-    leaving._messages.pop()
-    leaving.leaves.set()
-    assert (await leaving.asks(never)).sent == []
-
-
-@pytest.mark.parametrize("error", [None, anyio.BrokenResourceError, anyio.ClosedResourceError])
-async def test_what_an_application_does_after_its_answer_is_not_cut_off_and_may_fail(
-    error: type[Exception] | None,
-) -> None:
-    """A message is accepted first and handed over then; its session may end in between."""
-    done: list[str] = []
-
-    async def accepting(_scope: Any, receive: Any, send: Any) -> None:
-        await receive()
-        await respond(send, "Accepted", 202)
-        for _ in range(10):
-            await anyio.lowlevel.checkpoint()
-        done.append("handed over")
-        if error is not None:
-            raise error
-
-    assert (await Client(b"{}").asks(accepting)).reply == (202, "Accepted")
-    assert done == ["handed over"]
-
-
-async def test_a_fault_of_the_application_is_not_hidden() -> None:
-    async def broken(_scope: Any, _receive: Any, _send: Any) -> None:
-        raise anyio.BrokenResourceError
-
-    with pytest.RaisesGroup(anyio.BrokenResourceError):
-        await Client(b"{}").asks(broken)
-
-
 @pytest.mark.parametrize("depth", [MAX_DEPTH - 1, MAX_DEPTH])
 @pytest.mark.parametrize("wrap", [lambda inner: [inner], lambda inner: {"x": inner}])
 def test_depth_is_counted_exactly(depth: int, wrap: Callable[[Any], Any]) -> None:
@@ -502,3 +389,21 @@ async def test_a_call_that_holds_too_much_is_refused_and_no_other_is(value: byte
         taken = await http.post("/mcp", content=call + fields, headers=headers)
     assert refused.status_code == 400 or "more than 10000 values" in refused.text
     assert (taken.status_code, "invalid_arguments" in taken.text) == (200, False)
+
+
+@pytest.mark.parametrize(("states_it", "taken"), [(True, 0), (False, 2)])
+async def test_a_body_too_large_is_refused_by_its_stated_length_or_by_what_is_counted(
+    states_it: bool, taken: int
+) -> None:
+    web, parts = app(), iter([b"x" * MAX_BODY_BYTES] * 1000)
+
+    async def body() -> AsyncIterator[bytes]:
+        for part in parts:
+            yield part
+
+    length = {"content-length": str(MAX_BODY_BYTES + 1)} if states_it else {}
+    async with running(web), client(web) as http:
+        refused = await http.post("/mcp", content=body(), headers=MCP_HEADERS | length)
+    assert refused.status_code == 413
+    assert refused.text == f"The request is larger than {MAX_BODY_BYTES} bytes.\n"
+    assert 1000 - len([*parts]) == taken

@@ -207,17 +207,6 @@ async def test_a_query_that_waited_and_then_ran_out_of_time_says_so(
     assert re.search(r" s \(it waited \d\.\d s of its time behind other calls\)", detail)
 
 
-async def test_tools_are_listed_while_queries_run_and_wait() -> None:
-    held = Held()
-    stuck = tool("stuck", held.ask)
-    async with Client(served(stuck)) as client, anyio.create_task_group() as tasks:
-        for _ in range(2 * QUICK_AT_ONCE):
-            tasks.start_soon(client.call_tool, "stuck", {})
-        await anyio.wait_all_tasks_blocked()
-        assert len((await client.list_tools()).tools) == 1
-        held.released.set()
-
-
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
     held = Held()
     slow, quick = tool("slow", held.ask, blocking=True), tool("quick", lambda _call: value(2))
@@ -240,21 +229,6 @@ class Held:
         self.begun += 1
         assert self.released.wait(20)
         return value(self.begun)
-
-
-async def test_a_client_that_asks_for_progress_receives_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ros2_memory.serving.mcp_server.PROGRESS_EVERY_S", 0.001)
-    held, states = Held(), iter([Progress(10, 4, 6), *[Progress(10, 6, 4)] * 100_000])
-    reported: list[tuple[float, str | None]] = []
-
-    async def note(progress: float, total: float | None, message: str | None) -> None:
-        reported.append((progress, message))
-        if len(reported) == 2:
-            held.released.set()
-
-    async with Client(served(tool("slow", held.ask), progress=lambda: next(states))) as client:
-        await client.call_tool("slow", {}, progress_callback=note, meta={"progress_token": 0})
-    assert reported[:2] == [(1, "40 % of the bags stored"), (2, "60 % of the bags stored")]
 
 
 async def test_one_client_that_floods_the_server_does_not_starve_another() -> None:
@@ -317,27 +291,6 @@ async def test_more_calls_than_may_wait_are_told_so() -> None:
         assert [each["error"] for each in sent] == ["busy"] * 5
         held.released.set()
     assert len(sent) == MOST_WAITING + BLOCKING_AT_ONCE + 5
-
-
-async def test_stopping_has_running_queries_give_up() -> None:
-    started = threading.Event()
-
-    def ask(call: Call) -> Answer:
-        started.set()
-        return until_given_up(call)
-
-    server = served(tool("slow", ask))
-    results: list[CallToolResult] = []
-
-    async def call(client: Client) -> None:
-        results.append(await client.call_tool("slow", {}))
-
-    async with Client(server) as client, anyio.create_task_group() as tasks:
-        tasks.start_soon(call, client)
-        await anyio.to_thread.run_sync(started.wait)
-        server.dispatcher.stop()
-    told = sent(results[0])
-    assert (told["error"], "the server is stopping" in told["detail"]) == ("busy", True)
 
 
 async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: LogCapture) -> None:
