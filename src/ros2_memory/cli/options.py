@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from difflib import get_close_matches
 from functools import wraps
@@ -435,7 +435,7 @@ class Times:
 def as_command(name: str) -> Callable[[Command], Command]:
     """Returns what makes a function a command that reports its errors under a name.
 
-    A parameter whose type is a dataclass, such as `Bags` and `Times`, becomes the options of that,
+    A parameter whose type is a dataclass, as `Bags` and `Times` are, becomes the options of that,
     in its place. It returns its exit code, or whether something was left undone (`EXIT_NEGATIVE`).
 
     An annotation such as `Annotated[float, "S", "Seconds between updates."]` declares an option, by
@@ -447,7 +447,7 @@ def as_command(name: str) -> Callable[[Command], Command]:
         groups = {
             name: parameter.annotation
             for name, parameter in parameters.items()
-            if is_dataclass(parameter.annotation)
+            if hasattr(parameter.annotation, "__dataclass_fields__")
         }
 
         @wraps(command)

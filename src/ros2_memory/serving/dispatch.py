@@ -344,12 +344,15 @@ class Dispatcher:
 
         One that is no domain error is a fault of this program, and is logged.
         """
-        if isinstance(error, EpisodicError):
+        try:
+            if not isinstance(error, EpisodicError):
+                raise error  # noqa: TRY301 - logged as any fault in telling an error is
             reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
             return f"{error.code}{reason}", self._replies.error(error)
-        log.error("tool_failed", exc_info=True)  # noqa: LOG014 - its callers caught it
-        context = structlog.contextvars.get_contextvars()
-        return "internal", self._replies.internal(str(context.get("correlation_id")))
+        except Exception:
+            log.exception("tool_failed")
+            context = structlog.contextvars.get_contextvars()
+            return "internal", self._replies.internal(str(context.get("correlation_id")))
 
 
 def _with_wait(waited_s: float) -> str:
