@@ -99,7 +99,6 @@ def ask(
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
-    tools = {tool.name: tool for tool in dispatcher.tools}
     if not asked:
         rows: list[JsonValue] = []
         for tool_listed in dispatcher.tools:
@@ -114,11 +113,11 @@ def ask(
             print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
         return False
     # A folder that is not there may stand before the tool.
+    tools = {tool.name for tool in dispatcher.tools}
     name = next((word for word in asked if word in tools), asked[0])
     rest = [word for word in asked if word and word != name]
-    arguments = question_for(memory, name, tools.get(name), rest)
     with spinner(f"asking {name}"):
-        (reply,) = call_tools(dispatcher, {name: arguments})
+        reply = answer_to(dispatcher, memory, name, rest)
     answer: JsonValue = json.loads(reply.text)
     if as_json:
         print_line(reply.text)
@@ -131,34 +130,32 @@ def ask(
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 
-def question_for(
-    memory: Memory, name: str, tool: Tool | None, words: Sequence[str]
-) -> dict[str, object]:
-    """Returns the arguments for a tool, from the words of the command line.
+def answer_to(dispatcher: Dispatcher, memory: Memory, name: str, words: Sequence[str]) -> Reply:
+    """Returns the reply of a tool to the words of the command line; `called` says what it ends.
 
-    A `recap` without a time is that of the newest day.
+    Times and durations may be as people write them. A `recap` without a time is that of the newest
+    day.
 
     Raises:
         InvalidArgumentsError: a word is no argument, or a text is no time.
     """
+    tool = next((tool for tool in dispatcher.tools if tool.name == name), None)
     schemas = {} if tool is None else tool.arguments
-    arguments = with_times(
-        parse_arguments(words, schemas), schemas, unix_from_ns(present_time(memory))
-    )
+    now = unix_from_ns(present_time(memory))
+    arguments = {
+        key: _with_parsed_times(value, schemas.get(key), now)
+        for key, value in parse_arguments(words, schemas).items()
+    }
     if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
         first, last = newest_day(memory).asked()
         arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
-    return arguments
+    return called(dispatcher, name, arguments)
 
 
-def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]) -> list[Reply]:
-    """Returns the replies of tools, by name and arguments; the dispatcher takes no further call."""
-
-    async def replies() -> list[Reply]:
-        return [await dispatcher.answer(tool, arguments) for tool, arguments in calls.items()]
-
+def called(dispatcher: Dispatcher, tool: str, arguments: Mapping[str, object]) -> Reply:
+    """Returns the reply of a tool; the dispatcher takes no further call."""
     try:
-        return anyio.run(replies)
+        return anyio.run(dispatcher.answer, tool, arguments)
     finally:
         dispatcher.stop()
 
@@ -189,21 +186,6 @@ def parse_arguments(given: Sequence[str], schemas: Mapping[str, JsonObject]) -> 
         is_text = schemas.get(key, {}).get("type") == "string"
         arguments[key] = text if is_text else _from_json(text, text)
     return arguments
-
-
-def with_times(
-    arguments: Mapping[str, object], schemas: Mapping[str, JsonObject], now: float
-) -> dict[str, object]:
-    """Returns a tool's arguments, with times and durations as people write them in seconds.
-
-    `now` is in Unix seconds.
-
-    Raises:
-        InvalidArgumentsError: a text is no time.
-    """
-    return {
-        key: _with_parsed_times(value, schemas.get(key), now) for key, value in arguments.items()
-    }
 
 
 def _with_parsed_times(value: object, schema: object, now: float) -> object:

@@ -9,7 +9,7 @@ from typing import Final
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.cli.ask import call_tools
+from ros2_memory.cli.ask import called
 from ros2_memory.cli.options import MB, AsJson, Bags, open_robot
 from ros2_memory.cli.output import (
     format_size,
@@ -103,10 +103,10 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
 
 def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
     """Returns what is recorded in one bag directory: replies of two tools, and how much it is."""
-    tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
-    replies = call_tools(build_dispatcher(settings, memory), tools)
-    shown = {tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)}
-    return {"held": _amount_recorded(memory.index.snapshot()), **shown}
+    report = {"held": _amount_recorded(memory.index.snapshot())}
+    for tool in ("memory_status", "data_time_range"):
+        report[tool] = json.loads(called(build_dispatcher(settings, memory), tool, {}).text)
+    return report
 
 
 def _show(memory: Memory, report: Mapping[str, JsonObject]) -> None:

@@ -15,7 +15,7 @@ from typing import Annotated, Final, TypeAlias, cast
 import typer
 
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.cli.ask import call_tools, question_for
+from ros2_memory.cli.ask import answer_to
 from ros2_memory.cli.export import describe_undefined, with_definitions, write_mcap
 from ros2_memory.cli.options import LOOKING, AsJson, Bags, is_folder, load_to_look, open_memory
 from ros2_memory.cli.output import print_line, print_notes, spinner
@@ -238,10 +238,8 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
         InvalidArgumentsError: the tool refuses the question, or cannot answer it in time.
     """
     memory = replace(memory, scanner=Scanner(None, memory.index.bag_dir))
-    dispatcher = build_dispatcher(settings, memory)
     tool, *given = words
-    tools = {tool.name: tool for tool in dispatcher.tools}
-    (reply,) = call_tools(dispatcher, {tool: question_for(memory, tool, tools.get(tool), given)})
+    reply = answer_to(build_dispatcher(settings, memory), memory, tool, given)
     answer: JsonValue = json.loads(reply.text)
     if reply.is_error and isinstance(answer, dict):
         raise InvalidArgumentsError(str(answer["detail"]))

@@ -226,7 +226,13 @@ def run_demo(
             bag_dir = Path(stack.enter_context(temporary))
         bag_dir.mkdir(parents=True, exist_ok=True)
         folder = bag_dir.resolve()
-        recorder = stack.enter_context(_recorder(folder, duration_s))
+        begun = WallClock().now() - ns_from_unix(duration_s)
+        schedule = MessageSchedule(t0=begun - _UNDERWAY_S * NS_PER_S, start=begun)
+        name = time.strftime("flat_%Y_%m_%d-%H_%M_%S")
+        recorder = DemoRecorder(folder / name, schedule, split_duration_s=SPLIT_DURATION_S)
+        if recorder.failure is not None:
+            raise recorder.failure
+        stack.enter_context(recorder)
         server, url = stack.enter_context(running_server(folder, port, verbose=verbose))
         tell(
             "A simulated robot drives through a flat and records what it does. A client asks the "
@@ -255,42 +261,25 @@ def run_demo(
     return int(right < len(questions))
 
 
-def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
-    """Returns a recorder that has written its history and continues."""
-    now = WallClock().now()
-    start = now - ns_from_unix(duration_s)
-    timeline = MessageSchedule(t0=start - _UNDERWAY_S * NS_PER_S, start=start)
-    name = time.strftime("flat_%Y_%m_%d-%H_%M_%S")
-    recorder = DemoRecorder(bag_dir / name, timeline, split_duration_s=SPLIT_DURATION_S)
-    if recorder.failure is not None:
-        raise recorder.failure
-    return recorder
-
-
 async def _ask_all(
     url: str, recorder: DemoRecorder, show: _Show, questions: Sequence[Question]
 ) -> int:
     """Asks every question over one connection; returns how many answers were right."""
-    right = 0
+    right, clock = 0, WallClock()
     async with Client(sse_client(url, timeout=_CONNECTED_WITHIN_S)) as client:
         for number, question in enumerate(questions, start=1):
-            exchange = await _ask(client, question, recorder)
+            before = clock.now()
+            try:
+                result = await client.call_tool(question.tool, dict(question.arguments))
+            except MCPError as error:
+                exchange = Exchange(question, "", f"the call failed: {error}", right=False)
+            else:
+                texts = [part.text for part in result.content if isinstance(part, TextContent)]
+                call = CallContext(recorder.timeline.t0, before, clock.now())
+                exchange = judge_reply(question, "".join(texts), call, is_error=result.is_error)
             show(number, exchange)
             right += exchange.right
     return right
-
-
-async def _ask(client: Client, question: Question, recorder: DemoRecorder) -> Exchange:
-    clock = WallClock()
-    before = clock.now()
-    try:
-        result = await client.call_tool(question.tool, dict(question.arguments))
-    except MCPError as error:
-        return Exchange(question, "", f"the call failed: {error}", right=False)
-    after = clock.now()
-    reply = "".join(part.text for part in result.content if isinstance(part, TextContent))
-    call = CallContext(recorder.timeline.t0, before, after)
-    return judge_reply(question, reply, call, is_error=result.is_error)
 
 
 def _wait(server: Child, recorder: DemoRecorder) -> None:

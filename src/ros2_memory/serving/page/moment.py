@@ -118,7 +118,7 @@ def sightings_shown(
             rows += [{"topic": topic, **row} for row in rendered if isinstance(row, dict)]
         total = None if total is None or sightings.total is None else total + sightings.total
         notes += sightings.notes
-    rows.sort(key=_last_seen, reverse=True)
+    rows.sort(key=lambda row: float(str(row.get("last_seen") or 0.0)), reverse=True)
     return {
         "label": label,
         "start": start_s,
@@ -127,8 +127,3 @@ def sightings_shown(
         "total": total,
         "notes": [*dict.fromkeys(notes)],
     }
-
-
-def _last_seen(sighting: JsonObject) -> float:
-    last = sighting.get("last_seen")
-    return last if isinstance(last, float) else 0.0
