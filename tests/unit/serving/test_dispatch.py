@@ -207,6 +207,17 @@ async def test_a_query_that_waited_and_then_ran_out_of_time_says_so(
     assert re.search(r" s \(it waited \d\.\d s of its time behind other calls\)", detail)
 
 
+async def test_tools_are_listed_while_queries_run_and_wait() -> None:
+    held = Held()
+    stuck = tool("stuck", held.ask)
+    async with Client(served(stuck)) as client, anyio.create_task_group() as tasks:
+        for _ in range(2 * QUICK_AT_ONCE):
+            tasks.start_soon(client.call_tool, "stuck", {})
+        await anyio.wait_all_tasks_blocked()
+        assert len((await client.list_tools()).tools) == 1
+        held.released.set()
+
+
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
     held = Held()
     slow, quick = tool("slow", held.ask, blocking=True), tool("quick", lambda _call: value(2))
