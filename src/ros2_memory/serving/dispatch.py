@@ -13,7 +13,6 @@ import uuid
 from collections import deque
 from contextlib import contextmanager
 from difflib import get_close_matches
-from threading import Lock
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -50,12 +49,11 @@ LONGEST_QUESTION: Final = 500
 
 
 class QuestionLog:
-    """Keeps the latest questions, `most` at most; none where that is 0. Thread-safe."""
+    """Keeps the latest questions, `most` at most; none where that is 0. One thread adds them."""
 
     def __init__(self, most: int, wall: Callable[[], Ns] = time.time_ns) -> None:
         self._wall = wall
         self._kept: deque[JsonObject] = deque(maxlen=most)
-        self._lock = Lock()
         self.is_on = most > 0
         self.count = 0
 
@@ -69,17 +67,15 @@ class QuestionLog:
             "ms": round(done.duration_s * 1000, 1),
             "answer": shortened(answer, LONGEST_ANSWER),
         }
-        with self._lock:
-            self.count += 1
-            self._kept.append(kept)
+        self.count += 1
+        self._kept.append(kept)
 
     def newest(self, most: int) -> tuple[JsonObject, ...]:
         """Returns the latest questions as the page shows them, the newest first.
 
         With when they came (Unix s, wall clock), how long they took, and the begin of the reply.
         """
-        with self._lock:
-            return tuple(reversed(self._kept))[:most]
+        return tuple(reversed(self._kept.copy()))[:most]  # another thread may add one
 
 
 QUICK_AT_ONCE: Final = 4

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-from collections import Counter, deque
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.core.errors import BusyError
 
@@ -21,13 +22,18 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_Turn: TypeAlias = "asyncio.Future[None]"
-"""Done when a waiting query may begin; has an exception when it is refused."""
-
 STOPPING: Final = "the server is stopping; ask again when it runs again"
 _NO_THREAD: Final = "the machine starts no more threads for the server; ask again later"
 MOST_WAITING: Final = 256
 """Queries that may wait in one queue. Each holds its arguments in memory."""
+
+
+@dataclass(eq=False)
+class _Turn:
+    """That of a waiting query; `comes` is done when it may begin, or is refused."""
+
+    client: Hashable
+    comes: asyncio.Future[None]
 
 
 class FairQueue:
@@ -41,13 +47,13 @@ class FairQueue:
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix=name)
         self._at_once = threads
         self._stopped = False
-        self._waiting: dict[Hashable, deque[_Turn]] = {}
+        self._waiting: list[_Turn] = []
         self._running: Counter[Hashable] = Counter()
 
     @property
     def waiting(self) -> int:
         """Returns how many queries wait for a thread."""
-        return sum(len(turns) for turns in self._waiting.values())
+        return len(self._waiting)
 
     @property
     def running(self) -> int:
@@ -90,16 +96,15 @@ class FairQueue:
             return
         if self.waiting >= MOST_WAITING:
             self._make_room(client)
-        turn = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(client, deque()).append(turn)
+        turn = _Turn(client, asyncio.get_running_loop().create_future())
+        self._waiting.append(turn)
         try:
-            await turn
+            await turn.comes
         except asyncio.CancelledError:
-            if turn.done() and not turn.cancelled():
-                if turn.exception() is None:
-                    self._release(client)
-            else:
-                self._remove(client, turn)
+            if turn in self._waiting:
+                self._waiting.remove(turn)
+            elif not turn.comes.cancelled() and turn.comes.exception() is None:
+                self._release(client)
             raise
 
     def _make_room(self, client: Hashable) -> None:
@@ -108,24 +113,17 @@ class FairQueue:
         Raises:
             BusyError: that is the client that asks.
         """
-        most = max(self._waiting, key=lambda waiting: len(self._waiting[waiting]))
+        waiting = Counter(turn.client for turn in self._waiting)
+        most, count = waiting.most_common(1)[0]
         refusal = BusyError(
             f"{MOST_WAITING} questions wait already; ask again when some are answered, and "
             "fewer at once"
         )
-        if len(self._waiting[most]) <= len(self._waiting.get(client, ())) + 1:
+        if count <= waiting[client] + 1:
             raise refusal
-        last = self._waiting[most][-1]
-        self._remove(most, last)
-        last.set_exception(refusal)
-
-    def _remove(self, client: Hashable, turn: _Turn) -> None:
-        """Takes a query out of the queue; it is not in it any more if its turn has just come."""
-        turns = self._waiting.get(client, deque())
-        if turn in turns:
-            turns.remove(turn)
-            if not turns:
-                del self._waiting[client]
+        last = next(turn for turn in reversed(self._waiting) if turn.client == most)
+        self._waiting.remove(last)
+        last.comes.set_exception(refusal)
 
     def _release(self, client: Hashable) -> None:
         """Frees a thread, and begins the next query."""
@@ -133,11 +131,10 @@ class FairQueue:
         if not self._running[client]:
             del self._running[client]
         while self.running < self._at_once and self._waiting:
-            following = min(self._waiting, key=self._running.__getitem__)
-            turns = self._waiting.pop(following)
-            turn = turns.popleft()
-            if turns:  # behind the others: a dictionary keeps its order
-                self._waiting[following] = turns
-            if not turn.done():
-                self._running[following] += 1
-                turn.set_result(None)
+            turn = min(self._waiting, key=lambda turn: self._running[turn.client])
+            self._waiting.remove(turn)
+            # The client's other turns go behind those of others; a sort keeps the order of equals.
+            self._waiting.sort(key=lambda other: other.client == turn.client)
+            if not turn.comes.done():
+                self._running[turn.client] += 1
+                turn.comes.set_result(None)
