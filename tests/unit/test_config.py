@@ -14,15 +14,13 @@ from hypothesis import strategies as st
 
 from ros2_memory.config import (
     Settings,
-    exit_on_config_error,
     load_labels,
     load_message_schemas,
     load_settings,
-    unused_config,
 )
 from ros2_memory.config_sources import Sources
 from ros2_memory.core.errors import ConfigError
-from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, copied, edit, refusal
+from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, copied, refusal
 from tests.support.examples import examples
 
 if TYPE_CHECKING:
@@ -307,32 +305,6 @@ class TestRefusals:
             assert re.search("secret|shell|token", str(caught.value))
 
 
-class TestExit:
-    def test_a_refused_configuration_is_explained_on_stderr_with_exit_code_2(
-        self, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        with pytest.raises(SystemExit) as caught, exit_on_config_error("ros2-memory-server"):
-            load_settings(["data.now=walls"], {})
-        assert caught.value.code == 2
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert err.splitlines() == [
-            "ros2-memory-server cannot start, its configuration is refused:",
-            "data.now: 'walls' is not allowed; use one of: wall, latest (set on the command line)",
-        ]
-
-
-class TestConfigFolder:
-    def test_one_beside_is_named_as_unused_unless_it_says_the_same(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.delenv("MEMORY_CONFIG_DIR", raising=False)
-        monkeypatch.chdir(copied(tmp_path).parent)
-        assert unused_config() is None
-        edit(Path("config/config.yaml"), "name: episodic", "name: mine")
-        assert "is not used" in (unused_config() or "")
-
-
 def labels(text: str, tmp_path: Path) -> object:
     path = tmp_path / "labels.yaml"
     path.write_text(text)
@@ -430,18 +402,6 @@ def test_a_preset_that_builds_on_itself_ends(folder: Path) -> None:
     (folder / "config.yaml").write_text("defaults:\n  - deployment: loop\n")
     (folder / "deployment" / "loop.yaml").write_text("defaults: [loop]\ndata: {now: latest}\n")
     assert Sources(folder, (), {})("data.now") == f"in {folder}"
-
-
-def test_a_file_of_the_operators_stands_for_the_keys_that_it_sets(folder: Path) -> None:
-    text = (folder / "config.yaml").read_text().replace("deployment: null", "deployment: mine")
-    (folder / "config.yaml").write_text(text)
-    (folder / "deployment" / "mine.yaml").write_text(
-        "# @package _global_\nserver:\n  name: robin\n"
-    )
-    source = Sources(folder, (), {})
-    assert source("server.name") == f"in {folder / 'deployment' / 'mine.yaml'}"
-    assert source("server.port") == f"in {folder / 'config.yaml'}"
-    assert source.choice("deployment") == ("mine", f"in {folder / 'config.yaml'}")
 
 
 @pytest.mark.parametrize("content", ["[", "- 1", "", "data: 7", "defaults: 7", "\x00"])

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import pty
 import re
 import shutil
-import subprocess
 import time
 from typing import TYPE_CHECKING
 
@@ -16,7 +14,6 @@ from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, assessment
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap
-from tests.support.forked_commands import write_command
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -92,26 +89,6 @@ def test_messages_that_two_recordings_have_count_once(bag_dir: Path, exits: Prog
 def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "none").mkdir()
     assert "latest          none" in exits(0, f"watch --count 1 --bag-dir {tmp_path}/none").out
-
-
-def test_a_terminal_gets_a_table(tmp_path: Path) -> None:
-    ours, theirs = pty.openpty()
-    write_command(tmp_path)
-    program = [str(tmp_path / "ros2-memory"), "watch", "--count", "1"]
-    env = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
-    with subprocess.Popen(program, stdout=theirs, stderr=subprocess.PIPE, env=env) as process:
-        os.close(theirs)
-        shown = b""
-        try:
-            while some := os.read(ours, 4096):
-                shown += some
-        except OSError:  # the other end is closed
-            pass
-        os.close(ours)
-        assert process.wait(60) == 0
-    assert b"/odom" in shown
-    assert b"usual_hz" in shown
-    assert b"silent" in shown
 
 
 class TestOldData:

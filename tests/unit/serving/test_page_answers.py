@@ -44,7 +44,7 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.bags import detections, odom, write_mcap
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
 
@@ -339,25 +339,6 @@ def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
     assert paths(0, 30) == {"robin": (10, 20), "wren": (20, 40)}
     assert paths(-1000, 30) == {"jay": (0, 10), "robin": (10, 20), "wren": (20, 40)}
     assert paths(-1000, -800) == {}
-
-
-def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
-    tmp_path: Path,
-) -> None:
-    for name, begins, parent in (("robin", 0, "base"), ("wren", 500, "map"), ("jay", 900, "base")):
-        poses = [odom(BEGIN + (begins + n) * S, float(n), 0.0) for n in range(10)]
-        at = poses[0].log_time
-        mount = transform(at, parent, "laser", (0.1, 0.0, 0.0))
-        mounted = tf(at, mount, topic="/tf_static")
-        write_mcap(tmp_path / name / "0.mcap", [mounted, *poses])
-    memory = memory_of(tmp_path)
-
-    def robots(start_s: int, stop_s: int) -> list[str]:
-        return [each["name"] for each in paths_in(memory, start_s, stop_s)]
-
-    assert robots(0, 600) == ["robin", "wren"]
-    assert robots(0, 1000) == ["jay", "robin", "wren"]
-    assert robots(0, 400) == []
 
 
 def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:
