@@ -30,7 +30,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.malloc import return_free_memory
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.core.text import abbreviate, shortened
-from ros2_memory.core.timebase import Deadline, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.fair_queue import STOPPING, FairQueue
 from ros2_memory.tools.extra_tools import DECLARATIONS
@@ -51,8 +51,7 @@ LONGEST_QUESTION: Final = 500
 class QuestionLog:
     """Keeps the latest questions, `most` at most; none where that is 0. One thread adds them."""
 
-    def __init__(self, most: int, wall: Callable[[], Ns] = time.time_ns) -> None:
-        self._wall = wall
+    def __init__(self, most: int) -> None:
         self._kept: deque[JsonObject] = deque(maxlen=most)
         self.is_on = most > 0
         self.count = 0
@@ -60,7 +59,7 @@ class QuestionLog:
     def add(self, name: str, arguments: Mapping[str, object], done: Answered, answer: str) -> None:
         """Adds a call that is over, and drops the oldest one too many. Long texts are cut."""
         kept: JsonObject = {
-            "asked": round(unix_from_ns(self._wall() - ns_from_unix(done.duration_s)), 3),
+            "asked": round(time.time() - done.duration_s, 3),
             "tool": name if done.tool == name else abbreviate(name),
             "arguments": abbreviate(arguments, LONGEST_QUESTION),
             "outcome": done.outcome,

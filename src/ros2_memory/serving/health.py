@@ -81,16 +81,9 @@ class Health:
     that hangs must not cost a thread with every request.
     """
 
-    def __init__(
-        self,
-        memory: Memory,
-        version: str,
-        backfill: Backfill | None = None,
-        timeout_s: float = TIMEOUT_S,
-    ) -> None:
+    def __init__(self, memory: Memory, version: str, backfill: Backfill | None = None) -> None:
         self._report = partial(_health_report, memory, version, backfill)
         self._version = version
-        self._timeout_s = timeout_s
         self._queue = FairQueue("health", 1)
 
     def stop(self) -> None:
@@ -104,7 +97,7 @@ class Health:
         crash left open, and bags that a wrong clock dated; they are counted. Times are Unix
         seconds.
         """
-        with anyio.move_on_after(self._timeout_s), suppress(BusyError):
+        with anyio.move_on_after(TIMEOUT_S), suppress(BusyError):
             return await self._queue.run(None, self._report)
         return _status(self._version, ["the bag directory is being scanned"], {})
 

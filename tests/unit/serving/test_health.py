@@ -109,7 +109,10 @@ async def test_a_recorder_that_does_not_record_degrades_it_unless_it_was_stopped
     assert reply.get("problems") == problems
 
 
-async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(tmp_path: Path) -> None:
+async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.serving.health.TIMEOUT_S", 0.001)
     released = threading.Event()
     looks: list[int] = []
 
@@ -121,7 +124,7 @@ async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(tmp_
 
     memory = memory_at(tmp_path)
     index = Hanging(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
-    health = Health(replace(memory, index=index), "1", timeout_s=0.001)
+    health = Health(replace(memory, index=index), "1")
     before = threading.active_count()
     reply = [await health() for _ in range(10)]
     during = threading.active_count()

@@ -206,9 +206,8 @@ def _every_pose(
 
 
 def _joined(lines: Sequence[Line]) -> Line:
-    if not lines:
-        return Line(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
-    return Line(*(np.concatenate(column) for column in zip(*lines, strict=True)))
+    nothing = Line(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
+    return Line(*(np.concatenate(column) for column in zip(nothing, *lines, strict=True)))
 
 
 def _drawn(line: Line, pixel_m: float) -> Line:
