@@ -11,14 +11,17 @@ from collections import deque
 from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
+import anyio
+import anyio.lowlevel
 import pytest
+from starlette.responses import PlainTextResponse
 from structlog.testing import capture_logs
 
 from ros2_memory.core.logging_setup import LogThrottle
 from ros2_memory.serving import connection_limits
 from ros2_memory.serving.auth import admit
 from ros2_memory.serving.dispatch import MAX_DEPTH, MAX_VALUES, excess_in_arguments
-from ros2_memory.serving.request_limits import MAX_BODY_BYTES
+from ros2_memory.serving.request_limits import MAX_BODY_BYTES, RequestLimits
 from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import (
     GOOD,
@@ -363,6 +366,50 @@ async def test_peers_that_are_gone_fill_no_log(
     assert len(logged) == len({each["reason"] for each in logged})
     tracebacks = [each for each in caplog.records if each.exc_info]
     assert tracebacks == []
+
+
+async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> None:
+    async with serving() as served:
+        _, writer = await served.connect()
+        async with asyncio.timeout(BOUND_S):
+            while not served.server.server_state.connections:
+                await asyncio.sleep(0.001)
+        [connection] = served.server.server_state.connections
+        connected = connection.transport.get_extra_info("socket")
+        waits = connected.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+        assert waits == connection_limits.UNREAD_S * 1000
+        # Linux doubles what it is told, for its own bookkeeping.
+        kept = connected.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+        assert kept <= 2 * connection_limits.SEND_BUFFER_BYTES
+        writer.close()
+
+
+@pytest.mark.parametrize("error", [None, anyio.BrokenResourceError, anyio.ClosedResourceError])
+async def test_what_an_application_does_after_its_answer_is_not_cut_off_and_may_fail(
+    error: type[Exception] | None,
+) -> None:
+    """A message is accepted first and handed over then; its session may end in between."""
+    done: list[str] = []
+
+    async def accepting(scope: Any, receive: Any, send: Any) -> None:
+        await PlainTextResponse("Accepted", 202)(scope, receive, send)
+        for _ in range(10):
+            await anyio.lowlevel.checkpoint()
+        done.append("handed over")
+        if error is not None:
+            raise error
+
+    async with client(RequestLimits(accepting)) as http:
+        assert (await http.post("/messages/", content=b"{}")).status_code == 202
+    assert done == ["handed over"]
+
+
+async def test_a_fault_of_the_application_is_not_hidden() -> None:
+    async def broken(_scope: Any, _receive: Any, _send: Any) -> None:
+        raise anyio.BrokenResourceError
+
+    with pytest.RaisesGroup(anyio.BrokenResourceError):
+        await client(RequestLimits(broken)).post("/messages/", content=b"{}")
 
 
 @pytest.mark.parametrize("depth", [MAX_DEPTH - 1, MAX_DEPTH])
