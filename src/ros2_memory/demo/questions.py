@@ -155,41 +155,32 @@ def _time_range(reply: JsonValue, call: CallContext) -> str:
     )
 
 
-def _ago(
-    topic: str, seconds_ago: float, expected: Expected, sentence: str, off: float = _ROUNDED
-) -> Judge:
-    """Judges what the message of a topic so long ago holds; a number may be `off`."""
-
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        moment = _number(reply, "timestamp")
-        call.require_ago(moment, seconds_ago)
-        t = call.robot_time(moment, topic)
-        _require(reply, expected(t), off=off)
-        return _said(sentence, t, moment, call)
-
-    return judge
-
-
-def _last(
+def _at(
     topic: str,
-    holds: Callable[[float], bool],
     expected: Expected,
     sentence: str,
+    *,
+    ago: float | None = None,
+    holds: Callable[[float], bool] = lambda _: True,
     then: str | None = None,
+    off: float = _ROUNDED,
 ) -> Judge:
-    """Judges a time at which something was so in the messages of a topic.
+    """Judges what a message of a topic holds: one so many seconds ago, or at which something holds.
 
-    `expected` and `sentence` are of that message, or of the one of the topic `then`.
+    `expected` and `sentence` are of that message, or of the one of the topic `then`; a number may
+    be `off`.
     """
 
     def judge(reply: JsonValue, call: CallContext) -> str:
         moment = _number(reply, "timestamp")
+        if ago is not None:
+            call.require_ago(moment, ago)
         t = call.robot_time(moment, topic)
         if not holds(t):
             raise WrongAnswerError(f"expected a time at which it was so, not {moment:.6f}")
         if then is not None:
             t = call.robot_time(_number(reply, "value_timestamp"), then)
-        _require(reply, expected(t))
+        _require(reply, expected(t), off=off)
         return _said(sentence, t, moment, call)
 
     return judge
@@ -323,25 +314,31 @@ QUESTIONS: Final = (
         "Where was I 10 s ago?",
         "get_position_seconds_ago",
         {"seconds_ago": 10},
-        _ago(ODOM, 10, _pose, "{place}, facing {facing}."),
+        _at(ODOM, _pose, "{place}, facing {facing}.", ago=10),
     ),
     Question(
         "And how fast?",
         "get_velocity_seconds_ago",
         {"seconds_ago": 10},
-        _ago(ODOM, 10, _twist, "{motion}."),
+        _at(ODOM, _twist, "{motion}.", ago=10),
     ),
     Question(
         "What objects did you see at the front door?",
         "get_value_when",
         {"value_topic": SCENE_OBJECTS, "condition_topic": ODOM, **_near(robot.FRONT_DOOR)},
-        _last(ODOM, _is_near(robot.FRONT_DOOR), _objects, "{objects}, {when}.", SCENE_OBJECTS),
+        _at(
+            ODOM,
+            _objects,
+            "{objects}, {when}.",
+            holds=_is_near(robot.FRONT_DOOR),
+            then=SCENE_OBJECTS,
+        ),
     ),
     Question(
         "When was the path last clear?",
         "find_last_match",
         {"topic": PATH_CLEAR, "condition_type": "equals", "value": True},
-        _last(PATH_CLEAR, robot.path_clear, lambda _: {"value": {"value": True}}, "{when}."),
+        _at(PATH_CLEAR, lambda _: {"value": {"value": True}}, "{when}.", holds=robot.path_clear),
     ),
     Question(
         "How far have I driven in the last minute?",
@@ -353,24 +350,24 @@ QUESTIONS: Final = (
         "When did you last see scissors?",
         "find_last_match",
         {"topic": "/vision/*/scene_objects", **_SCISSORS},
-        _last(
+        _at(
             SCENE_OBJECTS,
-            _sees("scissors"),
             lambda t: {"topic": SCENE_OBJECTS, **_objects(t)},
             "{when}; in view: {objects}.",
+            holds=_sees("scissors"),
         ),
     ),
     Question(
         "And where were you then?",
         "get_value_when",
         {"value_topic": ODOM, "condition_topic": SCENE_OBJECTS, **_SCISSORS},
-        _last(SCENE_OBJECTS, _sees("scissors"), _at_position, "{place}, {when}.", ODOM),
+        _at(SCENE_OBJECTS, _at_position, "{place}, {when}.", holds=_sees("scissors"), then=ODOM),
     ),
     Question(
         "When were you last at the kitchen counter?",
         "find_last_match",
         {"topic": ODOM, **_near(robot.KITCHEN_COUNTER)},
-        _last(ODOM, _is_near(robot.KITCHEN_COUNTER), _at_position, "{when}."),
+        _at(ODOM, _at_position, "{when}.", holds=_is_near(robot.KITCHEN_COUNTER)),
     ),
     Question(
         "Where in the flat was the camera 10 s ago?",
@@ -382,7 +379,13 @@ QUESTIONS: Final = (
         "How full was the battery half a minute ago?",
         "get_topic_seconds_ago",
         {"topic": BATTERY, "seconds_ago": 30, "tolerance_s": 1.5, "fields": ["percentage"]},
-        _ago(BATTERY, 30, lambda t: {"value": {"percentage": robot.battery(t)}}, "{charge}.", 1e-6),
+        _at(
+            BATTERY,
+            lambda t: {"value": {"percentage": robot.battery(t)}},
+            "{charge}.",
+            ago=30,
+            off=1e-6,
+        ),
     ),
     Question(
         "What did the camera's pictures show?",

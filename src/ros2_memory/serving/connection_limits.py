@@ -1,4 +1,4 @@
-"""Bounds on HTTP connections: how many there are, and how long one may keep the server waiting.
+"""Bounds on HTTP connections and requests: how many there are, how much, and for how long.
 
 Uvicorn waits without limit for the rest of a request, and for a client to read its reply. A few
 hundred clients that do neither would use up all file descriptors.
@@ -7,6 +7,9 @@ A connection is unknown until a request on it is admitted: it showed the token, 
 `ForgeryGuard` where there is no token. Unknown connections have a small pool of their own, in which
 a new one replaces the oldest of the address that has most: a flood from one machine replaces its
 own. However many there are, a client that shows the token is served.
+
+A body is read whole before anything parses it, and is so small that parsing it holds up nobody. A
+call is cancelled when its client leaves.
 """
 
 from __future__ import annotations
@@ -14,9 +17,13 @@ from __future__ import annotations
 import socket
 from collections import Counter
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
+import anyio
 import h11
+from starlette.datastructures import Headers
+from starlette.responses import PlainTextResponse
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ros2_memory.core.logging_setup import LogThrottle, get_logger
@@ -26,6 +33,7 @@ if TYPE_CHECKING:
     import asyncio
 
     import uvicorn
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
     from uvicorn.server import ServerState
 
 HEAD_S: Final = 10.0
@@ -45,6 +53,13 @@ CHUNK_BYTES: Final = 64
 ACCEPTED_AT_ONCE: Final = 16
 """In one turn of the event loop. A new connection is first read three turns later, so fewer are
 accepted by then than there is room for, and none is replaced before its first bytes were read."""
+MAX_BODY_BYTES: Final = 128 << 10
+"""Several times the largest arguments. Parsing it takes some hundredths of a second, in which the
+event loop serves no client; all connections together hold 32 MiB at most."""
+
+_TOO_LARGE: Final = PlainTextResponse(
+    f"The request is larger than {MAX_BODY_BYTES} bytes.\n", status_code=413
+)
 
 log = get_logger(__name__)
 
@@ -263,3 +278,89 @@ def _limit_socket(transport: asyncio.Transport) -> None:
     connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
     if hasattr(socket, "TCP_USER_TIMEOUT"):
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))
+
+
+@dataclass
+class RequestLimits:
+    """Reads requests for an application, and cancels it where nobody waits for its reply."""
+
+    _app: ASGIApp
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles an ASGI connection."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        if scope["method"] not in {"POST", "PUT", "PATCH"}:
+            await self._app(scope, receive, _once(send))
+            return
+        # h11 has refused a length that is no number. Uvicorn discards the rest of a body that is
+        # too large, since a client may read the refusal only afterwards.
+        is_small = int(Headers(scope=scope).get("content-length", "0")) <= MAX_BODY_BYTES
+        body, has_more = bytearray(), is_small
+        while has_more:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return
+            body += message.get("body", b"")
+            is_small = len(body) <= MAX_BODY_BYTES
+            has_more = is_small and message.get("more_body", False)
+        if is_small:
+            await self._answer(scope, bytes(body), receive, send)
+        else:
+            await _TOO_LARGE(scope, receive, send)
+
+    async def _answer(self, scope: Scope, body: bytes, receive: Receive, send: Send) -> None:
+        """Runs the application, for as long as the client waits for its response.
+
+        The application may go on after the response: a message to an event stream's session is
+        accepted first, and delivered then. The session may end in between.
+        """
+        unread: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+        is_complete = False
+
+        async def receive_body() -> Message:
+            if not unread:
+                await anyio.sleep_forever()
+            return unread.pop()
+
+        async def send_on(message: Message) -> None:
+            nonlocal is_complete
+            is_last = message["type"] == "http.response.body" and not message.get("more_body")
+            is_complete = is_complete or is_last
+            await send(message)
+
+        async def cancel_on_disconnect(running: anyio.CancelScope) -> None:
+            # Uvicorn sends this message also when the response is complete.
+            while (await receive())["type"] != "http.disconnect":
+                pass
+            if not is_complete:
+                running.cancel()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(cancel_on_disconnect, tasks.cancel_scope)
+            try:
+                await self._app(scope, receive_body, send_on)
+            except (anyio.BrokenResourceError, anyio.ClosedResourceError):
+                if not is_complete:
+                    raise
+            tasks.cancel_scope.cancel()
+
+
+def _once(send: Send) -> Send:
+    """Returns a `send` that takes a second response for the end of the first.
+
+    When the server stops, the MCP library leaves an event stream open, and answers once more.
+    """
+    has_begun = has_ended = False
+
+    async def send_first(message: Message) -> None:
+        nonlocal has_begun, has_ended
+        if has_begun and message["type"] == "http.response.start":
+            has_ended = True
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
+        has_begun = True
+        if not has_ended:
+            await send(message)
+
+    return send_first

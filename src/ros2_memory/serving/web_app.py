@@ -26,8 +26,8 @@ from ros2_memory.serving.auth import (
     TokenGate,
     is_admitted,
 )
+from ros2_memory.serving.connection_limits import RequestLimits
 from ros2_memory.serving.page import Page
-from ros2_memory.serving.request_limits import RequestLimits
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence

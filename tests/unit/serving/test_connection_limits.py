@@ -20,8 +20,8 @@ from structlog.testing import capture_logs
 from ros2_memory.core.logging_setup import LogThrottle
 from ros2_memory.serving import connection_limits
 from ros2_memory.serving.auth import admit
+from ros2_memory.serving.connection_limits import MAX_BODY_BYTES, RequestLimits
 from ros2_memory.serving.dispatch import MAX_DEPTH, MAX_VALUES, excess_in_arguments
-from ros2_memory.serving.request_limits import MAX_BODY_BYTES, RequestLimits
 from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import (
     GOOD,
