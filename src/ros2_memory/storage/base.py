@@ -17,25 +17,17 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.bag_summary import (
-    OUT_OF_ORDER_NS,
-    BagSummary,
-    SummarySchema,
-    TopicHeader,
-    shared_schema,
-)
 from ros2_memory.core.errors import BagError, UndecodableError
-from ros2_memory.core.pauses import absences_of, noteworthy
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.pauses import CountedPause
 
 T = TypeVar("T")
 IntArray: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
@@ -524,71 +516,3 @@ class BagWriter(ABC):
             BagVanishedError: the source is not there.
             BagError: not all of the source can be read, or the target cannot be written.
         """
-
-
-@dataclass(slots=True)
-class Extent:
-    """Messages of one channel: how many, and the log times of the earliest and the latest."""
-
-    count: int
-    first: Ns
-    last: Ns
-
-
-def summarize_channels(
-    channels: Mapping[int, Channel],
-    totals: Mapping[int, Extent],
-    absences: Mapping[int, Sequence[CountedPause]],
-    *,
-    complete: bool = True,
-    notes: tuple[str, ...],
-    set_back: tuple[Ns, Ns],
-    pauses: Sequence[CountedPause],
-) -> BagSummary:
-    """Returns the summary of a file; channels of one topic and type count as one.
-
-    Args:
-        channels: those that it declares, by number.
-        totals: the messages of each that has some.
-        absences: the pauses of each of more than `SHORTEST_SILENCE_NS`.
-        complete: whether the file was readable to its end.
-        notes: sentences on what is wrong with it.
-        set_back: by how much log times go back, and the first one after that.
-        pauses: where no channel has a message for a while.
-    """
-    by_topic: dict[tuple[str, str], list[int]] = {}
-    for number in totals:
-        channel = channels[number]
-        by_topic.setdefault((channel.topic, channel.type), []).append(number)
-    silent = {channel.topic for channel in channels.values()} - {topic for topic, _ in by_topic}
-    headers: list[TopicHeader] = []
-    numbers: list[int] = []
-    # Encoded at once, without an object for each topic: an index makes thousands of summaries.
-    noted: dict[str, tuple[CountedPause, ...]] = {}
-    for (topic, type_name), members in sorted(by_topic.items()):
-        number, *others = members
-        total, latched, listed = totals[number], channels[number].latched, absences.get(number, ())
-        count, first, last = total.count, total.first, total.last
-        for other in others:
-            total, listed, latched = totals[other], (), latched or channels[other].latched
-            count += total.count
-            first, last = min(first, total.first), max(last, total.last)
-        headers.append(TopicHeader(topic, type_name, channels[number].encoding, latched))
-        numbers += count, first, last
-        # Where it has several types, a pause of one is none of the topic.
-        is_other_type = topic in noted
-        found = absences_of(listed, count, last - first) if listed else ()
-        noted[topic] = () if is_other_type else found
-    length = max(numbers[2::3], default=0) - min(numbers[1::3], default=0)
-    schema = shared_schema(
-        SummarySchema(
-            tuple(headers),
-            tuple(sorted(silent)),
-            complete,
-            notes,
-            set_back if set_back[0] > OUT_OF_ORDER_NS else None,
-            noteworthy(pauses, numbers[::3], length),
-            tuple((topic, found) for topic, found in noted.items() if found),
-        )
-    )
-    return BagSummary.of_numbers(schema, numbers)

@@ -35,9 +35,9 @@ from ros2_memory.storage.base import (
     Record,
     Schema,
     batched,
-    summarize_channels,
 )
 from ros2_memory.storage.cache import ByteLru, shared
+from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import (
     MANY_TOPICS,
     MAX_CHUNK_MB,
@@ -51,8 +51,6 @@ from ros2_memory.storage.errors import (
     UnreadableError,
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
-from ros2_memory.storage.mcap.chunk import Pairs
-from ros2_memory.storage.mcap.index import Contents
 from ros2_memory.storage.mcap.records import offered_as_latched
 from ros2_memory.storage.zstd_bag import uncompressed_payload
 from ros2_memory.typestore import full_name
@@ -149,7 +147,7 @@ class SqliteBags:
         """Returns topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
             is_right = self._is_indexed_right(base, topics)
-            contents = Contents()
+            tally = Tally()
             orphans = impossible = 0
             rows = base.execute(_ROWS)
             while part := rows.fetchmany(_ROWS_AT_ONCE):
@@ -158,26 +156,18 @@ class SqliteBags:
                         "damaged: messages without an integer timestamp or a binary payload"
                     )
                 timed = [(number, time) for number, time, _ in part if 0 <= time < MAX_NS]
-                known = [
-                    (number, time, 0, 0) for number, time in timed if number in topics.channels
-                ]
+                known = [pair for pair in timed if pair[0] in topics.channels]
                 impossible += len(part) - len(timed)
                 orphans += len(timed) - len(known)
                 if known:
-                    contents.add(Pairs(*np.array(known, np.int64).T))
+                    numbers, times = np.array(known, np.int64).T
+                    tally.add(numbers, times, np.zeros_like(times))
         notes = [] if is_right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no topic")
         if impossible:
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
-        return summarize_channels(
-            topics.channels,
-            contents.totals,
-            contents.absences,
-            notes=tuple(notes),
-            set_back=contents.back,
-            pauses=contents.pauses,
-        )
+        return tally.contents().summary(topics.channels, tuple(notes))
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the topics declared in the file."""

@@ -110,7 +110,7 @@ class _Own(threading.local):
 _OWN: Final = _Own()
 
 
-def decompress_zstd(compressed: bytes, limit: SizeLimit) -> bytes:
+def decompress_zstd(compressed: bytes | memoryview, limit: SizeLimit) -> bytes:
     """Decompresses one zstd frame.
 
     Raises:
@@ -148,7 +148,7 @@ def in_turn(front: Callable[[int], bytes], limit: SizeLimit) -> bytes:
     return data
 
 
-def zstd_front(compressed: bytes, size: int) -> bytes:
+def zstd_front(compressed: bytes | memoryview, size: int) -> bytes:
     """Returns the first `size` bytes of a zstd frame that may end early, or all that it has."""
     with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
         return stream.read(size)

@@ -26,9 +26,9 @@ from ros2_memory.storage.base import (
     Batch,
     Channel,
     Closing,
+    IntArray,
     Record,
     batched,
-    summarize_channels,
 )
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
@@ -43,35 +43,30 @@ from ros2_memory.storage.errors import (
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bulk import (
     ReadChunks,
-    are_declared,
     bare_batches,
     batches_of,
+    compared,
     loose_place,
     read_groups,
+    require_declared,
 )
 from ros2_memory.storage.mcap.chunk import (
     Chunk,
-    Column,
     Pairs,
     believed_pairs,
-    declarations_of,
-    in_file_order,
+    chunk_data,
     pairs_in,
-    require_indexed,
     walk_chunk,
 )
 from ros2_memory.storage.mcap.index import (
-    OTHER_DECLARED,
     DoubtError,
     McapIndex,
-    chunk_data,
     index_from_summary,
 )
 from ros2_memory.storage.mcap.merge import RunRows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
-    Declarations,
     closing_of,
     is_finished,
 )
@@ -138,15 +133,7 @@ class McapBags:
         """Returns topics with exact counts and first and last log times."""
         with OpenFile(path, at_once=True) as file:
             index = _Reading(self, file, has_totals=True).verified()
-        return summarize_channels(
-            index.channels,
-            index.totals,
-            index.absences,
-            complete=index.complete,
-            notes=index.notes,
-            set_back=index.set_back,
-            pauses=index.pauses,
-        )
+        return index.contents.summary(index.channels, index.notes, complete=index.complete)
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the channels declared in the file."""
@@ -198,7 +185,7 @@ class _Reading:
     def _known_index(self, *, has_totals: bool) -> McapIndex:
         file, limit, sound = self._file, self._bags.limit, self._bags.sound
         index = self._bags.indexes.get(file.key)
-        if isinstance(index, McapIndex) and (index.totals or not has_totals):
+        if isinstance(index, McapIndex) and (index.contents.totals or not has_totals):
             return index
         reason = self._bags.contradictions.get(file.key)
         if reason is not None:
@@ -239,7 +226,7 @@ class _Reading:
         index, declared = self.index, self.index.declared
         if declared is None:  # it was made of the messages
             return index
-        totals = index.totals.values()
+        totals = index.contents.totals.values()
         ends = sorted({end for total in totals for end in (total.first, total.last)})
         odd = (*index.chunks[:1], *index.chunks[-1:], *_out_of_order(index.chunks))
         looked_at = {chunk.offset for chunk in odd}
@@ -255,32 +242,19 @@ class _Reading:
                 break
             chosen.append(chunk)
         for group in read_groups(self._file, chosen, self._bags.limit):
-            for chunk in () if are_declared(group, declared) else group.chunks:
-                try:
-                    self._require_declared(chunk, declared)
-                except _ContradictedError as error:
-                    return self._without_indexes(error)
-                except UnreadableError:
-                    continue
+            try:
+                require_declared(group, declared)
+            except UnreadableError:
+                for chunk in group.chunks:
+                    try:
+                        content = self._content(chunk)
+                    except UnreadableError:
+                        continue
+                    try:
+                        require_declared(content, declared)
+                    except UnreadableError as error:
+                        return self._without_indexes(error)
         return index
-
-    def _require_declared(self, chunk: Chunk, declared: Declarations) -> None:
-        """Compares a chunk with what its indexes and the summary section say of it.
-
-        Raises:
-            _ContradictedError: it has other messages, or declares a channel otherwise.
-            UnreadableError: it cannot be read.
-        """
-        data = self._chunk_data(chunk)
-        places = in_file_order(self._pairs(chunk, data).offsets)
-        try:
-            with as_unreadable():
-                found = declarations_of(data, places, np.array([len(data)]))
-                agrees = all(declared.agrees(*declaration) for declaration in found)
-        except UnreadableError as error:
-            raise _ContradictedError(reason_of(error)) from error
-        if not agrees:
-            raise _ContradictedError(OTHER_DECLARED)
 
     def records(self, *, newest_first: bool) -> Iterator[Record | LostError]:
         """Yields the messages in order, and errors where some are lost."""
@@ -306,8 +280,8 @@ class _Reading:
         passed: dict[int, Chunk] = {}
         try:
             yield from self._batches(bare, passed)
-            column = self._inside(self.index.loose, self._wanted)
-            pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
+            times, places = self._inside(self.index.loose, self._wanted)
+            pairs = zip(places.tolist(), times.tolist(), strict=True)
             yield from batched(
                 (loose_place(at), self._loose_record(at, time)) for at, time in pairs
             )
@@ -366,7 +340,7 @@ class _Reading:
         self, group: ReadChunks, passed: dict[int, Chunk]
     ) -> Iterator[Batch | LostError]:
         """Yields the messages of chunks that were read together; if that failed, one by one."""
-        if group.buffer is not None:
+        if group.buffer:
             with suppress(UnreadableError, ValueError, IndexError):
                 pairs = pairs_in(group.chunks, group.indexes, self._wanted)
                 batches = self._batches_of(group, pairs)
@@ -387,25 +361,18 @@ class _Reading:
                 was yielded.
         """
         try:
-            data = self._chunk_data(chunk)
+            content = self._content(chunk)
         except UnreadableError as error:
             lost = self._lost(chunk, str(error))
             if lost is not None:
                 yield lost
             return
-        pairs = self._pairs(chunk, data)
+        pairs = self._pairs(content)
         pairs = pairs.taken(np.isin(pairs.channels, [*self._wanted]))
         if before is not None:
-            pairs = pairs.taken(
-                ~np.isin(pairs.offsets, believed_pairs(self._file, before, before.channels).offsets)
-            )
-        try:
-            batches = self._batches_of(ReadChunks([chunk], data, [len(data)]), pairs)
-        except (UnreadableError, ValueError, IndexError) as error:
-            if chunk.index_places is None:
-                raise
-            raise _ContradictedError(reason_of(error)) from error
-        yield from batches
+            known = self._believed(before, before.channels).offsets
+            pairs = pairs.taken(~np.isin(pairs.offsets, known))
+        yield from self._batches_of(content, pairs)
 
     def _batches_of(self, content: ReadChunks, pairs: Pairs) -> Iterator[Batch]:
         return batches_of(content, pairs, self._wanted, self._window, self._uncompressed)
@@ -420,12 +387,12 @@ class _Reading:
         wanted = self._wanted
         # Of large chunks only the last used stays decompressed: all that overlap in time would
         # otherwise be in memory at once.
-        last_used = lru_cache(1)(self._chunk_data)
+        last_used = lru_cache(1)(self._content)
 
         def rows_of(chunk: Chunk) -> RunRows[Record | LostError] | None:
             last_used.cache_clear()  # before the next is decompressed
             try:
-                data = last_used(chunk)
+                content = last_used(chunk)
             except UnreadableError as error:
                 # Only what is wanted by the chunk's index is lost.
                 lost = self._lost(chunk, str(error))
@@ -433,48 +400,49 @@ class _Reading:
                     return None
                 at = lost.last if newest_first else lost.first
                 return RunRows([at], [0], lambda _place, _time: lost)
-            column = self._inside(self._pairs(chunk, data, wanted), wanted)
-            if not column.times.size:
-                return None
+            pairs, data = self._pairs(content, wanted), content.buffer
             if len(data) <= _LARGE_BYTES:
-                return rows(column, partial(self._record, data, wanted))
-            return rows(column, lambda *at: self._record(last_used(chunk), wanted, *at))
+                return rows(pairs, partial(self._record, data, wanted))
+            return rows(pairs, lambda *at: self._record(last_used(chunk).buffer, wanted, *at))
 
-        def rows(column: Column, fetch: Callable[[int, Ns], Record]) -> RunRows[Record | LostError]:
+        def rows(
+            pairs: Pairs, fetch: Callable[[int, Ns], Record]
+        ) -> RunRows[Record | LostError] | None:
             step = -1 if newest_first else 1
-            return RunRows(column.times[::step].tolist(), column.places[::step].tolist(), fetch)
+            times, places = (column[::step].tolist() for column in self._inside(pairs, wanted))
+            return RunRows(times, places, fetch) if times else None
 
         if wanted:
             self._require_beside()
         for chunk in _with_any(self.index, wanted, self._window):
             yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
-        loose = self._inside(self.index.loose, wanted)
-        if loose.times.size:
-            run = rows(loose, self._loose_record)
-            yield SortedRun(int(loose.times[0]), int(loose.times[-1]), 0, lambda: run)
+        loose = rows(self.index.loose, self._loose_record)
+        if loose is not None:
+            first, last = sorted((loose.times[0], loose.times[-1]))
+            yield SortedRun(first, last, 0, lambda: loose)
 
-    def _inside(self, pairs: Pairs, wanted: Collection[int]) -> Column:
-        """Returns the wanted messages inside the window, in order."""
+    def _inside(self, pairs: Pairs, wanted: Collection[int]) -> tuple[IntArray, IntArray]:
+        """Returns log times and offsets of the wanted messages inside the window, in order."""
         channels, numbers = pairs.channels, [*wanted]
         # One alone, as in most questions, is compared in a tenth of the time.
         is_wanted = channels == numbers[0] if len(numbers) == 1 else np.isin(channels, numbers)
-        column = Column.of(pairs.times[is_wanted], pairs.offsets[is_wanted])
-        first, last = column.times.searchsorted((self._window.start, self._window.stop))
-        return Column(column.times[first:last], column.places[first:last])
+        times, places = pairs.times[is_wanted], pairs.offsets[is_wanted]
+        if (times[1:] <= times[:-1]).any():
+            order = np.lexsort((places, times))
+            times, places = times[order], places[order]
+        first, last = times.searchsorted((self._window.start, self._window.stop))
+        return times[first:last], places[first:last]
 
     def _lost(self, chunk: Chunk, reason: str) -> LostError | None:
         """Returns what of the window is lost with a chunk that cannot be read; None if nothing."""
         window = self._window
-        try:
-            with as_unreadable():
-                believed = believed_pairs(self._file, chunk, self._wanted)
-                times = self._inside(believed, self._wanted).times
-        except UnreadableError:
-            window = self._window
-            return LostError(
-                reason, max(chunk.start, window.start), min(chunk.end, window.stop - 1)
-            )
-        return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
+        first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
+        with suppress(UnreadableError), as_unreadable():
+            times, _ = self._inside(self._believed(chunk, self._wanted), self._wanted)
+            if not times.size:
+                return None
+            first, last = int(times[0]), int(times[-1])
+        return LostError(reason, first, last)
 
     def _require_beside(self, passed: Collection[int] = ()) -> None:
         """Compares the chunks beside the window with their records, each once.
@@ -487,15 +455,13 @@ class _Reading:
         for chunk in _beside(self.index, self._window):
             if chunk.index_places is not None and chunk.offset not in passed:
                 try:
-                    self._pairs(chunk)
+                    self._pairs(self._content(chunk))
                 except _ContradictedError as error:
                     raise _ContradictedError(str(error)) from error
                 except UnreadableError:
                     continue
 
-    def _pairs(
-        self, chunk: Chunk, data: bytes | None = None, wanted: Collection[int] | None = None
-    ) -> Pairs:
+    def _pairs(self, content: ReadChunks, wanted: Collection[int] | None = None) -> Pairs:
         """Returns the messages of a chunk, compared with its decompressed records.
 
         Those of all channels, or at least of the `wanted` ones.
@@ -504,30 +470,28 @@ class _Reading:
             _ContradictedError: the indexes do not agree with the records.
             UnreadableError: the records cannot be read.
         """
-        file, is_indexed = self._file, chunk.index_places is not None
+        [chunk] = content.chunks
         channels = chunk.channels if wanted is None else chunk.channels.intersection(wanted)
-        key = (file.key, chunk.offset, channels if is_indexed else None)
+        key = (self._file.key, chunk.offset, channels)
         pairs = self._bags.indexes.get(key)
         if isinstance(pairs, Pairs):
             return pairs
-        data = self._chunk_data(chunk) if data is None else data
-        if not is_indexed:
-            pairs = walk_chunk(data).pairs
+        if chunk.index_places is None:
+            pairs = walk_chunk(content.buffer).pairs
         else:
             try:
-                pairs = believed_pairs(file, chunk, channels)
-                require_indexed(pairs, data, pairs.offsets, len(data))
-                in_file_order(pairs.offsets)
+                pairs = believed_pairs(chunk, content.indexes[0], channels)
+                compared(content, pairs)
             except (UnreadableError, ValueError, IndexError, struct.error) as error:
                 raise _ContradictedError(reason_of(error), chunk) from error
         self._bags.indexes.put(key, pairs, 4 * pairs.times.nbytes + 600)
         return pairs
 
-    def _chunk_data(self, chunk: Chunk) -> bytes:
-        """Returns the decompressed records of a chunk.
+    def _content(self, chunk: Chunk) -> ReadChunks:
+        """Returns a chunk, decompressed, with its message indexes.
 
         Raises:
-            UnreadableError: they cannot be read.
+            UnreadableError: it cannot be read.
         """
         key = (self._file.key, chunk.offset)
         data = self._bags.chunks.get(key)
@@ -535,7 +499,13 @@ class _Reading:
             with as_unreadable():
                 data = chunk_data(self._file, chunk, self._bags.limit)
             self._bags.chunks.put(key, data, len(data))
-        return data
+        return ReadChunks([chunk], data, [len(data)], [self._index_of(chunk)])
+
+    def _index_of(self, chunk: Chunk) -> bytes:
+        return self._file.read(chunk.offset + chunk.length, chunk.index_length)
+
+    def _believed(self, chunk: Chunk, wanted: Collection[int]) -> Pairs:
+        return believed_pairs(chunk, self._index_of(chunk), wanted)
 
     def _record(self, data: bytes, channels: Mapping[int, Channel], place: int, time: Ns) -> Record:
         """Returns a message of a decompressed chunk, whose place was compared with its records."""

@@ -13,26 +13,23 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 
 from ros2_memory.core.arrays import gathered
-from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask, batched
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.mcap.chunk import (
-    NOT_THERE,
     Chunk,
     Pairs,
-    chunk_head,
-    declarations_of,
     decompressed_chunk,
-    in_file_order,
     index_groups,
     pairs_in,
-    require_indexed,
+    walk_chunk,
 )
-from ros2_memory.storage.mcap.records import CHUNK, MESSAGE, RECORD
+from ros2_memory.storage.mcap.index import OTHER_DECLARED
+from ros2_memory.storage.mcap.records import CHUNK, MESSAGE, MESSAGE_FIELDS, RECORD
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed
 
 if TYPE_CHECKING:
@@ -68,13 +65,13 @@ class ReadChunks(NamedTuple):
 
     Attributes:
         chunks: at least one.
-        buffer: their decompressed records; None if one of them cannot be read.
+        buffer: their decompressed records; empty if one of them cannot be read.
         sizes: how many bytes of the buffer each chunk has.
         indexes: the bytes of the message indexes behind each.
     """
 
     chunks: Sequence[Chunk]
-    buffer: bytes | None
+    buffer: bytes
     sizes: Sequence[int]
     indexes: Sequence[bytes] = ()
 
@@ -92,8 +89,8 @@ def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> It
         indexes: list[bytes] = []
         left = BATCH_BYTES
         end = begin
-        buffer: bytes | None = None
-        try:
+        # Whoever reads them one by one finds the reason.
+        with suppress(UnreadableError), as_unreadable():
             while end < len(chunks) and left > 0 and len(parts) < MAX_GROUP_CHUNKS:
                 chunk = chunks[end]
                 record = file.read(chunk.offset, chunk.length + chunk.index_length)
@@ -101,24 +98,36 @@ def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> It
                 if parts and CHUNK.unpack_from(body)[2] > left:
                     break
                 end += 1
-                head = chunk_head(body)
-                compressed = body[head.data_at : head.data_at + head.data_size]
-                parts.append(decompressed_chunk(head, compressed, limit))
+                parts.append(decompressed_chunk(body, limit))
                 indexes.append(record[chunk.length :])
                 left -= len(parts[-1])
                 if BATCH_BYTES - left > LARGE_BYTES:
                     limit.take_turn()
             del record, body
-            buffer = parts[0] if len(parts) == 1 else b"".join(parts)
-        except (OSError, MemoryError, EpisodicError):
-            raise
-        except Exception:  # noqa: BLE001, S110 - whoever reads them one by one finds the reason
-            pass
+        end = max(end, begin + 1)
         sizes = [len(part) for part in parts]
+        is_whole = len(parts) == end - begin
+        buffer = (parts[0] if len(parts) == 1 else b"".join(parts)) if is_whole else b""
         parts.clear()
-        yield ReadChunks(chunks[begin : max(end, begin + 1)], buffer, sizes, indexes)
+        yield ReadChunks(chunks[begin:end], buffer, sizes, indexes if is_whole else ())
         del buffer
-        begin = max(end, begin + 1)
+        begin = end
+
+
+_MESSAGE: Final = int(Opcode.MESSAGE)
+_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<i8"),
+        ("publish_time", "<i8"),
+    ],
+    align=False,
+)
+"""The heads of message records: all but their payloads."""
+_NOT_THERE: Final = "damaged: a message is not where its index says"
 
 
 def compared(
@@ -126,31 +135,60 @@ def compared(
 ) -> tuple[IntArray, np.ndarray[tuple[int], np.dtype[np.void]]]:
     """Returns where messages begin in the buffer of decompressed chunks, and their heads.
 
+    Together with the number of messages, which `mcap.index` compares with the statistics, this
+    proves that all messages of these channels are there: checksums protect the records.
+
     Raises:
-        UnreadableError: a message is not in the records, ends past its chunk, or is there twice.
+        UnreadableError: a message is not there, has another channel or log time, ends past its
+            chunk, or is there twice.
     """
-    sizes = np.array(content.sizes)
-    ends = np.cumsum(sizes)
-    at = pairs.offsets + (ends - sizes)[pairs.chunks]
-    if (pairs.offsets < 0).any():
-        raise UnreadableError(NOT_THERE)
-    heads = require_indexed(pairs, content.buffer or b"", at, ends[pairs.chunks])
-    in_file_order(at)
+    buffer, sizes = content.buffer, np.array(content.sizes)
+    chunk_ends = np.cumsum(sizes)
+    at = pairs.offsets + (chunk_ends - sizes)[pairs.chunks]
+    if at.size and (pairs.offsets.min() < 0 or at.max() > len(buffer) - _HEAD.itemsize):
+        raise UnreadableError(_NOT_THERE)
+    heads, room = gathered(buffer, _HEAD, at), chunk_ends[pairs.chunks] - at - RECORD.size
+    is_other = heads["opcode"] != _MESSAGE
+    is_other |= (heads["channel"] != pairs.channels) | (heads["log_time"] != pairs.times)
+    is_other |= (heads["length"] < MESSAGE_FIELDS) | (heads["length"] > room)
+    if is_other.any():
+        raise UnreadableError(_NOT_THERE)
+    ordered = np.sort(at)
+    if (ordered[1:] == ordered[:-1]).any():
+        raise UnreadableError("damaged: a message index holds a message twice")
     return at, heads
 
 
-def are_declared(content: ReadChunks, declared: Declarations) -> bool:
-    """Returns whether chunks have the messages that their indexes name, and no others.
+def require_declared(content: ReadChunks, declared: Declarations) -> None:
+    """Checks that chunks have no other messages, and declare no other channels, than is known.
 
-    And declare channels as `declared` does. False also where one of them cannot be read.
+    Only the bytes between messages are walked.
+
+    Args:
+        content: the chunks.
+        declared: what the summary section declares.
+
+    Raises:
+        UnreadableError: they do.
     """
-    with suppress(UnreadableError), as_unreadable():
-        buffer, ends = content.buffer, np.cumsum(content.sizes)
-        if buffer is not None:
-            places, _ = compared(content, pairs_in(content.chunks, content.indexes))
-            found = declarations_of(buffer, places, ends)
-            return all(declared.agrees(*declaration) for declaration in found)
-    return False
+    with as_unreadable():
+        at, heads = compared(content, pairs_in(content.chunks, content.indexes))
+        chunk_ends = np.cumsum(content.sizes)
+        begins = np.concatenate([[0], chunk_ends[:-1], at + RECORD.size + heads["length"]])
+        ends = np.concatenate([at, chunk_ends])
+        begins.sort()
+        ends.sort()
+        if (begins > ends).any():
+            raise UnreadableError(_NOT_THERE)
+        has_content = begins < ends
+        for begin, end in zip(
+            begins[has_content].tolist(), ends[has_content].tolist(), strict=True
+        ):
+            walked = walk_chunk(content.buffer[begin:end])
+            if walked.messages:
+                raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
+            if not all(declared.agrees(*declaration) for declaration in walked.declarations):
+                raise UnreadableError(OTHER_DECLARED)
 
 
 def batches_of(
@@ -172,7 +210,7 @@ def batches_of(
     Raises:
         UnreadableError: a message is not in the records, or ends past its chunk.
     """
-    buffer = content.buffer or b""
+    buffer = content.buffer
     if not pairs.times.size:
         return iter(())
     at, heads = compared(content, pairs)

@@ -66,27 +66,6 @@ _PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
 NOT_THERE: Final = "damaged: a message is not where its index says"
 _MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
 _EMPTY: Final[IntArray] = np.zeros(0, dtype=np.int64)
-_ZERO: Final[IntArray] = np.zeros(1, dtype=np.int64)
-
-
-class Column(NamedTuple):
-    """Messages of one part of a file, by log time, ties in file order.
-
-    `places` are the offsets of the message records, in the file or in the decompressed chunk.
-    """
-
-    times: IntArray
-    places: IntArray
-
-    @classmethod
-    def of(cls, times: IntArray, places: IntArray) -> Column:
-        """Returns a sorted column."""
-        if times.size > 1 and not bool((times[1:] > times[:-1]).all()):
-            order = np.lexsort((places, times))
-            times, places = times[order], places[order]
-            if bool(((times[1:] == times[:-1]) & (places[1:] == places[:-1])).any()):
-                raise UnreadableError("damaged: a message index holds a message twice")
-        return cls(times, places)
 
 
 class Chunk(NamedTuple):
@@ -195,17 +174,16 @@ def pairs_in(
     )
 
 
-def believed_pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> Pairs:
-    """Returns the messages of the `wanted` channels of a chunk, by its indexes.
+def believed_pairs(chunk: Chunk, region: bytes, wanted: Collection[int]) -> Pairs:
+    """Returns the messages of the `wanted` channels of a chunk, by the indexes behind it.
 
     These are believed: `pairs_in` found all indexes of the file right when the file was indexed. To
     check them once more takes longer than all else that a chunk takes.
 
     Raises:
-        UnreadableError, ValueError, struct.error: they have changed.
+        ValueError, struct.error: they have changed.
     """
     base = chunk.offset + chunk.length
-    region = file.read(base, chunk.index_length)
     numbers: list[int] = []
     columns = [np.zeros(0, _PAIR)]
     for number, place in _INDEX_PLACE.iter_unpack(chunk.index_places or b""):
@@ -253,97 +231,6 @@ def index_groups(
                 [file.read(member.offset + member.length, member.index_length) for member in group],
             )
             begin, size = nth + 1, 0
-
-
-_HEAD: Final = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<i8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<i8"),
-        ("publish_time", "<i8"),
-    ],
-    align=False,
-)
-"""The heads of message records: all but their payloads."""
-
-
-def require_indexed(
-    pairs: Pairs, data: bytes, places: IntArray, ends: IntArray | int
-) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    """Compares messages with their records, and returns the heads of these.
-
-    Together with the number of messages, which `mcap.index` compares with the statistics, this
-    proves that all messages of these channels are there.
-
-    Args:
-        pairs: the messages, by their indexes.
-        data: the decompressed records, which checksums protect.
-        places: where the record of each message begins.
-        ends: where the records of its chunk end.
-
-    Raises:
-        UnreadableError: a message is not there, has another channel or log time, or does not end in
-            its chunk.
-    """
-    if places.size and (places.min() < 0 or places.max() > len(data) - _HEAD.itemsize):
-        raise UnreadableError(NOT_THERE)
-    heads, room = gathered(data, _HEAD, places), ends - places - RECORD.size
-    is_other = heads["opcode"] != _MESSAGE_OPCODE
-    is_other |= (heads["channel"] != pairs.channels) | (heads["log_time"] != pairs.times)
-    is_other |= (heads["length"] < MESSAGE_FIELDS) | (heads["length"] > room)
-    if is_other.any():
-        raise UnreadableError(NOT_THERE)
-    return heads
-
-
-def in_file_order(places: IntArray) -> IntArray:
-    """Returns where messages begin, ascending.
-
-    Raises:
-        UnreadableError: two of them begin at the same place.
-    """
-    ordered = np.sort(places)
-    if (ordered[1:] == ordered[:-1]).any():
-        raise UnreadableError("damaged: a message index holds a message twice")
-    return ordered
-
-
-def declarations_of(data: bytes, places: IntArray, chunk_ends: IntArray) -> list[tuple[int, bytes]]:
-    """Returns the schema and channel records of chunks; walks only the bytes between messages.
-
-    Args:
-        data: the decompressed records of the chunks.
-        places: where all of their messages begin in these.
-        chunk_ends: where each chunk ends in these, ascending.
-
-    Returns:
-        The opcode and the body of each.
-
-    Raises:
-        UnreadableError: there are other messages between them, or too many declarations.
-    """
-    size = len(data)
-    lengths = gathered(data, _HEAD, places)["length"]
-    if ((lengths < 0) | (lengths > size)).any():
-        raise UnreadableError(NOT_THERE)
-    begins = np.concatenate([_ZERO, chunk_ends[:-1], places + RECORD.size + lengths])
-    ends = np.concatenate([places, chunk_ends])
-    begins.sort()
-    ends.sort()
-    if bool((begins > ends).any()):
-        raise UnreadableError(NOT_THERE)
-    declarations: list[tuple[int, bytes]] = []
-    has_content = begins < ends
-    for begin, end in zip(begins[has_content].tolist(), ends[has_content].tolist(), strict=True):
-        walked = walk_chunk(data[begin:end])
-        if walked.messages:
-            raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
-        declarations += walked.declarations
-        if len(declarations) > MAX_CHUNK_DECLARATIONS:
-            raise UnreadableError(_MANY_DECLARED)
-    return declarations
 
 
 @dataclass(slots=True)
@@ -405,34 +292,13 @@ class ChunkHead(NamedTuple):
     data_at: int
 
 
-CHUNK_HEAD_BYTES: Final = 96
+_HEAD_BYTES: Final = 96
 """The front of the body of a chunk record: all its fields, for any compression."""
-_SMALL_BYTES: Final = 48 << 10
 
 
-def read_compressed_chunk(
-    file: OpenFile, body_at: int, body_size: int, max_bytes: int
-) -> tuple[ChunkHead, bytes]:
-    """Reads the fields of a chunk record, and its data as far as the body reaches.
-
-    Args:
-        file: the open file.
-        body_at: where the record's body begins.
-        body_size: how much of the body there is.
-        max_bytes: the size up to which the data is read.
-
-    Raises:
-        UnreadableError: the fields are not all there, or the data is larger than `max_bytes`.
-    """
-    # A small chunk is read at once: to copy it costs less than a second read.
-    whole = file.read(body_at, body_size if body_size <= _SMALL_BYTES else CHUNK_HEAD_BYTES)
-    head = chunk_head(whole)
-    if head.data_size > max_bytes:
-        raise UnreadableError(too_large("a chunk", max_bytes))
-    in_file = min(body_size - head.data_at, head.data_size)
-    if head.data_at + in_file <= len(whole):
-        return head, whole[head.data_at : head.data_at + in_file]
-    return head, file.read(body_at + head.data_at, in_file)
+def chunk_body(file: OpenFile, at: int, size: int, limit: SizeLimit) -> bytes:
+    """Returns the body of a chunk record, or so much of it that a too large one is recognised."""
+    return file.read(at, min(size, limit.max_bytes + _HEAD_BYTES))
 
 
 def chunk_head(body: bytes) -> ChunkHead:
@@ -451,39 +317,50 @@ def chunk_head(body: bytes) -> ChunkHead:
     return ChunkHead(crc, body[CHUNK.size : name_end].decode(), data_size, name_end + UINT64.size)
 
 
-def decompressed_chunk(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> bytes:
-    """Decompresses a whole chunk, and verifies its checksum if it has one.
+def decompressed_chunk(body: bytes, limit: SizeLimit, *, is_whole: bool = True) -> bytes:
+    """Decompresses a chunk, and verifies its checksum if it has one; or its front, if it is cut.
 
     Nothing is allocated by the size that the chunk states.
 
     Raises:
         UnreadableError: it is damaged, larger than allowed, or its compression is unknown.
     """
-    if len(compressed) != head.data_size:
+    crc, compression, size, at = chunk_head(body)
+    compressed = memoryview(body)[at : at + size]
+    if size > limit.max_bytes:
+        raise UnreadableError(too_large("a chunk", limit.max_bytes))
+    if not is_whole:
+        if compression == "zstd":
+            data = in_turn(partial(zstd_front, compressed), limit)
+        else:
+            data = _decompressed(compression, compressed, limit)
+        return data[: limit.max_bytes]
+    if len(compressed) != size:
         raise UnreadableError("damaged: a chunk is shorter than it states")
-    data = _decompressed(head.compression, compressed, limit)
+    data = _decompressed(compression, compressed, limit)
     if len(data) > limit.max_bytes:
         raise UnreadableError(too_large("a chunk", limit.max_bytes))
-    if head.crc and zlib.crc32(data) != head.crc:
+    if crc and zlib.crc32(data) != crc:
         raise UnreadableError("damaged: a chunk does not match its checksum")
     return data
 
 
-def decompressed_prefix(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> bytes:
-    """Decompresses the front of a chunk that its file ends in."""
-    if head.compression == "zstd":
-        data = in_turn(partial(zstd_front, compressed), limit)
-    else:
-        data = _decompressed(head.compression, compressed, limit)
-    return data[: limit.max_bytes]
+def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
+    """Returns the decompressed records of a chunk; see `decompressed_chunk`.
+
+    Raises:
+        UnreadableError: the chunk is damaged or larger than allowed.
+    """
+    body = chunk_body(file, chunk.offset + RECORD.size, chunk.length - RECORD.size, limit)
+    return decompressed_chunk(body, limit, is_whole=chunk.usable is None)[: chunk.usable]
 
 
-def _decompressed(compression: str, compressed: bytes, limit: SizeLimit) -> bytes:
+def _decompressed(compression: str, compressed: memoryview, limit: SizeLimit) -> bytes:
     """Returns at most one byte more than allowed, so that the caller sees the excess."""
     if not compression:
         if len(compressed) > LARGE_BYTES:
             limit.take_turn()
-        return compressed
+        return bytes(compressed)
     if compression == "zstd":
         return decompress_zstd(compressed, limit)
     if compression == "lz4":
@@ -491,7 +368,7 @@ def _decompressed(compression: str, compressed: bytes, limit: SizeLimit) -> byte
     raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")
 
 
-def _lz4_front(compressed: bytes, size: int) -> bytes:
+def _lz4_front(compressed: memoryview, size: int) -> bytes:
     return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, size))
 
 
@@ -501,14 +378,12 @@ class OpenedChunk(NamedTuple):
     Attributes:
         data: the decompressed records; only the first `content.usable` bytes are whole records.
         content: what the records hold.
-        data_at: where the compressed data begins in the body of the chunk record.
-        compression: how it was compressed; empty where it was not.
+        is_compressed: whether it was.
     """
 
     data: bytes
     content: ChunkContent
-    data_at: int
-    compression: str
+    is_compressed: bool
 
 
 class ChunkOpener:
@@ -536,14 +411,12 @@ class ChunkOpener:
                 f"its chunks hold more than {MAX_COMPRESSION_RATIO} times what the file does"
             )
         in_file = min(record.end, self._file.size) - record.body_at
-        decompress = decompressed_chunk if record.end <= self._file.size else decompressed_prefix
         with as_unreadable():
-            head, compressed = read_compressed_chunk(
-                self._file, record.body_at, in_file, self._limit.max_bytes
-            )
-            data = decompress(head, compressed, self._limit)
+            body = chunk_body(self._file, record.body_at, in_file, self._limit)
+            is_whole = record.end <= self._file.size
+            data = decompressed_chunk(body, self._limit, is_whole=is_whole)
             self._bytes += len(data)
             content = walk_chunk(data)
         self._bytes += MESSAGE_BYTES * content.messages
         self._chunks += 1
-        return OpenedChunk(data, content, head.data_at, head.compression)
+        return OpenedChunk(data, content, bool(chunk_head(body).compression))

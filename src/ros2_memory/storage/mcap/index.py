@@ -13,26 +13,19 @@ import zlib
 from functools import lru_cache
 from itertools import pairwise
 from operator import attrgetter, le
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
 
+from ros2_memory.core.arrays import run_starts
 from ros2_memory.core.bag_summary import MESSAGES_MISSING, WRONG_STATISTICS
-from ros2_memory.core.pauses import (
-    SHORTEST_PAUSE_NS,
-    SHORTEST_SILENCE_NS,
-    CountedPause,
-    pauses_among,
-)
 from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
-from ros2_memory.storage.base import Extent
 from ros2_memory.storage.cache import unshared_bytes
+from ros2_memory.storage.contents import Contents, Tally
 from ros2_memory.storage.errors import (
     MAX_CHUNKS,
     MAX_SECTION_BYTES,
-    SizeLimit,
     UnreadableError,
     as_unreadable,
     reason_of,
@@ -43,12 +36,9 @@ from ros2_memory.storage.mcap.chunk import (
     OUTSIDE,
     Chunk,
     Pairs,
-    decompressed_chunk,
-    decompressed_prefix,
     index_bytes,
     index_groups,
     pairs_in,
-    read_compressed_chunk,
 )
 from ros2_memory.storage.mcap.records import (
     FOOTER,
@@ -64,14 +54,14 @@ if TYPE_CHECKING:
 
     from mcap.records import Statistics
 
-    from ros2_memory.storage.base import Channel, IntArray
+    from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.contents import Extent
     from ros2_memory.storage.file_io import OpenFile
 
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
 _INDEX_LENGTH: Final = struct.Struct("<Q")
 _new_tuple: Final = tuple.__new__
-_NONE: Final = np.empty(0, np.int64)
 _MAX_CACHED_BYTES: Final = 128 << 10
 
 # Plain integers: the opcodes of records are compared with them some million times.
@@ -211,14 +201,10 @@ class McapIndex(NamedTuple):
         channels: the channels by their number in the file.
         channel_bytes: memory that the channels take which no other file shares.
         chunks: the chunks with messages, in file order.
-        totals: the messages of each channel that has some; none where they were not asked for.
         loose: the messages outside chunks; their offsets are in the file.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
-        set_back: by how much the log times of a channel go back at most, from one chunk to a later
-            one or from one message to the next, and the first one after that.
-        pauses: where no channel has a message for more than `SHORTEST_PAUSE_NS`.
-        absences: by channel, where it has none for more than `SHORTEST_SILENCE_NS`.
+        contents: what the messages amount to; nothing where that was not asked for.
         seams: where the times of chunks do not go on from one to the next; empty after a scan.
         contradiction: how the indexes of the file contradict its messages, if that was found after
             they had been used; else empty.
@@ -228,13 +214,10 @@ class McapIndex(NamedTuple):
     channels: Mapping[int, Channel]
     channel_bytes: int
     chunks: tuple[Chunk, ...]
-    totals: Mapping[int, Extent]
+    contents: Contents = Contents()
     loose: Pairs = NO_PAIRS
     complete: bool = True
     notes: tuple[str, ...] = ()
-    set_back: tuple[Ns, Ns] = (0, 0)
-    pauses: Sequence[CountedPause] = ()
-    absences: Mapping[int, Sequence[CountedPause]] = MappingProxyType({})
     seams: tuple[Seam, ...] = ()
     contradiction: str = ""
     declared: Declarations | None = None
@@ -251,117 +234,6 @@ class McapIndex(NamedTuple):
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
         loose = 4 * self.loose.times.nbytes
         return 1000 + self.channel_bytes + 400 * len(self.chunks) + places + loose
-
-
-class Contents:
-    """What the messages of a file amount to, added some chunks at a time."""
-
-    def __init__(self) -> None:
-        self.totals: dict[int, Extent] = {}
-        self.back: tuple[Ns, Ns] = (0, 0)  # as `set_back` of `McapIndex`
-        self._held: list[tuple[IntArray, IntArray, IntArray]] = []
-        self._spans: list[tuple[IntArray, IntArray, IntArray, IntArray]] = []  # by channel
-
-    def add(self, pairs: Pairs) -> tuple[IntArray, IntArray]:
-        """Adds all messages of chunks, which follow those before in the file.
-
-        Returns:
-            The first and the last log time of each chunk with messages, of which there is one.
-        """
-        parts = _begins_of_groups(pairs.chunks)
-        starts = np.minimum.reduceat(pairs.times, parts)
-        ends = np.maximum.reduceat(pairs.times, parts)
-        # Of a short chunk its bounds will do.
-        is_long = ends - starts > SHORTEST_PAUSE_NS
-        counts = np.diff(parts, append=pairs.times.size)
-        inside = pairs.times[np.repeat(is_long, counts)]
-        self._held.append((starts[~is_long], ends[~is_long], counts[~is_long]))
-        self._held.append((inside, inside, np.ones_like(inside)))
-        order = np.argsort(pairs.channels, kind="stable")
-        numbers, times = pairs.channels[order], pairs.times[order]
-        parts = _begins_of_groups(numbers, pairs.chunks[order])
-        back = -np.diff(times, prepend=times[:1])
-        back[parts] = 0
-        most = int(back.argmax())
-        self.back = max(self.back, (int(back[most]), int(times[most])))
-        spans = (
-            numbers[parts],
-            np.minimum.reduceat(times, parts),
-            np.maximum.reduceat(times, parts),
-            np.diff(parts, append=numbers.size),
-        )
-        is_long = spans[2] - spans[1] > SHORTEST_SILENCE_NS
-        if is_long.any():
-            of_long = np.repeat(is_long, spans[3])
-            long_times = times[of_long]
-            ones = np.ones_like(long_times)
-            self._spans.append((numbers[of_long], long_times, long_times, ones))
-        short_numbers, *short = (column[~is_long] for column in spans)
-        self._spans.append((short_numbers, short[0], short[1], short[2]))
-        numbers, firsts, lasts, counts = spans
-        is_same = numbers[1:] == numbers[:-1]
-        if not (is_same & (firsts[1:] < lasts[:-1])).any():
-            # They follow each other, as in most files: those of a channel are one.
-            begin = np.append(0, np.flatnonzero(~is_same) + 1)
-            last = np.append(begin[1:], numbers.size) - 1
-            spans = numbers[begin], firsts[begin], lasts[last], np.add.reduceat(counts, begin)
-        rows = zip(*(column.tolist() for column in spans), strict=True)
-        for number, first, last, count in rows:
-            total = self.totals.get(number)
-            if total is not None and total.last > first:
-                self.back = max(self.back, (total.last - first, first))
-            self._count(number, count, first, last)
-        return starts, ends
-
-    def join(self, other: Contents) -> None:
-        """Adds other messages of the file, whose order relative to these is unknown."""
-        for number, extent in other.totals.items():
-            self._count(number, extent.count, extent.first, extent.last)
-        self.back = max(self.back, other.back)
-        self._held += other._held
-        self._spans += other._spans
-
-    def _count(self, number: int, count: int, first: Ns, last: Ns) -> None:
-        total = self.totals.get(number)
-        if total is None:
-            self.totals[number] = Extent(count, first, last)
-            return
-        total.count += count
-        # Some hundred times a file: `min` and `max` take four times as long.
-        total.first = min(total.first, first)
-        total.last = max(total.last, last)
-
-    @property
-    def pauses(self) -> Sequence[CountedPause]:
-        """As `pauses` of `McapIndex`."""
-        held = self._held or [(_NONE, _NONE, _NONE)]
-        return pauses_among(*map(np.concatenate, zip(*held, strict=True)))
-
-    @property
-    def absences(self) -> Mapping[int, Sequence[CountedPause]]:
-        """As `absences` of `McapIndex`."""
-        last = max((total.last for total in self.totals.values()), default=0)
-        first = min((total.first for total in self.totals.values()), default=0)
-        if last - first <= SHORTEST_SILENCE_NS:  # as most splits
-            return {}
-        numbers, *spans = map(np.concatenate, zip(*self._spans, strict=True))
-        order = np.lexsort((spans[0], numbers))
-        apart = spans[0][order[1:]] - spans[1][order[:-1]] > SHORTEST_SILENCE_NS
-        may_pause = {*numbers[order[1:][apart]].tolist()}
-        by_channel = {
-            number: pauses_among(
-                *(column[numbers == number] for column in spans), longer_than=SHORTEST_SILENCE_NS
-            )
-            for number in self.totals
-            if number in may_pause
-        }
-        return {number: pauses for number, pauses in by_channel.items() if pauses}
-
-
-def _begins_of_groups(*columns: IntArray) -> IntArray:
-    """Returns the positions of the rows that differ from the row before; the first is one."""
-    is_other = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
-    return np.append(0, np.flatnonzero(is_other) + 1)
 
 
 def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
@@ -385,19 +257,6 @@ def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
     return tuple(seams) if len(seams) <= _MOST_SEAMS else ()
 
 
-def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
-    """Returns the decompressed records of a chunk; see `decompressed_chunk`.
-
-    Raises:
-        UnreadableError: the chunk is damaged or larger than allowed.
-    """
-    body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
-    head, compressed = read_compressed_chunk(file, body_at, body_size, limit.max_bytes)
-    if chunk.usable is not None:
-        return decompressed_prefix(head, compressed, limit)[: chunk.usable]
-    return decompressed_chunk(head, compressed, limit)
-
-
 def index_from_summary(file: OpenFile, *, is_sound: bool = False) -> McapIndex:
     """Returns the index that the summary section and the message indexes give.
 
@@ -415,22 +274,22 @@ def index_from_summary(file: OpenFile, *, is_sound: bool = False) -> McapIndex:
         raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
     if is_sound or not index.chunks:
         return index
-    contents = Contents()
+    tally = Tally()
     with as_unreadable():
         for group, regions in index_groups(file, index.chunks):
-            firsts, lasts = contents.add(pairs_in(group, regions))
+            pairs = pairs_in(group, regions)
+            tally.add(pairs.channels, pairs.times, pairs.chunks)
+            begins = run_starts(pairs.chunks)
+            firsts = np.minimum.reduceat(pairs.times, begins).tolist()
+            lasts = np.maximum.reduceat(pairs.times, begins).tolist()
             stated_times = [(chunk.start, chunk.end) for chunk in group]
-            if [*zip(firsts.tolist(), lasts.tolist(), strict=True)] != stated_times:
+            if [*zip(firsts, lasts, strict=True)] != stated_times:
                 raise UnreadableError(OUTSIDE)
+    contents = tally.contents()
     if contents.totals.keys() != stated.channel_message_counts.keys():
         raise DoubtError
-    return index._replace(
-        totals=contents.totals,
-        notes=disagreements(stated, contents.totals),
-        set_back=contents.back,
-        pauses=contents.pauses,
-        absences=contents.absences,
-    )
+    notes = disagreements(stated, contents.totals)
+    return index._replace(contents=contents, notes=notes)
 
 
 def _index_without_totals(file: OpenFile, *, is_sound: bool) -> tuple[McapIndex, Statistics]:
@@ -457,7 +316,7 @@ def _index_without_totals(file: OpenFile, *, is_sound: bool) -> tuple[McapIndex,
     if index_bytes(indexes, stated.message_count) != index_length:
         raise DoubtError("its message indexes do not hold what its statistics state")
     seams = _seams(filled)
-    index = McapIndex(channels, channel_bytes, tuple(filled), {}, seams=seams, declared=declared)
+    index = McapIndex(channels, channel_bytes, tuple(filled), seams=seams, declared=declared)
     return index, stated
 
 

@@ -14,16 +14,12 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.text import counted
-from ros2_memory.storage.base import Closing, Extent
+from ros2_memory.storage.base import Closing
 from ros2_memory.storage.cache import unshared_bytes
+from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
 from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, Pairs
-from ros2_memory.storage.mcap.index import (
-    OTHER_DECLARED,
-    Contents,
-    McapIndex,
-    disagreements,
-)
+from ros2_memory.storage.mcap.index import OTHER_DECLARED, McapIndex, disagreements
 from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     MESSAGE,
@@ -35,8 +31,11 @@ from ros2_memory.storage.mcap.records import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mcap.records import Statistics
 
+    from ros2_memory.storage.contents import Extent
     from ros2_memory.storage.file_io import OpenFile
 
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
@@ -73,11 +72,12 @@ class _Scan:
     in_chunks: Declarations = field(default_factory=Declarations)
     redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
-    contents: Contents = field(default_factory=Contents)
+    tally: Tally = field(default_factory=Tally)
     # Of messages outside chunks: channels, log times and offsets.
     loose: tuple[array[int], array[int], array[int]] = field(
         default_factory=lambda: (array("H"), array("Q"), array("q"))
     )
+    tallied: int = 0  # of these
     stated: Statistics | None = None
     messages: int = 0
     damaged: list[str] = field(default_factory=list)
@@ -133,11 +133,11 @@ class _Scan:
         if not usable:
             return
         self._add_content(opened.content, record.offset, self.file.size, usable)
-        if opened.compression:
+        if opened.is_compressed:
             self.partial = self.file.size - record.offset
             self.read_to = self.file.size
         else:
-            self.read_to = record.body_at + opened.data_at + usable
+            self.read_to = self.file.size - len(opened.data) + usable
 
     def _add_content(
         self, content: ChunkContent, offset: int, end: int, usable: int | None
@@ -150,27 +150,30 @@ class _Scan:
         self.messages += content.messages
         pairs = content.pairs
         if pairs.times.size:
-            firsts, lasts = self.contents.add(pairs)
-            first, last = int(firsts[0]), int(lasts[0])
+            self._tally_loose()
+            self.tally.add(pairs.channels, pairs.times, pairs.chunks)
+            first, last = int(pairs.times.min()), int(pairs.times.max())
             numbers = frozenset(pairs.channels.tolist())
             self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
+
+    def _tally_loose(self) -> None:
+        """Counts the messages outside chunks up to here, each as a chunk of its own."""
+        loose = Pairs.of(*(column[self.tallied :] for column in self.loose))
+        self.tallied = len(self.loose[0])
+        if loose.times.size:
+            self.tally.add(loose.channels, loose.times, np.arange(loose.times.size))
 
     def index(self, note: str) -> McapIndex:
         """Returns the index of the messages found; `note` comes before its other notes."""
         complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
-        loose = Pairs.of(*self.loose)
-        if loose.times.size:
-            beside = Contents()
-            beside.add(loose._replace(chunks=np.arange(loose.times.size)))
-            self.contents.join(beside)
+        self._tally_loose()
+        contents = self.tally.contents()
         declarations = self.repeated
         differing = declarations.update(self.declared)
         differing = declarations.update(self.in_chunks) or differing
         channels = declarations.channels()
-        totals = {
-            channel: total for channel, total in self.contents.totals.items() if channel in channels
-        }
-        notes = self._notes(totals, complete=complete)
+        totals = {number: total for number, total in contents.totals.items() if number in channels}
+        notes = self._notes(contents.totals, totals, complete=complete)
         if note:
             notes.insert(0, note)
         if differing and not note.startswith(OTHER_DECLARED):
@@ -181,18 +184,17 @@ class _Scan:
             channels,
             unshared_bytes(channels),
             tuple(self.chunks),
-            totals,
-            loose,
+            contents._replace(totals=totals),
+            Pairs.of(*self.loose),
             complete=complete,
             notes=tuple(notes),
-            set_back=self.contents.back,
-            pauses=self.contents.pauses,
-            absences=self.contents.absences,
         )
 
-    def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
+    def _notes(
+        self, found: Mapping[int, Extent], totals: Mapping[int, Extent], *, complete: bool
+    ) -> list[str]:
         notes = [] if complete else [self._end_note()]
-        timed = sum(total.count for total in self.contents.totals.values())
+        timed = sum(total.count for total in found.values())
         if orphans := timed - sum(total.count for total in totals.values()):
             notes.append(f"left out: {counted(orphans, 'message')} of no declared channel")
         if self.damaged:
