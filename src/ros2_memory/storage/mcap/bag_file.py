@@ -430,7 +430,7 @@ class _Reading:
         if (times[1:] <= times[:-1]).any():
             order = np.lexsort((places, times))
             times, places = times[order], places[order]
-        first, last = times.searchsorted((self._window.start, self._window.stop))
+        first, last = times.searchsorted((self._window.start, min(self._window.stop, MAX_NS)))
         return times[first:last], places[first:last]
 
     def _lost(self, chunk: Chunk, reason: str) -> LostError | None:
