@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self
 from ros2_memory.storage.errors import UnreadableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
 EMPTY_FILE: Final = "empty file: nothing had reached the disk"
@@ -107,19 +106,3 @@ class OpenFile:
             offset += len(piece)
             missing -= len(piece)
         return b"".join(pieces)
-
-    def read_each(self, offsets: Iterable[int], length: int) -> list[bytes]:
-        """Returns up to `length` bytes from each of these offsets, fewer at the end of the file.
-
-        Raises:
-            UnreadableError: the file became shorter.
-        """
-        if len(self._whole) == self.size:
-            return [self._whole[offset : offset + length] for offset in offsets]
-        # One call for all: a file has a chunk, and so an offset, for each 16 KiB to 1 MiB.
-        read, descriptor = os.pread, self._descriptor
-        pieces = [(offset, read(descriptor, length, offset)) for offset in offsets]
-        return [
-            piece if len(piece) == length else self.read(offset, min(length, self.size - offset))
-            for offset, piece in pieces
-        ]

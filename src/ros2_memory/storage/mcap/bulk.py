@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from mcap.opcode import Opcode
 
-from ros2_memory.core.arrays import gathered
+from ros2_memory.core.arrays import gathered, run_starts
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask, batched
@@ -216,31 +216,50 @@ def batches_of(
     at, heads = compared(content, pairs)
     stops = at + RECORD.size + heads["length"]
     order = _in_window(pairs, window)
-    at, numbers = at[order], pairs.channels[order]
-    steps = np.array([place_of(chunk) for chunk in content.chunks])[pairs.chunks[order]]
-    published = _published(heads["publish_time"][order], pairs.times[order])
-    times, places = pairs.times[order], pairs.offsets[order] + steps
-    starts = at + MESSAGE.size
-    lengths = stops[order] - starts
-    has_frames = bool(_are_frames(buffer, starts, lengths).any())
-    bounds = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
-    edges = [0, *bounds.tolist(), numbers.size] if numbers.size else []
-    batches: list[Batch] = []
-    for first, last in pairwise(edges):
+    stated, logged = heads["publish_time"][order], pairs.times[order]
+    # An unsigned time past the signed range has become negative. Some writers write 0 for unknown.
+    published = np.where((stated <= 0) | (stated == MAX_NS), logged, stated)
+    starts = at[order] + MESSAGE.size
+    sizes = stops[order] - starts
+    batches = _by_channel(
+        pairs, order, content.chunks, channels, (published, buffer, starts, sizes)
+    )
+    if not _are_frames(buffer, starts, sizes).any():
+        return batches
+    return chain.from_iterable(_decompressed(framed, uncompressed) for framed in batches)
+
+
+def _by_channel(
+    pairs: Pairs,
+    order: IntArray,
+    chunks: Sequence[Chunk],
+    channels: Mapping[int, Channel],
+    payloads: tuple[IntArray, bytes, IntArray, IntArray],
+) -> Iterator[Batch]:
+    """Returns a batch for each channel of messages.
+
+    Args:
+        pairs: the messages, and others.
+        order: their positions among these, channel by channel.
+        chunks: that these are in.
+        channels: by their number.
+        payloads: their publish times, and buffer, starts and sizes of a `Batch`.
+    """
+    numbers, times = pairs.channels[order], pairs.times[order]
+    steps = np.array([place_of(chunk) for chunk in chunks])[pairs.chunks[order]]
+    places = pairs.offsets[order] + steps
+    published, buffer, starts, sizes = payloads
+    for first, last in pairwise([*run_starts(numbers).tolist(), numbers.size]):
         rows = slice(first, last)
-        batch = Batch(
+        yield Batch(
             channels[int(numbers[first])],
             times[rows],
             published[rows],
             places[rows],
             buffer,
             starts[rows],
-            lengths[rows],
+            sizes[rows],
         )
-        batches.append(batch)
-    if not has_frames:
-        return iter(batches)
-    return chain.from_iterable(_decompressed(framed, uncompressed) for framed in batches)
 
 
 def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
@@ -248,12 +267,6 @@ def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
     order: IntArray = np.argsort(pairs.channels, kind="stable")
     is_inside = (pairs.times >= window.start) & (pairs.times < window.stop)
     return order if is_inside.all() else order[is_inside[order]]
-
-
-def _published(stated: IntArray, logged: IntArray) -> IntArray:
-    # An unsigned time past the signed range has become negative. Some writers write 0 for unknown.
-    is_impossible = (stated <= 0) | (stated == MAX_NS)
-    return np.where(is_impossible, logged, stated) if is_impossible.any() else stated
 
 
 def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
@@ -290,11 +303,6 @@ def bare_batches(
     for group, indexes in index_groups(file, chunks):
         pairs = pairs_in(group, indexes, channels)
         order = _in_window(pairs, window)
-        steps = np.array([place_of(chunk) for chunk in group])[pairs.chunks[order]]
-        numbers, times = pairs.channels[order], pairs.times[order]
-        places = pairs.offsets[order] + steps
-        for number in np.unique(numbers).tolist():
-            is_of_channel = numbers == number
-            none = np.zeros(int(is_of_channel.sum()), np.int64)
-            logged = times[is_of_channel]
-            yield Batch(channels[number], logged, logged, places[is_of_channel], b"", none, none)
+        none = np.zeros(order.size, np.int64)
+        payloads = pairs.times[order], b"", none, none
+        yield from _by_channel(pairs, order, group, channels, payloads)

@@ -171,7 +171,6 @@ _OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
 OTHER_DECLARED: Final = "its summary section declares other channels or types than its messages"
 _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
-_STATED_BYTES: Final = _STATED.size
 _HEAD_BYTES: Final = RECORD.size
 _SEAM_SHARE: Final = 16
 _SEAM_TIMES: Final = 4
@@ -334,7 +333,7 @@ def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]
     heads = [
         _stating(_CHUNK, chunk.length - _HEAD_BYTES, chunk.start, chunk.end) for chunk in ordered
     ]
-    if file.read_each(begins, _STATED_BYTES) != heads:
+    if [file.read(begin, _STATED.size) for begin in begins] != heads:
         raise DoubtError(_OTHER_CHUNKS)
     ends = [MAGIC_SIZE, *[chunk.offset + chunk.length + chunk.index_length for chunk in ordered]]
     begins.append(end)
