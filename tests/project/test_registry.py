@@ -8,17 +8,12 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import sys
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import jsonschema
 
-from tests.project.test_documents import asked
 from tests.support.memories import ROOT
-from tests.support.robot_run import write_run
 
 SERVER: Any = json.loads((ROOT / "server.json").read_text(encoding="utf-8"))
 [PACKAGE] = SERVER["packages"]
@@ -45,19 +40,3 @@ def test_every_variable_is_one_that_the_programs_read() -> None:
     example = (ROOT / ".env.example").read_text(encoding="utf-8")
     known = set(re.findall(r"^#([A-Z_]+)=", example, re.MULTILINE))
     assert {variable["name"] for variable in PACKAGE["environmentVariables"]} <= known
-
-
-async def test_a_client_that_runs_the_package_so_is_answered(tmp_path: Path) -> None:
-    write_run(tmp_path / "bags")
-    assert PACKAGE["runtimeHint"] == "uvx"
-    assert PACKAGE["transport"] == {"type": "stdio"}
-    # uvx runs the program of the package's own name.
-    program = shutil.which(PACKAGE["identifier"], path=str(Path(sys.executable).parent))
-    assert program
-    arguments = [each["value"] for each in PACKAGE["packageArguments"]]
-    given = {"MEMORY_BAG_DIR": str(tmp_path / "bags")}
-    for variable in PACKAGE["environmentVariables"]:
-        if variable["name"] not in given:
-            assert not variable.get("isRequired")
-            given[variable["name"]] = variable["default"]
-    assert (await asked(program, arguments, given))["reply"]["bags"] == 1

@@ -49,7 +49,6 @@ UNMEASURED: Final = (
     "recorder/test_supervisor*.py",
     "soak/*.py",
     "test_any_cut.py",
-    "test_benchmarks.py",
     "test_cancelled.py",
     "test_clock_steps.py",
     "test_confinement.py::test_no_text_of_a_caller",

@@ -128,19 +128,13 @@ class SummarySchema:
         topics, silent, complete, notes, set_back, pauses, absences = json.loads(text)
         return shared_schema(
             SummarySchema(
-                tuple(
-                    TopicHeader(topic, type_name, encoding, bool(latched))
-                    for topic, type_name, encoding, latched in topics
-                ),
+                tuple(TopicHeader(*header) for header in topics),
                 tuple(silent),
-                bool(complete),
+                complete,
                 tuple(notes),
-                set_back and (int(set_back[0]), int(set_back[1])),
-                tuple((int(start), int(end)) for start, end in pauses),
-                tuple(
-                    (topic, tuple((int(start), int(end), int(sent)) for start, end, sent in listed))
-                    for topic, listed in absences
-                ),
+                set_back and tuple(set_back),
+                tuple(map(tuple, pauses)),
+                tuple((topic, tuple(map(tuple, listed))) for topic, listed in absences),
             )
         )
 
@@ -238,11 +232,6 @@ class BagSummary:
         )
         numbers = [part for topic in topics for part in (topic.count, topic.first, topic.last)]
         self.data = _packed(self.schema, numbers)
-
-    @classmethod
-    def of_numbers(cls, schema: SummarySchema, numbers: Sequence[int]) -> Self:
-        """Returns the summary of count, first and last of each topic of a schema."""
-        return cls.decoded(schema, _packed(schema, numbers))
 
     @classmethod
     def decoded(cls, schema: SummarySchema, data: bytes) -> Self:

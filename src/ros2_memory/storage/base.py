@@ -270,6 +270,7 @@ class BagReader(ABC):
         """
         return next(self.records(path, [topic], window, newest_first=True), None)
 
+    @abstractmethod
     def batches(
         self,
         path: Path,
@@ -298,11 +299,6 @@ class BagReader(ABC):
                 are found to contradict the messages (`BagContradictionError`), the messages that
                 were not yielded yet follow, and none is lost.
         """
-        del bare
-
-        records = or_errors(self.records(path, topics, window))
-        # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-        return map(unless_error, batched(enumerate(records)))
 
     @abstractmethod
     def undecodable(self, channel: Channel) -> str | None:

@@ -13,7 +13,6 @@ from ros2_memory.bootstrap import build_memory, reading_of
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
-from ros2_memory.retention.clear import clear_bags
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import keeper_of
 
@@ -57,21 +56,6 @@ def bags(tmp_path: Path) -> Iterator[Path]:
     yield folder
     # pytest would recurse.
     subprocess.run(["rm", "-rf", str(folder)], check=True)
-
-
-def test_what_cannot_be_deleted_is_named_a_hundred_times_and_counted(
-    bags: Path, bag: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(130):
-        os.link(bag, bags / f"{number}.mcap")
-
-    def refused(*_path: object, **_dir_fd: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "unlink", refused)
-    wiped = clear_bags(bags)
-    assert (wiped.files, len(wiped.faults), wiped.more) == (0, 100, 30)
-    assert f"{bags}/" in wiped.faults[0]
 
 
 def test_they_are_scanned_repaired_read_for_definitions_and_removed(

@@ -98,13 +98,3 @@ def test_a_turn_that_is_passed_on_is_taken_again_behind_who_waited() -> None:
         other.join()
     assert [each > 0 for each in waits] == [True]
     assert not waiting(large)
-
-
-def test_a_block_in_a_block_is_part_of_it() -> None:
-    large, waits = LargeReads(), list[int]()
-    with large.during(waited=waits.append):
-        with large.during():
-            large.acquire()
-        assert waiting(large) == 1
-    assert not waiting(large)
-    assert not waits  # it was free

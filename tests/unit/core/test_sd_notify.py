@@ -31,13 +31,6 @@ def test_it_is_told_over_an_abstract_socket_too(monkeypatch: pytest.MonkeyPatch)
         assert listener.recv(100) == b"STOPPING=1\nSTATUS=over"
 
 
-def test_it_is_told_twice_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    set_only(monkeypatch, {"WATCHDOG_USEC": "30000000"})
-    assert watchdog_interval_s() == 15
-    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
-    assert watchdog_interval_s() == 15
-
-
 @pytest.mark.parametrize(
     "env",
     [

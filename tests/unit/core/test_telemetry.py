@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
-import anyio
-
 from ros2_memory.core.telemetry import Answered, Observer, Telemetry
 from ros2_memory.serving.dispatch import Dispatcher
 from tests.unit.serving.test_dispatch import served, tool, value
-
-
-class Heard(Observer):
-    def __init__(self) -> None:
-        self.calls: list[Answered] = []
-
-    def answered(self, call: Answered) -> None:
-        self.calls.append(call)
 
 
 class Failing(Observer):
@@ -24,14 +14,6 @@ class Failing(Observer):
 
 def dispatcher(observer: Observer) -> Dispatcher:
     return served(tool("good", lambda _: value(7)), telemetry=Telemetry((observer,))).dispatcher
-
-
-async def test_a_call_that_its_client_left_is_told_as_cancelled() -> None:
-    heard = Heard()
-    with anyio.CancelScope() as scope:
-        scope.cancel()
-        await dispatcher(heard).answer("good", {})
-    assert [call.outcome for call in heard.calls] == ["cancelled"]
 
 
 async def test_an_observer_that_fails_costs_no_answer() -> None:

@@ -35,15 +35,3 @@ def test_a_message_of_a_type_whose_definition_is_empty_names_what_to_set() -> No
         decoding.decode(record)
     nothing = record._replace(payload=b"\x00\x01\x00\x00\x00")
     assert decoding.decode(nothing) is not None
-
-
-def test_equal_channels_of_two_bags_decode_alike_and_different_ones_each_in_their_way() -> None:
-    decoding = McapReader()
-    message = text(1, "x")
-    for _ in range(3):
-        own = record_of(message)
-        assert getattr(decoding.decode(own), "data", "") == "x"
-        other = record_of(
-            message, Schema(message.type, "ros2msg", b"uint32 size\nuint8[2] bytes\n")
-        )
-        assert getattr(decoding.decode(other), "size", 0) == 2

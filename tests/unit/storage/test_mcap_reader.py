@@ -4,11 +4,8 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
-import zstandard
-from mcap import records as mcap_records
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from ros2_memory.core.errors import (
     BagContradictionError,
@@ -16,10 +13,9 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.mcap.records import MESSAGE
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
+from tests.support.bags import VOLATILE, McapLayout, boolean, text, write_mcap
 from tests.support.mcap_surgery import (
     FOOTER,
     RECORD,
@@ -34,10 +30,7 @@ from tests.support.mcap_surgery import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
-
-    from mcap.records import ChunkIndex
 
     from ros2_memory.storage.base import BagReader, Record
 
@@ -147,31 +140,6 @@ class TestIndexesThatAreWrong:
         assert len(notes) == 1
         assert any("without its indexes" in note for note in reader.summarize(path).notes)
 
-    @pytest.mark.parametrize("longer", [100, 1 << 40, -20])
-    def test_a_message_that_does_not_end_in_its_chunk_is_left_out_and_named(
-        self, tmp_path: Path, longer: int
-    ) -> None:
-        """Where no checksum tells that its length is wrong."""
-
-        def fill(writer: Writer) -> None:
-            schema = writer.register_schema(STRING, "ros2msg", b"string data")
-            channel = writer.register_channel("/chatter", "cdr", schema)
-            for time in range(4):
-                writer.add_message(channel, time, b"\0\1\0\0\2\0\0\0%d\0" % time, time)
-
-        path = raw_mcap(
-            tmp_path / "a.mcap", fill, compression=CompressionType.NONE, enable_crcs=False
-        )
-        data = bytearray(path.read_bytes())
-        at = data.index(b"\2\0\0\0003\0") - 4 - MESSAGE.size + 1
-        (length,) = struct.unpack_from("<Q", data, at)
-        struct.pack_into("<Q", data, at, length + longer)
-        path.write_bytes(data)
-        for newest_first in (False, True):
-            found, notes = read_on(McapReader(), path, newest_first=newest_first)
-            assert found == sorted(range(3), reverse=newest_first)
-            assert any("not where its index says" in note for note in notes)
-
     @pytest.mark.parametrize(
         ("kind", "old", "new"),
         [
@@ -219,53 +187,6 @@ class TestIndexesThatAreWrong:
         path.write_bytes(data[:-60] + bytes((data[-60] ^ 1,)) + data[-59:])
         assert [each.type for each in McapReader().summarize(path).of("/chatter")] == [STRING]
 
-    @pytest.mark.parametrize(
-        ("at", "value"),
-        [
-            pytest.param(0, lambda chunk: chunk.message_start_time + 1, id="a later start"),
-            pytest.param(0, lambda _: (1 << 64) - 1, id="a start after its end"),
-            pytest.param(8, lambda chunk: chunk.message_end_time - 1, id="an earlier end"),
-            pytest.param(16, lambda _: 8, id="no chunk"),
-            pytest.param(16, None, id="another chunk"),
-            pytest.param(24, lambda chunk: chunk.chunk_length - 1, id="another length"),
-        ],
-    )
-    def test_a_chunk_index_that_does_not_agree_with_its_chunk_is_named(
-        self, path: Path, at: int, value: Callable[[ChunkIndex], int] | None
-    ) -> None:
-        _, second, _, other, *_ = chunks_of(path)
-        stated = other.chunk_start_offset if value is None else value(second)
-
-        def of_the_second(body: bytearray) -> None:
-            if struct.unpack_from("<Q", body, 16) == (second.chunk_start_offset,):
-                struct.pack_into("<Q", body, at, stated)
-
-        edit_summary(path, Opcode.CHUNK_INDEX, of_the_second)
-        reader = McapReader()
-        summary = reader.summarize(path)
-        assert summary.count == 20
-        assert any("its chunk indexes do not " in note for note in summary.notes)
-        for start in range(20):
-            found = reader.records(path, ["/chatter"], TimeWindow(start, start + 3))
-            assert [each.log_time for each in found] == [*range(start, min(start + 3, 20))]
-
-    def test_a_channel_that_a_chunk_index_lacks_is_not_lost(self, tmp_path: Path) -> None:
-        both = [*chatter(12), *(boolean(time, True) for time in range(12))]
-        path = write_mcap(tmp_path / "a.mcap", both)
-
-        def without_the_first_channel(opcode: int, body: bytes) -> bytes:
-            if opcode != Opcode.CHUNK_INDEX:
-                return body
-            size = from_bytes(body[32:36])
-            return body[:32] + struct.pack("<I", size - 10) + body[46:]
-
-        rewrite_summary(path, without_the_first_channel)
-        reader = McapReader()
-        assert reader.summarize(path).count == 24
-        assert times(read(reader, path)) == times(read(reader, path, "/bumper")) == [*range(12)]
-        [note] = reader.summarize(path).notes
-        assert note == "its message indexes do not hold what its statistics state"
-
     def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(self, path: Path) -> None:
         hidden = chunks_of(path)[2]
         left = 20 - (hidden.message_end_time - hidden.message_start_time + 1)
@@ -306,23 +227,6 @@ class TestIndexesThatAreWrong:
 
 
 class TestWhatAWriterMayDo:
-    def test_two_channels_of_one_topic_and_type_are_one_topic(self, tmp_path: Path) -> None:
-        def fill(writer: Writer) -> None:
-            schema = writer.register_schema(STRING, "ros2msg", definition(STRING).encode())
-            first = writer.register_channel("/t", "cdr", schema)
-            second = writer.register_channel(
-                "/t", "cdr", schema, {"offered_qos_profiles": "durability: 1\n"}
-            )
-            for time, channel in ((1, first), (2, second), (3, first)):
-                writer.add_message(channel, time, text(time, "x").payload, time)
-
-        path = raw_mcap(tmp_path / "a.mcap", fill)
-        reader = McapReader()
-        (topic,) = reader.summarize(path).topics
-        assert (topic.count, topic.first, topic.last, topic.latched) == (3, 1, 3, True)
-        assert times(read(reader, path, "/t")) == [1, 2, 3]
-        assert [channel.latched for channel in reader.channels(path)] == [False, True]
-
     @pytest.mark.parametrize(
         ("qos", "latched"),
         [
@@ -344,49 +248,6 @@ class TestWhatAWriterMayDo:
 
         (topic,) = McapReader().summarize(raw_mcap(tmp_path / "a.mcap", fill)).topics
         assert topic.latched is latched
-
-    def test_a_chunk_of_declarations_alone_may_have_empty_message_indexes(
-        self, tmp_path: Path
-    ) -> None:
-        path = write_mcap(tmp_path / "a.mcap", [], declared=[("/chatter", STRING)])
-        data = path.read_bytes()
-        start = FOOTER.unpack_from(data, len(data) - 8 - FOOTER.size)[2]
-        [channel] = McapReader().channels(path)
-        declared, beside, summary = RecordBuilder(), RecordBuilder(), RecordBuilder()
-        schema = mcap_records.Schema(1, channel.schema.text, "ros2msg", STRING)
-        for section in (declared, summary):
-            schema.write(section)
-            mcap_records.Channel(1, "/chatter", "cdr", {}, 1).write(section)
-        content = declared.end()
-        mcap_records.Chunk("", content, 0, 0, 0, len(content)).write(beside)
-        at = start - RECORD.size - 4  # where the data ended
-        chunk_size = beside.count
-        mcap_records.MessageIndex(1, []).write(beside)
-        mcap_records.DataEnd(0).write(beside)
-        mcap_records.Statistics(0, 1, {}, 1, 0, 0, 0, 0, 1).write(summary)
-        size, places = len(content), {1: at + chunk_size}
-        mcap_records.ChunkIndex(chunk_size, at, "", size, 0, 15, places, 0, size).write(summary)
-        front = data[:at] + beside.end()
-        footer = FOOTER.pack(Opcode.FOOTER, 20, len(front), 0, 0)
-        path.write_bytes(front + summary.end() + footer + data[-8:])
-        reader = McapReader()
-        assert reader.summarize(path).silent == ("/chatter",)
-        assert reader.summarize(path).notes == ()
-        assert read(reader, path) == []
-
-    def test_attachments_and_metadata_between_the_messages_are_passed_over(
-        self, tmp_path: Path
-    ) -> None:
-        def fill(writer: Writer) -> None:
-            channel = writer.register_channel("/t", "json", 0)
-            for time in range(4):
-                writer.add_message(channel, time, b"{}", time)
-                writer.add_attachment(time, time, "note", "text/plain", b"\x05" * 100)
-                writer.add_metadata("rosbag2", {"robot": "r1"})
-
-        for number, chunked in enumerate((True, False)):
-            path = raw_mcap(tmp_path / f"{number}.mcap", fill, use_chunking=chunked)
-            assert times(read(McapReader(), path, "/t")) == [0, 1, 2, 3]
 
     def test_a_channel_whose_metadata_is_not_utf_8_has_its_messages(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", chatter(3), McapLayout(chunk_size=None))
@@ -413,26 +274,6 @@ class TestWhatAWriterMayDo:
         for record in (bad, deep):
             with pytest.raises(UndecodableError, match=r"mouse \(Mouse\): the payload is not JSON"):
                 reader.decode(record)
-
-    def test_a_foreign_encoding_is_listed_and_named(self, tmp_path: Path) -> None:
-        def fill(writer: Writer) -> None:
-            schema = writer.register_schema("foxglove.Pose", "protobuf", b"\x0a")
-            writer.add_message(writer.register_channel("p", "protobuf", schema), 1, b"\x08", 1)
-
-        reader = McapReader()
-        path = raw_mcap(tmp_path / "a.mcap", fill)
-        (record,) = read(reader, path, "p")
-        assert [t.topic for t in reader.summarize(path).topics] == ["p"]
-        with pytest.raises(UndecodableError, match="message encoding 'protobuf' is not read"):
-            reader.decode(record)
-
-    def test_a_compressed_message_that_is_damaged_is_undecodable(self, tmp_path: Path) -> None:
-        packed = zstandard.compress(text(1, "hello " * 50).payload)[:-3]
-        path = write_mcap(tmp_path / "a.mcap", [Msg("/chatter", STRING, 1, packed)])
-        reader = McapReader()
-        (record,) = read(reader, path)
-        with pytest.raises(UndecodableError, match="compressed payload is damaged"):
-            reader.decode(record)
 
     def test_times_that_no_clock_shows_are_left_out_and_reported(self, tmp_path: Path) -> None:
         def fill(writer: Writer) -> None:

@@ -15,14 +15,10 @@ import zstandard
 
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
-from ros2_memory.history.view import TimeRange
-from ros2_memory.queries import topic_range
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MESSAGES,
     MAX_TOPICS,
-    SizeLimit,
     UnreadableError,
     max_decompressed_bytes,
 )
@@ -31,7 +27,6 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.sqlite_bag import guard
-from ros2_memory.storage.zstd_bag import decompress_zstd
 from tests.fuzz.bombs import rle_frame
 from tests.fuzz.records import (
     MAGIC,
@@ -44,7 +39,6 @@ from tests.fuzz.records import (
     without_summary,
 )
 from tests.support.bags import Msg, text, write_db3
-from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -104,10 +98,6 @@ class TestChunks:
         assert summary.count == 1
         assert "larger than the 1 MiB allowed" in summary.notes[0]
         assert "reader.max_chunk_mb" in summary.notes[0]
-
-    def test_a_frame_that_states_more_than_its_blocks_can_hold_is_refused(self) -> None:
-        with pytest.raises(UnreadableError, match="states more than it can hold"):
-            decompress_zstd(rle_frame(10, stated=50 * MB), SizeLimit(64 * MB))
 
     def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
         self, tmp_path: Path
@@ -177,12 +167,6 @@ class TestChunks:
             == 1
         )
 
-    def test_a_topic_may_have_any_number_of_channels(self, tmp_path: Path) -> None:
-        many = [channel(n, 1, "/chatter") for n in range(1, MAX_TOPICS + 2)]
-        path = bag(tmp_path, STRINGS[0], *many, string_message())
-        [chatter] = McapReader().summarize(path).topics
-        assert (chatter.topic, chatter.count) == ("/chatter", 1)
-
     def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -194,21 +178,6 @@ class TestChunks:
         summary = McapReader().summarize(bag(tmp_path, first, *[each] * 21))
         assert summary.count == 20
         assert "more than 20 chunks" in summary.notes[0]
-
-
-class TestTies:
-    def test_samples_of_messages_of_one_log_time_are_evenly_spaced_and_read_once(
-        self, tmp_path: Path
-    ) -> None:
-        same = [message(1, 5, text(0, f"{n}").payload) for n in range(1000)]
-        bag(tmp_path, chunk_of(bytes_of([*STRINGS, *same]), span=(5, 5)))
-        memory = memory_of(tmp_path)
-        answer = topic_range(
-            memory, Call(), "/chatter", TimeRange(start_s=0, end_s=1), max_samples=4
-        )
-        assert answer.total == 1000
-        values = [each.value for each in answer.samples]
-        assert values == [{"value": f"{n}"} for n in (0, 333, 666, 999)]
 
 
 class TestMessages:
@@ -234,11 +203,6 @@ class TestMessages:
         assert len(getattr(few, "data", ())) == 1000
         with pytest.raises(UndecodableError, match="more than 200000 texts or messages"):
             McapReader().decode(record(300_000))
-
-    def test_a_large_array_of_numbers_is_decoded(self) -> None:
-        known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
-        payload = b"\0\1\0\0" + struct.pack("<I", MB) + bytes(MB)
-        assert len(getattr(McapReader().decode(Record(known, 1, 1, payload)), "data", ())) == MB
 
     def test_json_longer_than_is_read_is_refused(self) -> None:
         known = Channel("/t", "json", Schema("Thing", "jsonschema", b"{}"))
@@ -267,16 +231,6 @@ class TestWholeFiles:
             path.write_bytes(data)
             with pytest.raises(BagError, match="it is made of more than"):
                 Rosbag2Reader().closing(path)
-
-    def test_a_closed_bag_of_which_nothing_could_be_read_is_listed_as_damaged(
-        self, tmp_path: Path
-    ) -> None:
-        path = bag(tmp_path, bomb(300 * MB))
-        snapshot = memory_of(tmp_path).index.snapshot()
-        assert snapshot.empty == ()
-        [aside] = snapshot.damaged
-        assert aside.path == path
-        assert "larger than the 64 MiB allowed" in aside.reason
 
 
 class TestSqlite:

@@ -28,7 +28,6 @@ from ros2_memory.storage.base import (
     Closing,
     IntArray,
     Record,
-    batched,
 )
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
@@ -46,7 +45,6 @@ from ros2_memory.storage.mcap.bulk import (
     bare_batches,
     batches_of,
     compared,
-    loose_place,
     read_groups,
     require_declared,
 )
@@ -79,10 +77,9 @@ if TYPE_CHECKING:
 
 
 _LARGE_BYTES: Final = 8 << 20
-_REASONS_BYTES: Final = 1 << 20
 _VERIFIED_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to verify their message indexes."""
-_MOST_SOUND: Final = 100_000
+_MOST_VERDICTS: Final = 100_000
 _NEXT_BUT_ONE: Final = 2
 _EVERYTHING: Final = TimeWindow.everything()
 
@@ -120,9 +117,19 @@ class McapBags:
         # Many programs write chunks of 4 MiB.
         self.chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) * 3 // 4)
         self.indexes: ByteLru[McapIndex | Pairs] = ByteLru((cache_mb << 20) // 4)
-        self.contradictions: ByteLru[str] = ByteLru(_REASONS_BYTES)
-        # By the hashes of their keys: to fill a store each file of a history is read twice.
-        self.sound: set[int] = set()
+        # How the indexes of files were found wrong, "" where they are right: by the hashes of their
+        # keys, since to fill a store each file of a history is read twice.
+        self._verdicts: dict[int, str] = {}
+
+    def verdict(self, file: OpenFile) -> str | None:
+        """Returns how the indexes of a file were found wrong; None if nothing is known."""
+        return self._verdicts.get(hash(file.key))
+
+    def judge(self, file: OpenFile, verdict: str = "") -> None:
+        """Remembers how the indexes of a file were found wrong, or that they are right."""
+        if len(self._verdicts) >= _MOST_VERDICTS:
+            self._verdicts.clear()
+        self._verdicts[hash(file.key)] = verdict
 
     def closing(self, path: Path) -> Closing:
         """Returns whether the writer has finished the file."""
@@ -183,22 +190,20 @@ class _Reading:
         self.index = self._known_index(has_totals=has_totals)
 
     def _known_index(self, *, has_totals: bool) -> McapIndex:
-        file, limit, sound = self._file, self._bags.limit, self._bags.sound
-        index = self._bags.indexes.get(file.key)
+        file, bags = self._file, self._bags
+        index = bags.indexes.get(file.key)
         if isinstance(index, McapIndex) and (index.contents.totals or not has_totals):
             return index
-        reason = self._bags.contradictions.get(file.key)
-        if reason is not None:
-            return self._index_without_indexes(reason)
+        verdict = bags.verdict(file)
+        if verdict:
+            return self._index_without_indexes(verdict)
         if not is_finished(file):
-            return self._remembered(index_by_scan(file, limit))
+            return self._remembered(index_by_scan(file, bags.limit))
         try:
-            index = index_from_summary(file, is_sound=not has_totals and hash(file.key) in sound)
-            if len(sound) >= _MOST_SOUND:
-                sound.clear()
-            sound.add(hash(file.key))
+            index = index_from_summary(file, is_sound=not has_totals and verdict is not None)
+            bags.judge(file)
         except DoubtError as doubt:
-            index = index_by_scan(file, limit, str(doubt))
+            index = index_by_scan(file, bags.limit, str(doubt))
         except UnreadableError as error:
             return self._without_indexes(error)
         return self._remembered(index)
@@ -209,9 +214,9 @@ class _Reading:
 
     def _without_indexes(self, error: UnreadableError) -> McapIndex:
         """Returns an index of the messages themselves, in place of one that was found wrong."""
-        reason, key = f"{error}; {READ_WITHOUT_INDEXES}", self._file.key
+        reason = f"{error}; {READ_WITHOUT_INDEXES}"
         # Kept apart from the index: not every read that follows would find it out again.
-        self._bags.contradictions.put(key, reason, len(reason) + len(key.path) + 200)
+        self._bags.judge(self._file, reason)
         return self._index_without_indexes(reason)
 
     def _index_without_indexes(self, reason: str) -> McapIndex:
@@ -280,11 +285,6 @@ class _Reading:
         passed: dict[int, Chunk] = {}
         try:
             yield from self._batches(bare, passed)
-            times, places = self._inside(self.index.loose, self._wanted)
-            pairs = zip(places.tolist(), times.tolist(), strict=True)
-            yield from batched(
-                (loose_place(at), self._loose_record(at, time)) for at, time in pairs
-            )
         except _ContradictedError as error:
             self.index = self._without_indexes(error)
             yield self._contradiction()
@@ -416,10 +416,6 @@ class _Reading:
             self._require_beside()
         for chunk in _with_any(self.index, wanted, self._window):
             yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
-        loose = rows(self.index.loose, self._loose_record)
-        if loose is not None:
-            first, last = sorted((loose.times[0], loose.times[-1]))
-            yield SortedRun(first, last, 0, lambda: loose)
 
     def _inside(self, pairs: Pairs, wanted: Collection[int]) -> tuple[IntArray, IntArray]:
         """Returns log times and offsets of the wanted messages inside the window, in order."""
@@ -515,12 +511,6 @@ class _Reading:
         if payload.startswith(FRAME_MAGIC):
             payload = self._uncompressed(channel, payload)
         return Record(channel, time, published if 0 < published < MAX_NS else time, payload)
-
-    def _loose_record(self, place: int, time: Ns) -> Record:
-        """Returns a message outside of chunks."""
-        _, length = RECORD.unpack(self._file.read(place, RECORD.size))
-        data = self._file.read(place, RECORD.size + length)
-        return self._record(data, self.index.channels, 0, time)
 
 
 def _with_any(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:

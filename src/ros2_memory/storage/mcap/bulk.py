@@ -42,22 +42,16 @@ if TYPE_CHECKING:
 MAX_GROUP_CHUNKS: Final = 4096
 _UINT32: Final = np.dtype("<u4")
 _MAGIC: Final = int.from_bytes(FRAME_MAGIC, "little")
-_CHUNK_STEP: Final = 6
+_CHUNK_STEP: Final = 5
 _PLACE_BITS: Final = 29
-_LOOSE: Final = -(1 << 62)
 
 
 def place_of(chunk: Chunk) -> int:
     """Returns what is added to offsets in a chunk, so that places are in the order of the file.
 
-    Two chunks with messages begin more than 64 bytes apart; a chunk has at most 512 MiB.
+    Two chunks, or parts as such, begin 32 bytes apart or more; a chunk has at most 512 MiB.
     """
     return chunk.offset >> _CHUNK_STEP << _PLACE_BITS
-
-
-def loose_place(offset: int) -> int:
-    """Returns the place of a message outside chunks, which comes before all others of its time."""
-    return _LOOSE + offset
 
 
 class ReadChunks(NamedTuple):

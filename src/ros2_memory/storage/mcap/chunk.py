@@ -65,11 +65,12 @@ _INDEX_PLACE: Final = struct.Struct("<HQ")
 _PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
 NOT_THERE: Final = "damaged: a message is not where its index says"
 _MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
-_EMPTY: Final[IntArray] = np.zeros(0, dtype=np.int64)
 
 
 class Chunk(NamedTuple):
     """One chunk of a file (a tuple: indexing a week makes millions).
+
+    Or a part of a file that has messages outside chunks: `is_bare`.
 
     Attributes:
         offset: where its record begins in the file.
@@ -81,6 +82,7 @@ class Chunk(NamedTuple):
             there are none to rely on.
         index_length: bytes of its message indexes, which follow it.
         usable: how many of its decompressed bytes are whole records, if the file ends inside it.
+        is_bare: whether its messages are in no chunk; they are found from its first byte on.
     """
 
     offset: int
@@ -91,6 +93,7 @@ class Chunk(NamedTuple):
     index_places: bytes | None = None
     index_length: int = 0
     usable: int | None = None
+    is_bare: bool = False
 
 
 class Pairs(NamedTuple):
@@ -114,9 +117,6 @@ class Pairs(NamedTuple):
     def taken(self, rows: Mask) -> Pairs:
         """Returns some of the messages."""
         return Pairs(*(column[rows] for column in self))
-
-
-NO_PAIRS: Final = Pairs(_EMPTY, _EMPTY, _EMPTY, _EMPTY)
 
 
 def pairs_in(
@@ -351,6 +351,10 @@ def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
     Raises:
         UnreadableError: the chunk is damaged or larger than allowed.
     """
+    if chunk.is_bare:
+        if chunk.length > LARGE_BYTES:
+            limit.take_turn()
+        return file.read(chunk.offset, chunk.length)
     body = chunk_body(file, chunk.offset + RECORD.size, chunk.length - RECORD.size, limit)
     return decompressed_chunk(body, limit, is_whole=chunk.usable is None)[: chunk.usable]
 

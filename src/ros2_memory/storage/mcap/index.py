@@ -32,10 +32,8 @@ from ros2_memory.storage.errors import (
 )
 from ros2_memory.storage.mcap.chunk import (
     INDEX_OFFSET,
-    NO_PAIRS,
     OUTSIDE,
     Chunk,
-    Pairs,
     index_bytes,
     index_groups,
     pairs_in,
@@ -74,31 +72,13 @@ class DoubtError(UnreadableError):
     """The summary section cannot be relied on; the text is a note on it, or empty."""
 
 
-class Declared(NamedTuple):
-    """What the schema and channel records of a summary section declare.
+def _summary(
+    file: OpenFile,
+) -> tuple[int, Mapping[int, Channel], Declarations, list[Chunk], Statistics | None]:
+    """Returns where the summary section of a file begins, and what it states.
 
-    Attributes:
-        channels: the channels by their number in the file.
-        channel_bytes: memory that the channels take which no other file shares.
-        declarations: the records, to compare others with.
-    """
-
-    channels: Mapping[int, Channel]
-    channel_bytes: int
-    declarations: Declarations
-
-
-class Summary(NamedTuple):
-    """What a summary section states; it begins at `start` in the file."""
-
-    start: int
-    declared: Declared
-    chunks: list[Chunk]
-    statistics: Statistics | None
-
-
-def read_summary(file: OpenFile) -> Summary:
-    """Returns the summary section of a file.
+    That is the channels by their number, the records that declare them, to compare others with, the
+    chunks and the statistics.
 
     Raises:
         DoubtError: it is missing, or does not match its checksum.
@@ -117,7 +97,7 @@ def read_summary(file: OpenFile) -> Summary:
             stated = statistics(section[begin:end])
     records = b"".join(declaring)
     declared = _declared if len(records) <= _MAX_CACHED_BYTES else _declared.__wrapped__
-    return Summary(start, declared(records), chunks, stated)
+    return start, *declared(records), chunks, stated
 
 
 def _section(file: OpenFile) -> tuple[int, bytes]:
@@ -147,7 +127,8 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
     channels = _numbers(places[:: INDEX_OFFSET.itemsize], places[1 :: INDEX_OFFSET.itemsize])
     (index_length,) = _INDEX_LENGTH.unpack_from(section, stop)
     # Past the function that takes the fields of a named tuple: it costs as much as all the rest.
-    return _new_tuple(Chunk, (offset, length, start, last, channels, places, index_length, None))
+    indexes = (places, index_length)
+    return _new_tuple(Chunk, (offset, length, start, last, channels, *indexes, None, False))
 
 
 @lru_cache(1024)
@@ -157,12 +138,11 @@ def _numbers(low: bytes, high: bytes) -> frozenset[int]:
 
 
 @lru_cache(32)
-def _declared(records: bytes) -> Declared:
+def _declared(records: bytes) -> tuple[Mapping[int, Channel], Declarations]:
     declarations = Declarations()
     for opcode, begin, end in section_records(records):
         declarations.add(opcode, records[begin:end])
-    channels = declarations.channels()
-    return Declared(channels, unshared_bytes(channels), declarations)
+    return declarations.channels(), declarations
 
 
 _CHUNK: Final = int(Opcode.CHUNK)
@@ -198,9 +178,7 @@ class McapIndex(NamedTuple):
 
     Attributes:
         channels: the channels by their number in the file.
-        channel_bytes: memory that the channels take which no other file shares.
         chunks: the chunks with messages, in file order.
-        loose: the messages outside chunks; their offsets are in the file.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
         contents: what the messages amount to; nothing where that was not asked for.
@@ -211,10 +189,8 @@ class McapIndex(NamedTuple):
     """
 
     channels: Mapping[int, Channel]
-    channel_bytes: int
     chunks: tuple[Chunk, ...]
     contents: Contents = Contents()
-    loose: Pairs = NO_PAIRS
     complete: bool = True
     notes: tuple[str, ...] = ()
     seams: tuple[Seam, ...] = ()
@@ -225,14 +201,13 @@ class McapIndex(NamedTuple):
     def used(self) -> frozenset[int]:
         """The channels that have messages."""
         of_chunks = {chunk.channels for chunk in self.chunks}
-        return frozenset(self.loose.channels.tolist()).union(*of_chunks)
+        return frozenset[int]().union(*of_chunks)
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes, without the channels that files share."""
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
-        loose = 4 * self.loose.times.nbytes
-        return 1000 + self.channel_bytes + 400 * len(self.chunks) + places + loose
+        return 1000 + unshared_bytes(self.channels) + 400 * len(self.chunks) + places
 
 
 def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
@@ -293,7 +268,7 @@ def index_from_summary(file: OpenFile, *, is_sound: bool = False) -> McapIndex:
 
 def _index_without_totals(file: OpenFile, *, is_sound: bool) -> tuple[McapIndex, Statistics]:
     """Returns the index without what its messages amount to, and what the file states of that."""
-    start, (channels, channel_bytes, declared), chunks, stated = read_summary(file)
+    start, channels, declared, chunks, stated = _summary(file)
     if stated is None or not declared.resolved or stated.channel_count > len(channels):
         raise DoubtError
     counts = stated.channel_message_counts
@@ -315,7 +290,7 @@ def _index_without_totals(file: OpenFile, *, is_sound: bool) -> tuple[McapIndex,
     if index_bytes(indexes, stated.message_count) != index_length:
         raise DoubtError("its message indexes do not hold what its statistics state")
     seams = _seams(filled)
-    index = McapIndex(channels, channel_bytes, tuple(filled), seams=seams, declared=declared)
+    index = McapIndex(channels, tuple(filled), seams=seams, declared=declared)
     return index, stated
 
 

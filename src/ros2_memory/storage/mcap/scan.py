@@ -10,12 +10,10 @@ from array import array
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.text import counted
 from ros2_memory.storage.base import Closing
-from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
 from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, Pairs
@@ -38,6 +36,9 @@ if TYPE_CHECKING:
     from ros2_memory.storage.contents import Extent
     from ros2_memory.storage.file_io import OpenFile
 
+_NONE: Final = frozenset[int]()
+_BARE_BYTES: Final = 64 << 10
+"""Such a part has one message, or up to so many bytes: for one of them it is read as a whole."""
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
 
 
@@ -59,6 +60,17 @@ def index_by_scan(file: OpenFile, limit: SizeLimit, note: str = "") -> McapIndex
 
 
 @dataclass(slots=True)
+class _Bare:
+    """Messages outside chunks that follow each other: a part of the file, as if it were a chunk."""
+
+    begin: int
+    end: int = 0
+    channels: array[int] = field(default_factory=lambda: array("H"))
+    times: array[int] = field(default_factory=lambda: array("Q"))
+    offsets: array[int] = field(default_factory=lambda: array("q"))
+
+
+@dataclass(slots=True)
 class _Scan:
     file: OpenFile
     max_bytes: int
@@ -73,11 +85,7 @@ class _Scan:
     redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
-    # Of messages outside chunks: channels, log times and offsets.
-    loose: tuple[array[int], array[int], array[int]] = field(
-        default_factory=lambda: (array("H"), array("Q"), array("q"))
-    )
-    tallied: int = 0  # of these
+    bare: _Bare = field(default_factory=lambda: _Bare(0))
     stated: Statistics | None = None
     messages: int = 0
     damaged: list[str] = field(default_factory=list)
@@ -86,6 +94,7 @@ class _Scan:
     def add(self, record: FileRecord) -> None:
         """Adds a record; one that is damaged is noted, since those behind it may be whole."""
         if record.end > self.file.size:
+            self._close_bare()
             self._add_cut_chunk(record)
             return
         self.data_ended = self.data_ended or record.opcode == Opcode.DATA_END
@@ -93,6 +102,7 @@ class _Scan:
             if record.opcode == Opcode.MESSAGE:
                 self._add_message(record)
             elif record.opcode == Opcode.CHUNK:
+                self._close_bare()
                 self._add_chunk(record)
             elif record.opcode in _DECLARED:
                 declarations = self.repeated if self.data_ended else self.declared
@@ -104,9 +114,14 @@ class _Scan:
     def _add_message(self, record: FileRecord) -> None:
         if record.end - record.offset > self.max_bytes:
             raise UnreadableError(too_large("a message", self.max_bytes))
+        if not self.bare.times or record.end > self.bare.begin + _BARE_BYTES:
+            self._close_bare()
+            self.bare = _Bare(record.offset)
         _, _, channel, _, log_time, _ = MESSAGE.unpack(record.head)
-        for column, value in zip(self.loose, (channel, log_time, record.offset), strict=True):
-            column.append(value)
+        self.bare.channels.append(channel)
+        self.bare.times.append(log_time)
+        self.bare.offsets.append(record.offset - self.bare.begin)
+        self.bare.end = record.end
         self.messages += 1
 
     def _declare(self, opcode: int, body: bytes, declarations: Declarations) -> None:
@@ -148,25 +163,27 @@ class _Scan:
             except UnreadableError as error:
                 self.damaged.append(str(error))
         self.messages += content.messages
-        pairs = content.pairs
+        self._add_pairs(content.pairs, Chunk(offset, end - offset, 0, 0, _NONE, usable=usable))
+
+    def _close_bare(self) -> None:
+        """Adds what was met of messages outside chunks as a part of the file."""
+        bare, self.bare = self.bare, _Bare(0)
+        pairs = Pairs.of(bare.channels, bare.times, bare.offsets)
+        length = bare.end - bare.begin
+        self._add_pairs(pairs, Chunk(bare.begin, length, 0, 0, _NONE, is_bare=True))
+
+    def _add_pairs(self, pairs: Pairs, chunk: Chunk) -> None:
+        """Adds messages, and the chunk that they are in with its times and channels."""
         if pairs.times.size:
-            self._tally_loose()
             self.tally.add(pairs.channels, pairs.times, pairs.chunks)
             first, last = int(pairs.times.min()), int(pairs.times.max())
-            numbers = frozenset(pairs.channels.tolist())
-            self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
-
-    def _tally_loose(self) -> None:
-        """Counts the messages outside chunks up to here, each as a chunk of its own."""
-        loose = Pairs.of(*(column[self.tallied :] for column in self.loose))
-        self.tallied = len(self.loose[0])
-        if loose.times.size:
-            self.tally.add(loose.channels, loose.times, np.arange(loose.times.size))
+            channels = frozenset(pairs.channels.tolist())
+            self.chunks.append(chunk._replace(start=first, end=last, channels=channels))
 
     def index(self, note: str) -> McapIndex:
         """Returns the index of the messages found; `note` comes before its other notes."""
         complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
-        self._tally_loose()
+        self._close_bare()
         contents = self.tally.contents()
         declarations = self.repeated
         differing = declarations.update(self.declared)
@@ -182,10 +199,8 @@ class _Scan:
             notes.append("it declares a channel or a type twice, differently: the last one is used")
         return McapIndex(
             channels,
-            unshared_bytes(channels),
             tuple(self.chunks),
             contents._replace(totals=totals),
-            Pairs.of(*self.loose),
             complete=complete,
             notes=tuple(notes),
         )

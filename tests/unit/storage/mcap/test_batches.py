@@ -19,7 +19,7 @@ from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.examples import examples
-from tests.support.mcap_surgery import SMALL, change_index, chatter, chunks_of, damaged
+from tests.support.mcap_surgery import SMALL, chatter, damaged
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -49,31 +49,6 @@ def records_in(batches: Iterable[object]) -> Counter[object]:
         for batch in batches
         for nth in range(batch.sizes.size)  # type: ignore[attr-defined]
     )
-
-
-def times_in(batches: Iterable[object]) -> Counter[int]:
-    return Counter(
-        time
-        for batch in batches
-        for time in batch.log_times.tolist()  # type: ignore[attr-defined]
-    )
-
-
-@pytest.mark.parametrize("number", range(4))
-@pytest.mark.parametrize(("at", "value"), [(0, 3), (8, 1)])
-def test_an_index_that_lies_loses_no_message_and_doubles_none(
-    tmp_path: Path, number: int, at: int, value: int
-) -> None:
-    path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
-    chunk = chunks_of(path)[number]
-    change_index(path, chunk, at, chunk.message_start_time + 1 if at == 0 else value)
-    reader = McapReader()
-    for _ in range(2):
-        found, errors = all_of(reader.batches(path, TOPICS, EVERYTHING))
-        assert len(errors) == 1
-        assert all(isinstance(error, BagContradictionError) for error in errors)
-        times = times_in(found)
-        assert times == Counter(range(20))
 
 
 @settings(max_examples=examples(150))
