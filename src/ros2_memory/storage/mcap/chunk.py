@@ -70,7 +70,7 @@ _MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} th
 class Chunk(NamedTuple):
     """One chunk of a file (a tuple: indexing a week makes millions).
 
-    Or a part of a file that has messages outside chunks: `is_bare`.
+    Or a part of a file that has messages outside chunks: `is_unchunked`.
 
     Attributes:
         offset: where its record begins in the file.
@@ -82,7 +82,7 @@ class Chunk(NamedTuple):
             there are none to rely on.
         index_length: bytes of its message indexes, which follow it.
         usable: how many of its decompressed bytes are whole records, if the file ends inside it.
-        is_bare: whether its messages are in no chunk; they are found from its first byte on.
+        is_unchunked: whether its messages are in no chunk; they are found from its first byte on.
     """
 
     offset: int
@@ -93,7 +93,7 @@ class Chunk(NamedTuple):
     index_places: bytes | None = None
     index_length: int = 0
     usable: int | None = None
-    is_bare: bool = False
+    is_unchunked: bool = False
 
 
 class Pairs(NamedTuple):
@@ -351,7 +351,7 @@ def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
     Raises:
         UnreadableError: the chunk is damaged or larger than allowed.
     """
-    if chunk.is_bare:
+    if chunk.is_unchunked:
         if chunk.length > LARGE_BYTES:
             limit.take_turn()
         return file.read(chunk.offset, chunk.length)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.file_io import OpenFile
 
 _NONE: Final = frozenset[int]()
-_BARE_BYTES: Final = 64 << 10
+_UNCHUNKED_BYTES: Final = 64 << 10
 """Such a part has one message, or up to so many bytes: for one of them it is read as a whole."""
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
 
@@ -60,7 +60,7 @@ def index_by_scan(file: OpenFile, limit: SizeLimit, note: str = "") -> McapIndex
 
 
 @dataclass(slots=True)
-class _Bare:
+class _Unchunked:
     """Messages outside chunks that follow each other: a part of the file, as if it were a chunk."""
 
     begin: int
@@ -85,7 +85,7 @@ class _Scan:
     redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
-    bare: _Bare = field(default_factory=lambda: _Bare(0))
+    unchunked: _Unchunked = field(default_factory=lambda: _Unchunked(0))
     stated: Statistics | None = None
     messages: int = 0
     damaged: list[str] = field(default_factory=list)
@@ -94,7 +94,7 @@ class _Scan:
     def add(self, record: FileRecord) -> None:
         """Adds a record; one that is damaged is noted, since those behind it may be whole."""
         if record.end > self.file.size:
-            self._close_bare()
+            self._close_unchunked()
             self._add_cut_chunk(record)
             return
         self.data_ended = self.data_ended or record.opcode == Opcode.DATA_END
@@ -102,7 +102,7 @@ class _Scan:
             if record.opcode == Opcode.MESSAGE:
                 self._add_message(record)
             elif record.opcode == Opcode.CHUNK:
-                self._close_bare()
+                self._close_unchunked()
                 self._add_chunk(record)
             elif record.opcode in _DECLARED:
                 declarations = self.repeated if self.data_ended else self.declared
@@ -114,14 +114,14 @@ class _Scan:
     def _add_message(self, record: FileRecord) -> None:
         if record.end - record.offset > self.max_bytes:
             raise UnreadableError(too_large("a message", self.max_bytes))
-        if not self.bare.times or record.end > self.bare.begin + _BARE_BYTES:
-            self._close_bare()
-            self.bare = _Bare(record.offset)
+        if not self.unchunked.times or record.end > self.unchunked.begin + _UNCHUNKED_BYTES:
+            self._close_unchunked()
+            self.unchunked = _Unchunked(record.offset)
         _, _, channel, _, log_time, _ = MESSAGE.unpack(record.head)
-        self.bare.channels.append(channel)
-        self.bare.times.append(log_time)
-        self.bare.offsets.append(record.offset - self.bare.begin)
-        self.bare.end = record.end
+        self.unchunked.channels.append(channel)
+        self.unchunked.times.append(log_time)
+        self.unchunked.offsets.append(record.offset - self.unchunked.begin)
+        self.unchunked.end = record.end
         self.messages += 1
 
     def _declare(self, opcode: int, body: bytes, declarations: Declarations) -> None:
@@ -165,12 +165,12 @@ class _Scan:
         self.messages += content.messages
         self._add_pairs(content.pairs, Chunk(offset, end - offset, 0, 0, _NONE, usable=usable))
 
-    def _close_bare(self) -> None:
+    def _close_unchunked(self) -> None:
         """Adds what was met of messages outside chunks as a part of the file."""
-        bare, self.bare = self.bare, _Bare(0)
-        pairs = Pairs.of(bare.channels, bare.times, bare.offsets)
-        length = bare.end - bare.begin
-        self._add_pairs(pairs, Chunk(bare.begin, length, 0, 0, _NONE, is_bare=True))
+        part, self.unchunked = self.unchunked, _Unchunked(0)
+        pairs = Pairs.of(part.channels, part.times, part.offsets)
+        length = part.end - part.begin
+        self._add_pairs(pairs, Chunk(part.begin, length, 0, 0, _NONE, is_unchunked=True))
 
     def _add_pairs(self, pairs: Pairs, chunk: Chunk) -> None:
         """Adds messages, and the chunk that they are in with its times and channels."""
@@ -183,7 +183,7 @@ class _Scan:
     def index(self, note: str) -> McapIndex:
         """Returns the index of the messages found; `note` comes before its other notes."""
         complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
-        self._close_bare()
+        self._close_unchunked()
         contents = self.tally.contents()
         declarations = self.repeated
         differing = declarations.update(self.declared)
