@@ -96,7 +96,7 @@ def find_things(
     note_other_frames(view, known, region)
     asked = {known.labels.key(label): label for label in labels}
     places = places_asked(limits, region, known.frames)
-    _, looked = known.estimate.looks.times()
+    looked = known.estimate.looks.last
     latest_look = int(looked[looked < window.stop].max(initial=0))
     finder = _Finder(known, window, region, places, now, latest_look)
     found = sorted(finder.find(asked), key=lambda row: (-row.last, row.label, row.place))

@@ -275,7 +275,7 @@ class Estimate:
             return None
         cells, cell_of = np.unique(self.looks.cell[looks], return_inverse=True)
         messages, last = np.bincount(cell_of, n), np.zeros(len(cells), np.int64)
-        np.maximum.at(last, cell_of, self.looks.times(looks)[1])
+        np.maximum.at(last, cell_of, self.looks.last[looks])
         is_in_best = cell_of == np.lexsort((last, messages))[-1]
         looks, n = looks[is_in_best], n[is_in_best]
         columns = (self.looks.x, self.looks.y, self.looks.yaw)
@@ -380,7 +380,9 @@ def estimate(
     for group in groups:
         linked = _link(group, observed)
         _add_poorly_localised(group, linked, observed)
-        if not _are_of_mover(group, linked):
+        moves = len(group.stays) - len(linked)
+        is_restless = moves >= _RESTLESS_MOVES and moves > _RESTLESS_SHARE * len(group.rows)
+        if not is_restless and not moves_by_itself(group.key):
             instances += linked
             # Of most places the evidence is of false detections, and not needed.
             for place in {stay.place for thing in linked for stay in thing.stays}:
@@ -868,13 +870,6 @@ def most_at_once(spots: Ints) -> int:
     slices = np.unique(spots[:, Spot.SLICE], return_inverse=True)[1]
     together = np.sort(np.minimum(spots[:, Spot.TOGETHER], np.bincount(slices)[slices]))
     return max(1, int(together[-max(1, len(together) // 100)]))
-
-
-def _are_of_mover(group: _Group, linked: Sequence[Instance]) -> bool:
-    """Whether what a label's stays were linked into moves by itself."""
-    moves = len(group.stays) - len(linked)
-    is_restless = moves >= _RESTLESS_MOVES and moves > _RESTLESS_SHARE * len(group.rows)
-    return is_restless or moves_by_itself(group.key)
 
 
 def _names(sights: JoinedSights, labels: Labels) -> dict[str, str]:

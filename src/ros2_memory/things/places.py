@@ -519,7 +519,12 @@ def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
     turn = np.radians((np.diff(fixes[:, Fix.YAW]) + 1800) % 3600 / 10 - 180)
     off = np.hypot(np.diff(fixes[:, Fix.X]), np.diff(fixes[:, Fix.Y])) + AHEAD_MM * np.abs(turn)
     jumped = np.flatnonzero((off > _JUMP_MM) & (after[:-1] <= _NEXT_NS))
-    vague = np.flatnonzero(_sigma_said(fixes[:, Fix.SIGMA], after) > _POOR_MM)
+    # What the localiser gave last, at each fix; -1 if that is not known.
+    sigma = fixes[:, Fix.SIGMA]
+    is_new = sigma >= 0
+    is_new[1:] |= after[:-1] > _KNOWN_NS
+    newest = np.maximum.accumulate(np.where(is_new, np.arange(len(sigma)), 0))
+    vague = np.flatnonzero(sigma[newest] > _POOR_MM)
     starts = np.concatenate((time[jumped] - _BEFORE_NS, time[vague]))
     stops = np.concatenate((time[jumped + 1], time[vague] + np.minimum(after[vague], _KNOWN_NS)))
     order = np.argsort(starts, kind="stable")
@@ -535,14 +540,3 @@ def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
     # Whole slices: else a look from beside would miss what a spot that is left out has seen.
     slices = np.union1d(spots[poor_spots, Spot.SLICE], looks[poor_looks, Look.SLICE])
     return np.isin(spots[:, Spot.SLICE], slices), np.isin(looks[:, Look.SLICE], slices)
-
-
-def _sigma_said(sigma: Ints, after: Ints) -> Ints:
-    """Returns the deviation (mm) that the localiser gave last, at each fix; -1 if not known.
-
-    `after` is how long (ns) it is until the next fix.
-    """
-    is_new = sigma >= 0
-    is_new[1:] |= after[:-1] > _KNOWN_NS
-    last = np.maximum.accumulate(np.where(is_new, np.arange(len(sigma)), 0))
-    return sigma[last]

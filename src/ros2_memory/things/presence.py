@@ -20,7 +20,6 @@ import numpy as np
 from ros2_memory.analysis.sights import (
     CELL_DECIDEG,
     CELL_MM,
-    SLICE_NS,
     STOREY_MM,
     Floats,
     Hit,
@@ -74,7 +73,6 @@ _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
 """A cell with so many looks is blocked if its share of hits is below this part of the others'."""
 _YAWS: Final = 3600 // CELL_DECIDEG
-_NS_PER_US: Final = np.int64(1_000)
 _VIEW_SHARE: Final = 0.02
 """What lies farther out at each side of a field of view is mistaken."""
 
@@ -125,11 +123,7 @@ class Cells:
     @property
     def looks(self) -> Looks:
         """What answers need of the looks."""
-        begins = np.zeros(int(self.slice.max(initial=0)) + 1, np.int64)
-        begins[self.slice] = self._first // SLICE_NS * SLICE_NS
-        after, lasted = self._first - begins[self.slice], self.last - self._first
-        columns = (after // _NS_PER_US, lasted // _NS_PER_US, self.x, self.y, self.yaw, self.cell)
-        return Looks(begins, self.slice, *map(narrowed, columns))
+        return Looks(self.slice, self._first, self.last, self.x, self.y, self.yaw, self.cell)
 
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from some cells of places, by cell."""
@@ -282,47 +276,25 @@ class Evidence(NamedTuple):
     fair: Flags
 
     def at(self, place: int) -> Evidence:
-        """Returns that for one place alone, in few bytes."""
+        """Returns that of the looks at one place alone, in few bytes, with their numbers."""
         ends = np.array([place, place + 1]) << _BITS
-        looks, blind = (
-            slice(*np.searchsorted(keys, ends).tolist()) for keys in (self.looks, self.blind)
-        )
-        return Evidence(
-            narrowed(_number(self.looks[looks])),
-            narrowed(self.cell[looks]),
-            narrowed(self.n[looks]),
-            narrowed(self.hits[looks]),
-            narrowed(_number(self.blind[blind])),
-            narrowed(self.times[blind]),
-            self.sees[looks].copy(),
-            self.fair[looks].copy(),
-        )
+        looks = slice(*np.searchsorted(self.looks, ends).tolist())
+        of_looks = (_number(self.looks[looks]), self.cell[looks], self.n[looks], self.hits[looks])
+        number, cell, n, hits = map(narrowed, of_looks)
+        sees, fair, none = self.sees[looks].copy(), self.fair[looks].copy(), self.blind[:0]
+        return Evidence(number, cell, n, hits, none, none, sees, fair)
 
 
 class Looks(NamedTuple):
-    """From where detectors looked: a column each, in as few bytes as it needs.
+    """When and from where detectors looked: columns as in `Look`; `cell` is as in `Cells`."""
 
-    Attributes:
-        begins: when each slice begins (ns).
-        slice, x, y, yaw: as in `Look`.
-        after_us: from the beginning of the slice to the first message; `lasted_us` from there on.
-        cell: that of the robot's pose, as in `Cells`.
-    """
-
-    begins: Ints
     slice: Ints
-    after_us: Ints
-    lasted_us: Ints
+    first: Ints
+    last: Ints
     x: Ints
     y: Ints
     yaw: Ints
     cell: Ints
-
-    def times(self, looks: Ints | None = None) -> tuple[Ints, Ints]:
-        """Returns the times (ns) of the first and the last message of some looks, or of all."""
-        which = slice(None) if looks is None else looks
-        first = self.begins[self.slice[which]] + self.after_us[which] * _NS_PER_US
-        return first, first + self.lasted_us[which] * _NS_PER_US
 
 
 class Stay(NamedTuple):
@@ -550,7 +522,7 @@ def looks_without(
     cell's own rate is known as well as its messages make it (a uniform prior).
     """
     looks, is_hit = evidence.looks, evidence.hits > 0
-    slices, (first, last) = every.slice[looks], every.times(looks)
+    slices, first, last = (column[looks] for column in every[:3])
     during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
     during &= (last <= seen_to) | is_hit
     start, stop = window

@@ -50,7 +50,7 @@ from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import topics_with_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.view import View
@@ -118,7 +118,10 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
             newest = view.stream.newest(topic, window)
             first = None if newest is None else view.stream.first([topic], window)
             for stored in filter(None, (newest, first)):
-                if not _has_columns(view, topic, stored.time):
+                at = TimeWindow(stored.time, stored.time + 1)
+                rows_then = [*scan(view, topic, at, copies=True)]
+                # What was decoded need not be compiled again.
+                if not rows_then or any("" in rows.table.left_out for rows in rows_then):
                     view.bags.decode(stored, failures)
     reasons = {failure.topic: failure.reason for failure in failures}
     for topic, reason in reasons.items():
@@ -136,12 +139,6 @@ def describe_hung(view: View, window: TimeWindow) -> Iterator[str]:
                     f"{topic} repeats its message of {unix_text(since)} again and again: its "
                     "detector seems to hang, and what it saw since then is not known"
                 )
-
-
-def _has_columns(view: View, topic: str, at: Ns) -> bool:
-    """Returns whether messages were decoded; their type need not be compiled for that again."""
-    at_once = [*scan(view, topic, TimeWindow(at, at + 1), copies=True)]
-    return bool(at_once) and all("" not in rows.table.left_out for rows in at_once)
 
 
 def notes_on_never(
@@ -211,7 +208,14 @@ def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     if not asked.labels:
         yield from unplaced_notes(known, (asked.window,))
         others = sorted(known.estimate.names.keys() - asked.found)
-        yield from _too_low([*_detected(known, others, asked.window)], asked)
+        detected = [*_detected(known, others, asked.window)]
+        low = [label for label in detected if label.low and not label.counted]
+        if low:
+            named = [f"{label.name} ({counted(label.low, 'time')})" for label in low]
+            yield repeating(
+                f"detected only below {asked.min_score}: {listed(named, at_most=_MOST_NAMED)}",
+                [label.name for label in detected],
+            )
     for key, label in asked.labels.items():
         about = f"{abbreviate(label)}: " if len(asked.labels) > 1 else ""
         for note in _of_label(known, key, asked):
@@ -287,10 +291,10 @@ def _labels_left_out(known: KnownThings) -> list[str]:
 
 def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     """Yields why no thing may be known of a window: its detectors published nothing in it."""
-    window, (first, last) = asked.window, known.estimate.looks.times()
+    window, looks = asked.window, known.estimate.looks
     topics = [topic for topic in known.estimate.topics if topic not in asked.undecoded]
     # Each new message of a detector is a look.
-    is_empty = not ((first < window.stop) & (last >= window.start)).any()
+    is_empty = not ((looks.first < window.stop) & (looks.last >= window.start)).any()
     if topics and is_empty and known.reaches_back(window):
         yield (
             f"{listed(topics)} published nothing new in this window: whether things were there "
@@ -325,18 +329,6 @@ def _detected(known: KnownThings, keys: Iterable[str], window: TimeWindow) -> It
             placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
             together=int(spots[:, Spot.TOGETHER].max(initial=0)),
         )
-
-
-def _too_low(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
-    """Yields which labels were detected, and do not count."""
-    low = [
-        f"{label.name} ({counted(label.low, 'time')})"
-        for label in detected
-        if label.low and not label.counted
-    ]
-    if low:
-        text = f"detected only below {asked.min_score}: {listed(low, at_most=_MOST_NAMED)}"
-        yield repeating(text, [label.name for label in detected])
 
 
 def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:

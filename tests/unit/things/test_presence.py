@@ -87,7 +87,6 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
         assert at_once.looks.tolist() == alone.looks.tolist()
         assert at_once.hits.tolist() == alone.hits.tolist()
         assert at_once.fair.tolist() == alone.fair.tolist()
-        assert at_once.times.tolist() == alone.times.tolist()
         assert [stay for of, stay in stays if of == nth] == [
             stay for _, stay in stays_at(cells, alone)
         ]
