@@ -24,7 +24,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import BagFile, JsonValue, Pose, Sample, TimeWindow
-from ros2_memory.core.text import listed
+from ros2_memory.core.text import listed, match_topics
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     FUTURE_NS,
@@ -451,13 +451,17 @@ def value_when(
     return _last_match(view, now, sought, found)
 
 
-def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
+def list_recorded_topics(
+    memory: Memory, call: Call, *, pattern: str | None = None
+) -> tuple[results.TopicRow, ...]:
     """Returns every topic that has messages, under each of its types; none for an empty memory.
 
-    A row has notes where its numbers are of bags that are not whole, or that a wrong clock dated.
+    With `pattern`, a glob, those that match it. A row has notes where its numbers are of bags that
+    are not whole, or that a wrong clock dated.
 
     Raises:
-        NoDataError: the bag directory or its disk is missing: what was recorded is not known.
+        NoDataError: the bag directory or its disk is missing: what was recorded is not known; or
+            no topic matches.
     """
     view = View(memory, call, memory.clock.now())
     if view.snapshot.problem is not None:
@@ -478,7 +482,17 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
                     notes.get(topic, ()),
                 )
             )
-    return tuple(rows)
+    if pattern is None or not rows:
+        return tuple(rows)
+    matched = {*match_topics([row.topic for row in rows], pattern)}
+    named = tuple(row for row in rows if row.topic in matched)
+    if not named:
+        raise NoDataError(
+            NoDataReason.TOPIC_NOT_RECORDED,
+            f"none of the {len(rows)} recorded topics matches {pattern}; "
+            "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
+        )
+    return named
 
 
 def data_time_range(
@@ -718,8 +732,10 @@ def _newest_at(
     if stored is None and tolerance_s is None and is_pose:
         before = TimeWindow(max(window.stop - _THINNED_POSES_NS, MIN_NS), window.stop)
         pose = view.stream.newest(topic, before)
-        if pose is not None and is_thinned(pose.bag.file) and _holds_until_next(view, pose):
-            stored = pose
+        if pose is not None and is_thinned(pose.bag.file):
+            # A pose of a thinned day holds until the next: farther apart none was recorded.
+            after = TimeWindow(pose.time + 1, pose.time + _THINNED_POSES_NS)
+            stored = pose if view.stream.first([topic], after) is not None else None
     deleted = False
     if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
         newest = view.stream.last(topic, window.stop)
@@ -736,12 +752,6 @@ def _newest_at(
     note_robots_near(view, stored)
     note_unread(view, TimeWindow(stored.time, window.stop))
     return stored
-
-
-def _holds_until_next(view: View, stored: StoredMessage) -> bool:
-    """Whether a pose of a thinned day holds until the next: farther apart none was recorded."""
-    window = TimeWindow(stored.time + 1, stored.time + _THINNED_POSES_NS)
-    return view.stream.first([stored.topic], window) is not None
 
 
 def _window_before(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cache, cached_property, partial
 from itertools import islice
@@ -325,8 +325,8 @@ class ToolDeclaration:
     """A query and all its names.
 
     `shows_example`: its schema alone does not show how it is called.
-    `count` answers in place of `query` where `by` is given. It need not take arguments that only
-    bound what is shown (`SHOWN_ALONE`); others that it does not take are refused.
+    `instead` has the queries that answer in place of `query` where an argument is given. They need
+    not take arguments that only bound what is shown (`SHOWN_ALONE`); others are refused.
     """
 
     names: tuple[ToolName, ...]
@@ -336,7 +336,7 @@ class ToolDeclaration:
     blocking: bool = False
     writes: bool = False
     shows_example: bool = False
-    count: Query | None = None
+    instead: Mapping[str, Query] = field(default_factory=dict)
 
     def tools(self, defaults: Mapping[str, object], *, plain_times: bool = False) -> Iterator[Tool]:
         """Yields a tool for each name; `defaults` fill the description's placeholders.
@@ -400,21 +400,20 @@ class ToolDeclaration:
         return asked
 
     def _bound(self, arguments: dict[str, object]) -> tuple[Query, dict[str, object]]:
-        """Returns the query that answers, or that counts, and its arguments.
+        """Returns the query that answers, and its arguments.
 
         Raises:
-            InvalidArgumentsError: one of them cannot be combined with `by`.
+            InvalidArgumentsError: one of them cannot be combined with another.
         """
-        by = None if self.count is None else arguments.pop("by")
-        if self.count is None or by is None:
-            return self.query, arguments
-        taken = inspect.signature(self.count).parameters
+        given = [name for name, value in arguments.items() if value not in (None, False, ())]
+        chosen = next((name for name in self.instead if name in given), None)
+        query = self.query if chosen is None else self.instead[chosen]
+        taken = inspect.signature(query).parameters
         refused = [
             self.arguments.model_fields[name].alias or name
-            for name, value in arguments.items()
-            if name not in taken and name not in SHOWN_ALONE and value not in (None, ())
+            for name in given
+            if name not in {chosen, *taken, *SHOWN_ALONE}
         ]
-        if refused:
-            raise InvalidArgumentsError(f"{', '.join(refused)} cannot be combined with by")
-        chosen = {name: value for name, value in arguments.items() if name in taken}
-        return self.count, {"by": by, **chosen}
+        if refused and chosen is not None:
+            raise InvalidArgumentsError(f"{', '.join(refused)} cannot be combined with {chosen}")
+        return query, {name: value for name, value in arguments.items() if name in taken}

@@ -41,7 +41,7 @@ _SIGHTINGS = ToolDeclaration(
     MatchesArguments,
     find_matches,
     blocking=True,
-    count=count_matches,
+    instead={"by": count_matches},
 )
 _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),
@@ -70,7 +70,7 @@ _VISITS = ToolDeclaration(
     VisitsArguments,
     visits,
     blocking=True,
-    count=count_visits,
+    instead={"by": count_visits},
 )
 _THINGS = ToolDeclaration(
     (ToolName("find_things", "Things"),),

@@ -6,12 +6,7 @@ A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declar
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING
-
-from ros2_memory import queries, results
-from ros2_memory.core.errors import NoDataError, NoDataReason
-from ros2_memory.core.text import match_topics
+from ros2_memory import queries
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.robot import count_path
 from ros2_memory.insights.episodes import topic_changes
@@ -35,69 +30,6 @@ from ros2_memory.tools.arguments import (
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import TimeRange
-
-
-def _list_topics(
-    memory: Memory, call: Call, *, pattern: str | None
-) -> tuple[results.TopicRow, ...]:
-    rows = queries.list_recorded_topics(memory, call)
-    if pattern is None or not rows:
-        return rows
-    matched = {*match_topics([row.topic for row in rows], pattern)}
-    named = tuple(row for row in rows if row.topic in matched)
-    if not named:
-        raise NoDataError(
-            NoDataReason.TOPIC_NOT_RECORDED,
-            f"none of the {len(rows)} recorded topics matches {pattern}; "
-            "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
-        )
-    return named
-
-
-def _topic_range(
-    memory: Memory,
-    call: Call,
-    topic: str,
-    span: TimeRange,
-    *,
-    max_samples: int,
-    fields: Sequence[str],
-    changes: bool | None,
-) -> results.TopicRange | results.Changes:
-    """Returns samples of a topic, or each value that it held once."""
-    query = topic_changes if changes else queries.topic_range
-    return query(memory, call, topic, span, max_samples=max_samples, fields=fields)
-
-
-def _trajectory(
-    memory: Memory,
-    call: Call,
-    span: TimeRange,
-    *,
-    topic: str | None,
-    where: JsonValue,
-    frame_id: str | None,
-    max_waypoints: int,
-    farthest: JsonValue,
-) -> results.TrajectorySummary | results.DrivenInside:
-    """Returns the whole way, or what was driven inside of a region."""
-    query = queries.trajectory_summary if where is None else partial(driven_inside, where=where)
-    return query(
-        memory,
-        call,
-        span,
-        topic=topic,
-        frame_id=frame_id,
-        max_waypoints=max_waypoints,
-        farthest=farthest,
-    )
-
 
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
     return (
@@ -113,7 +45,7 @@ DECLARATIONS = (
         "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; of too many "
         "the busiest.",
         TopicListArguments,
-        _list_topics,
+        queries.list_recorded_topics,
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Recorded times"),),
@@ -142,8 +74,8 @@ DECLARATIONS = (
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
         "max, max_at}}}} of all messages}}.",
         TopicRangeArguments,
-        _topic_range,
-        count=count_range,
+        queries.topic_range,
+        instead={"by": count_range, "changes": topic_changes},
     ),
     ToolDeclaration(
         _at_and_ago("position", "Position"),
@@ -205,8 +137,8 @@ DECLARATIONS = (
         "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
         "...}}; with where: only the path inside it, and visits.",
         TrajectoryArguments,
-        _trajectory,
+        queries.trajectory_summary,
         blocking=True,
-        count=count_path,
+        instead={"by": count_path, "where": driven_inside},
     ),
 )
