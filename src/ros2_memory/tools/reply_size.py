@@ -10,8 +10,6 @@ from __future__ import annotations
 import json
 import math
 from bisect import bisect_left
-from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import shortened
@@ -34,9 +32,9 @@ _TABLES: Final = frozenset({"rows", "windows.rows"})
 _WHOLE: Final = frozenset({"notes", "all", QUOTED, *HEADERS})
 """What stays as it is; each cell belongs to its column."""
 _FEWEST_ROWS: Final = 2
-_SHORTEST_TEXT: Final = 200
-_ARRAY_STEPS: Final = (50, 25, 12, 6, 3, 2)
-_KEY_STEPS: Final = (200, 50, 12, 4)
+_CHARS_OF_ELEMENT: Final = 40
+_KEYS_OF_ELEMENT: Final = 4
+"""For each element that arrays keep: how much texts and objects keep."""
 _MAX_NOTES: Final = 12
 _LONGEST_NOTE: Final = 600
 _LONGEST_OUTLINED: Final = 80
@@ -169,8 +167,13 @@ def _rows_note(key: str, kept: int, total: int, max_chars: int) -> str:
 
 
 def _shorter_values(reply: JsonObject, max_chars: int) -> JsonObject:
-    """Thins the arrays inside the rows, then cuts texts, then drops keys of wide objects."""
-    shortener = _weakest_shortener(reply, max_chars)
+    """Thins the arrays inside the rows, cuts texts and drops keys, no more than it takes."""
+    room = max_chars - _LONGEST_NOTE if max_chars > 3 * _LONGEST_NOTE else max_chars * 2 // 3
+
+    def fits(most: int) -> bool:
+        return len(to_json_text(_Shortener(most).shorten(reply))) <= room
+
+    shortener = _Shortener(largest(1, max_chars, fits) or 1)
     shorter = shortener.shorten(reply)
     named = [
         # As the `fields` argument takes it: relative to a sample's value.
@@ -187,40 +190,20 @@ def _shorter_values(reply: JsonObject, max_chars: int) -> JsonObject:
     return _with_note(shorter, shortened(sentence, _LONGEST_NOTE - 50))
 
 
-def _weakest_shortener(reply: JsonObject, max_chars: int) -> _Shortener:
-    """Returns the limits that leave most of the reply, and room for the note on them."""
-    room = max_chars - _LONGEST_NOTE if max_chars > 3 * _LONGEST_NOTE else max_chars * 2 // 3
-
-    def fits(keys: int, arrays: int, text: int) -> bool:
-        return len(to_json_text(_Shortener(keys, arrays, text).shorten(reply))) <= room
-
-    unlimited = len(to_json_text(reply))
-    longest = largest(_ARRAY_STEPS[0], max_chars, lambda arrays: fits(unlimited, arrays, unlimited))
-    if longest is not None:
-        return _Shortener(unlimited, longest, unlimited)
-    for arrays in _ARRAY_STEPS:
-        text = largest(_SHORTEST_TEXT, max_chars, partial(fits, unlimited, arrays))
-        if text is not None:
-            return _Shortener(unlimited, arrays, text)
-    fewest, shortest = _ARRAY_STEPS[-1], _SHORTEST_TEXT // 4
-    keys = next((step for step in _KEY_STEPS if fits(step, fewest, shortest)), _KEY_STEPS[-1])
-    return _Shortener(keys, fewest, shortest)
-
-
-@dataclass
 class _Shortener:
-    """Limits on the keys of an object, the elements of an array, and the characters of a text.
+    """Keeps so many elements of each array, and as much of texts and objects as goes with it.
 
     Attributes:
-        shortened: what exceeded them: (dot-path without indices, how it was shortened) to how much
-            was kept of how much, of the longest list or widest object there; (0, 0) for texts.
+        shortened: what had more: (dot-path without indices, how it was shortened) to how much was
+            kept of how much, of the longest list or widest object there; (0, 0) for texts.
     """
 
-    _keys: int
-    _arrays: int
-    _text: int
-    shortened: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
-    _columns: list[JsonValue] = field(default_factory=list)
+    def __init__(self, most: int) -> None:
+        self.shortened: dict[tuple[str, str], tuple[int, int]] = {}
+        self._most = most
+        self._most_chars = most * _CHARS_OF_ELEMENT
+        self._most_keys = most * _KEYS_OF_ELEMENT
+        self._columns: list[JsonValue] = []
 
     def shorten(self, reply: JsonObject) -> JsonObject:
         """Returns the reply with everything within the limits, except `_WHOLE` and its rows."""
@@ -235,12 +218,8 @@ class _Shortener:
 
     def _part(self, key: str, item: JsonValue, path: str) -> JsonValue:
         """Returns what an object has under a key; lists that stay whole as they are."""
-        is_first = path in {key, f"windows.{key}"}
-        return (
-            item
-            if is_first and key in _WHOLE and isinstance(item, list)
-            else self._value(item, path)
-        )
+        is_whole = isinstance(item, list) and key in _WHOLE and path in {key, f"windows.{key}"}
+        return item if is_whole else self._value(item, path)
 
     def _row(self, row: JsonValue, path: str) -> JsonValue:
         """Returns an element of a list; of a row of a table no cell is left out."""
@@ -250,18 +229,18 @@ class _Shortener:
         return self._value(row, path)
 
     def _value(self, value: JsonValue, path: str) -> JsonValue:
-        if isinstance(value, str) and len(value) > self._text:
+        if isinstance(value, str) and len(value) > self._most_chars:
             self.shortened[path, "texts cut"] = (0, 0)
-            return shortened(value, self._text)
+            return shortened(value, self._most_chars)
         if isinstance(value, list):
-            indices = evenly(len(value), self._arrays)
+            indices = evenly(len(value), self._most)
             self._count(path, "evenly thinned", len(indices), len(value))
             return [self._row(value[index], path) for index in indices]
         if isinstance(value, dict):
-            kept = list(value.items())[: self._keys]
+            kept = list(value.items())[: self._most_keys]
             self._count(path, "keys left out", len(kept), len(value))
             return {
-                shortened(key, self._text): self._part(key, item, f"{path}.{key}")
+                shortened(key, self._most_chars): self._part(key, item, f"{path}.{key}")
                 for key, item in kept
             }
         return value
