@@ -129,14 +129,10 @@ def _moments_of(memory: Memory) -> list[StoredMoment]:
     return [
         moment
         for moment in stored_moments_in(memory.index.bag_dir)
-        if not recording or _has_bags_of(moment.folder, recording)
+        if not recording
+        or Path(recording).is_relative_to(Path(MOMENTS_FOLDER, moment.folder.name))
+        or (moment.folder / recording).is_dir()
     ]
-
-
-def _has_bags_of(folder: Path, recording: str) -> bool:
-    """Whether a moment's folder holds bags of a recording, or is the recording itself."""
-    own = Path(MOMENTS_FOLDER, folder.name)
-    return Path(recording).is_relative_to(own) or (folder / recording).is_dir()
 
 
 def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:

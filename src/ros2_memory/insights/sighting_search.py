@@ -316,7 +316,8 @@ class _TopicRuns:
         Then, and where no run goes on, what follows an older run is not known.
         """
         self._join()
-        if not self._is_open or _has_messages(view, topic, gap):
+        is_silent = gap.empty or view.stream.first([topic], gap) is None
+        if not self._is_open or not is_silent:
             self._is_open, self._begins = False, MAX_NS
 
 
@@ -421,18 +422,6 @@ def _scoped(block: Block, scope: Scope) -> Block:
         return replace(messages, met=met)
 
     return block._replace(tested=tested)
-
-
-def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
-    """Whether a topic has a message in a time; by the index where that is enough."""
-    if gap.empty:
-        return False
-    bags = view.stream.overlapping_bags([topic], gap)
-    is_alone = len({bag.bag.recording for bag in bags}) == 1
-    counts = is_alone and not view.stream.may_be_repeated([topic])
-    if counts and any(gap.contains(bag.first) or gap.contains(bag.last) for bag in bags):
-        return True
-    return bool(bags) and view.stream.first([topic], gap) is not None
 
 
 def _has_enough(by_topic: Collection[_TopicRuns], enough: int, reached: Ns) -> bool:

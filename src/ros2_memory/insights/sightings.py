@@ -236,17 +236,24 @@ def _runs_as_sightings(
         searched = TimeWindow(runs[-1].first, searched.stop)
     view.notes.retract_outside(searched)
     # To say where the robot was takes longest.
-    wanted = [
-        (run, newest)
-        for run in runs
-        if view.call.wants(run.last) and (newest := _newest_match(view, search, run)) is not None
-    ]
-    sightings = tuple(
-        _sighting(view, search.condition, run, newest, scope=scope, frame_id=shown.frame_id)
-        for run, newest in wanted
-    )
-    if fields:
-        sightings = _with_fields(view, sightings, [newest for _, newest in wanted], fields)
+    sightings: list[Sighting] = []
+    refused: list[InvalidArgumentsError] = []
+    for run in runs:
+        newest = _newest_match(view, search, run) if view.call.wants(run.last) else None
+        if newest is None:
+            continue
+        sighting = _sighting(
+            view, search.condition, run, newest, scope=scope, frame_id=shown.frame_id
+        )
+        if fields:
+            try:
+                sighting = _with_fields(view, sighting, newest, fields)
+            except InvalidArgumentsError as error:
+                # A traceback has this frame, which has the errors: they would stay for long.
+                refused.append(error.with_traceback(None))
+        sightings.append(sighting)
+    if refused and len(refused) == len(sightings):
+        raise refused.pop(0)
     return sightings, total, searched
 
 
@@ -423,33 +430,16 @@ def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None
 
 
 def _with_fields(
-    view: View,
-    sightings: Sequence[Sighting],
-    newest_messages: Sequence[StoredMessage],
-    fields: Sequence[str],
-) -> tuple[Sighting, ...]:
-    """Returns the sightings with the fields of their last messages in place of matched texts.
+    view: View, sighting: Sighting, newest: StoredMessage, fields: Sequence[str]
+) -> Sighting:
+    """Returns a sighting with the fields of its last message in place of matched texts.
 
     Raises:
-        InvalidArgumentsError: none of them has these fields.
+        InvalidArgumentsError: the message does not have them.
     """
-    extended: list[Sighting] = []
-    refused: list[InvalidArgumentsError] = []
-    for sighting, newest in zip(sightings, newest_messages, strict=True):
-        record = newest.record
-        message = view.memory.reader.decode(record)
-        try:
-            shown = view.extractor.shown(message, record.channel.type, fields)
-        except InvalidArgumentsError as error:
-            # A traceback has this frame, which has the errors: they would stay for long.
-            refused.append(error.with_traceback(None))
-            extended.append(sighting)
-            continue
-        view.notes.add(*shown.notes)
-        extended.append(replace(sighting, matched=(), value=quote(shown.value)))
-    if refused and len(refused) == len(extended):
-        raise refused.pop(0)
-    return tuple(extended)
+    shown = view.extractor.shown(view.memory.reader.decode(newest.record), newest.type, fields)
+    view.notes.add(*shown.notes)
+    return replace(sighting, matched=(), value=quote(shown.value))
 
 
 def _place_of_thing(

@@ -223,24 +223,28 @@ def missing_data(view: View) -> Iterator[str]:
     if snapshot.problem is None and not snapshot.bags:
         yield nothing_here(snapshot)
     undecided = [bag for bag in snapshot.active if not bag.growing and bag.reason != HELD_BACK]
-    if undecided:
-        files = counted(len(undecided), "file has", "files have")
-        yield f"{files} no end yet: being written, or left by a crash"
-    if left_open := snapshot.timeline.disk_use[1]:
-        bags = counted(left_open, "bag was", "bags were")
-        yield f"{bags} left open by a crash: unwritten messages are lost"
-    if snapshot.unread:
-        files = counted(len(snapshot.unread), "file is not read", "files are not read")
-        yield f"{files}; data_time_range says why"
-    if odd := len(bags_with_remarks(snapshot)):
-        bags = counted(odd, "bag is", "bags are")
-        yield f"{bags} incomplete or contradictory; data_time_range has the details"
-    if broken := len(view.memory.scanner.damaged_parts(snapshot.bags)):
-        bags = counted(broken, "bag")
-        yield f"{bags} could not be read whole; data_time_range names what is damaged"
-    if misdated := len(snapshot.dating.misdated):
-        bags = counted(misdated, "bag is", "bags are")
-        yield f"{bags} dated by a wrong clock; data_time_range has the details"
+    broken = view.memory.scanner.damaged_parts(snapshot.bags)
+    at, details = "data_time_range", "data_time_range has the details"
+    for number, one, several, what in (
+        (len(undecided), "file has", "files have", "no end yet: being written, or left by a crash"),
+        (
+            snapshot.timeline.disk_use[1],
+            "bag was",
+            "bags were",
+            "left open by a crash: unwritten messages are lost",
+        ),
+        (len(snapshot.unread), "file is", "files are", f"not read; {at} says why"),
+        (
+            len(bags_with_remarks(snapshot)),
+            "bag is",
+            "bags are",
+            f"incomplete or contradictory; {details}",
+        ),
+        (len(broken), "bag", "bags", f"could not be read whole; {at} names what is damaged"),
+        (len(snapshot.dating.misdated), "bag is", "bags are", f"dated by a wrong clock; {details}"),
+    ):
+        if number:
+            yield f"{counted(number, one, several)} {what}"
     yield from describe_absent(view.memory.absent_splits(snapshot))
     segments = snapshot.timeline.recorded_segments
     newest = max(segments, key=lambda segment: segment.latest, default=None)
