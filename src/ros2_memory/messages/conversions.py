@@ -60,24 +60,15 @@ def field_table_of_class(cls: type) -> FieldTable | None:
     """Returns the fields of messages of a dataclass; None for another class."""
     if not dataclasses.is_dataclass(cls):
         return None
-    attributes = {_ros_name(f.name): f.name for f in dataclasses.fields(cls) if _is_data(f)}
+    attributes: dict[str, str] = {}
+    for field in dataclasses.fields(cls):
+        # rosbags imports ClassVar for type checkers only, so that dataclasses takes the constants
+        # of a definition for fields; the annotation's text still distinguishes them.
+        is_constant = isinstance(field.type, str) and field.type.startswith("ClassVar")
+        if not is_constant and field.name != "structure_needs_at_least_one_member":
+            bare = field.name.removesuffix("_")  # which rosbags appends to Python's keywords
+            attributes[bare if keyword.iskeyword(bare) else field.name] = field.name
     return FieldTable(str(getattr(cls, "__msgtype__", "")), attributes)
-
-
-def _is_data(field: dataclasses.Field[object]) -> bool:
-    """Whether a dataclass's field is one of the message.
-
-    rosbags imports ClassVar for type checkers only, so that dataclasses takes the constants of a
-    definition for fields; the annotation's text still distinguishes them.
-    """
-    constant = isinstance(field.type, str) and field.type.startswith("ClassVar")
-    return not constant and field.name != "structure_needs_at_least_one_member"
-
-
-def _ros_name(attribute: str) -> str:
-    """Returns the definition's name of an attribute: rosbags appends `_` to Python's keywords."""
-    bare = attribute.removesuffix("_")
-    return bare if keyword.iskeyword(bare) else attribute
 
 
 def field_of(node: object, name: str) -> object:
@@ -243,27 +234,20 @@ _XYZW: Final = attrgetter("x", "y", "z", "w")
 
 def xyz(node: object) -> Vector3 | None:
     """Returns the numbers of a message or JSON object with x, y and z; None for any other."""
-    if isinstance(node, dict):
-        x, y, z = map(node.get, "xyz")
-    else:
-        try:
-            x, y, z = _XYZ(node)
-        except AttributeError:
-            x, y, z = (field_of(node, name) for name in "xyz")
-    if type(x) is type(y) is type(z) is float:
-        return (x, y, z)
-    return triple((x, y, z))
+    try:
+        numbers: object = _XYZ(node)
+    except AttributeError:
+        numbers = tuple(field_of(node, name) for name in "xyz")
+    return triple(numbers)
 
 
 def xyzw(node: object) -> Quaternion | None:
     """Returns the numbers of a message or JSON object with x, y, z and w, not normalised."""
     try:
-        x, y, z, w = _XYZW(node)
+        numbers: object = _XYZW(node)
     except AttributeError:
-        x, y, z, w = (field_of(node, name) for name in "xyzw")
-    if type(x) is type(y) is type(z) is type(w) is float:
-        return (x, y, z, w)
-    return quadruple((x, y, z, w))
+        numbers = tuple(field_of(node, name) for name in "xyzw")
+    return quadruple(numbers)
 
 
 def number(node: object) -> float | None:
@@ -362,17 +346,9 @@ def channels_of(encoding: str) -> int | None:
     return {"mono": 1, "bayer": 1, "rgb": 3, "bgr": 3}.get(named[0], 4) if named else None
 
 
-def _compressed_image(message: object, data: object) -> object:
-    return _summary(data, encoding=field_of(message, "format"))
-
-
 def _point_cloud(message: object, data: object) -> object:
     shape = _shape(message)
     return _summary(data, points=math.prod(shape), shape=shape)
-
-
-def _occupancy_grid(message: object, data: object) -> object:
-    return _summary(data, shape=_shape(message, "info"))
 
 
 def _magnetic_field(_message: object, field: object) -> object:
@@ -397,9 +373,13 @@ _KINDS: Final[Mapping[str, tuple[ValueKind, str]]] = {
 _NONE: Final[Mapping[str, Callable[[object, object], object]]] = {}
 _SUMMARIES: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]] = {
     "sensor_msgs/msg/Image": {"data": _image},
-    "sensor_msgs/msg/CompressedImage": {"data": _compressed_image},
+    "sensor_msgs/msg/CompressedImage": {
+        "data": lambda message, data: _summary(data, encoding=field_of(message, "format"))
+    },
     "sensor_msgs/msg/PointCloud2": {"data": _point_cloud},
-    "nav_msgs/msg/OccupancyGrid": {"data": _occupancy_grid},
+    "nav_msgs/msg/OccupancyGrid": {
+        "data": lambda message, data: _summary(data, shape=_shape(message, "info"))
+    },
     "sensor_msgs/msg/MagneticField": {"magnetic_field": _magnetic_field},
 }
 

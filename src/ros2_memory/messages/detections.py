@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 from itertools import product
-from operator import is_
+from operator import is_, itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS
@@ -79,9 +79,9 @@ def detections_of(
 
     They are looked for `depth` lists, objects and texts deep.
     """
-    detections: list[Detection] = []
-    _walked(value, frame_id, depth, None, detections, listed=None)
-    return tuple(detections)
+    walk = _Walk(None)
+    walk.value(value, frame_id, depth)
+    return tuple(walk.detections)
 
 
 def naming(fields: Collection[str]) -> Iterator[str]:
@@ -103,125 +103,105 @@ def without_low_scores(value: JsonValue, min_score: float, depth: int = MAX_DEPT
     also the place of each that scores less. What has no score stays. A value without any such
     detection is returned as it is. They are looked for as by `detections_of`.
     """
-    return _walked(value, "", depth, min_score, [], listed=None)
+    return _Walk(min_score).value(value, "", depth)
 
 
-def _walked(
-    value: JsonValue,
-    frame: str,
-    depth: int,
-    least: float | None,
-    detections: list[Detection],
-    *,
-    listed: bool | None,
-) -> JsonValue:
-    """Appends the detections in a value; returns it without those of a score below `least`.
+class _Walk:
+    """A walk over a value, which collects its detections.
 
-    `listed`: in JSON, whether it is in a list; None outside of JSON.
+    What it returns is without those whose score is below `least`.
     """
-    if depth == 0:
-        return value
-    if isinstance(value, dict):
-        return _walked_object(
-            value, _frame(value) or frame, depth, least, detections, listed=listed
-        )
-    if isinstance(value, str):
-        if not looks_like_json(value):  # most are names
+
+    def __init__(self, least: float | None) -> None:
+        self.detections: list[Detection] = []
+        self._least = least
+
+    def value(
+        self, value: JsonValue, frame: str, depth: int, listed: bool | None = None
+    ) -> JsonValue:
+        """Returns what is left of a value in a frame.
+
+        `listed`: in JSON, whether it is in a list; None outside of JSON.
+        """
+        if depth == 0:
             return value
-        parsed = _from_json(value)
-        kept = _walked(parsed, frame, depth - 1, least, detections, listed=False)
-        return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
-    if isinstance(value, list):
-        listed = None if listed is None else True
-        parts = [
-            _walked(element, frame, depth - 1, least, detections, listed=listed)
-            if isinstance(element, dict)
-            else element
-            for element in value
+        if isinstance(value, dict):
+            return self._object(value, _frame(value) or frame, depth, listed)
+        if isinstance(value, str):
+            if not looks_like_json(value):  # most are names
+                return value
+            parsed = _from_json(value)
+            kept = self.value(parsed, frame, depth - 1, listed=False)
+            return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
+        if isinstance(value, list):
+            listed = None if listed is None else True
+            parts = [
+                self.value(element, frame, depth - 1, listed)
+                if isinstance(element, dict)
+                else element
+                for element in value
+            ]
+            return value if all(map(is_, parts, value)) else parts
+        return value
+
+    def _object(self, value: JsonObject, frame: str, depth: int, listed: bool | None) -> JsonValue:
+        label = _label(value)
+        if label is None:
+            return self._parts(value, frame, depth, listed)
+        own = _placed((value,), frame, label, _score(value))
+        if listed is not None and own.score is None and _SHOWN.isdisjoint(value):
+            begin = len(self.detections)
+            kept = self._parts(value, frame, depth, listed)
+            if label.strip().casefold() != _NOTHING and (listed or _is_alone(value)):
+                inner = self.detections[begin:]
+                scored = [one for one in inner if one.score is not None]
+                self.detections[begin:] = [own, *scored]
+            return kept
+        self.detections.append(own)
+        return None if self._is_below(value) else value
+
+    def _parts(self, value: JsonObject, frame: str, depth: int, listed: bool | None) -> JsonValue:
+        """Returns what is left of an object of which only parts may be detections."""
+        best = _best_result(value.get("results"))
+        best_label = None if best is None else _label(_hypothesis(best))
+        if best is not None and best_label is not None:
+            score = _score(_hypothesis(best))
+            self.detections.append(_placed((best, value), frame, best_label, score))
+            return self._with_hypotheses(value, best)
+        fields: JsonObject = {}
+        for name, inner in value.items():
+            if name in LISTS_OF_LABELS and isinstance(inner, list):
+                labels = (element for element in inner if isinstance(element, str) and element)
+                self.detections += map(Detection, labels)
+            is_leaf = not inner or isinstance(inner, int | float)  # most are: no call for each
+            fields[name] = inner if is_leaf else self.value(inner, frame, depth - 1, listed)
+        return value if all(map(is_, fields.values(), value.values())) else fields
+
+    def _with_hypotheses(self, value: JsonObject, best: JsonObject) -> JsonValue:
+        if self._is_below(_hypothesis(best)):
+            return None
+        results = value["results"]
+        kept: list[JsonValue] = [
+            None if isinstance(result, dict) and self._is_below(_hypothesis(result)) else result
+            for result in (results if isinstance(results, list) else ())
         ]
-        return value if all(map(is_, parts, value)) else parts
-    return value
+        return {**value, "results": kept} if None in kept else value
+
+    def _is_below(self, value: JsonObject) -> bool:
+        score = None if self._least is None else _score(value)
+        return score is not None and self._least is not None and score < self._least
 
 
-def _walked_object(
-    value: JsonObject,
-    frame: str,
-    depth: int,
-    least: float | None,
-    detections: list[Detection],
-    *,
-    listed: bool | None,
-) -> JsonValue:
-    """Returns an object as `_walked` does; `frame` is the one that it is in."""
-    label = _label(value)
-    if label is None:
-        return _walked_parts(value, frame, depth, least, detections, listed=listed)
-    own = _placed((value,), frame, label, _score(value))
-    if listed is not None and own.score is None and _SHOWN.isdisjoint(value):
-        inner: list[Detection] = []
-        kept = _walked_parts(value, frame, depth, least, inner, listed=listed)
-        if label.strip().casefold() == _NOTHING or not (listed or _is_alone(value)):
-            detections += inner
-        else:
-            detections += [own, *(one for one in inner if one.score is not None)]
-        return kept
-    detections.append(own)
-    return None if _is_below(value, least) else value
-
-
-def _is_alone(value: dict[str, JsonValue]) -> bool:
+def _is_alone(value: JsonObject) -> bool:
     """Returns whether an object has nothing beside its name, or lists of numbers or points."""
     others = [part for name, part in value.items() if name not in _NAMED_BY]
     lists = [part for part in others if isinstance(part, list)]
     return not others or any(isinstance(part[0], int | float | list) for part in lists if part)
 
 
-def _walked_parts(
-    value: dict[str, JsonValue],
-    frame: str,
-    depth: int,
-    least: float | None,
-    detections: list[Detection],
-    *,
-    listed: bool | None,
-) -> JsonValue:
-    """Returns an object of which only parts may be detections as `_walked` does."""
-    best = _best_result(value.get("results"))
-    best_label = None if best is None else _label(_hypothesis(best))
-    if best is not None and best_label is not None:
-        detections.append(_placed((best, value), frame, best_label, _score(_hypothesis(best))))
-        return value if least is None else _without_hypotheses(value, best, least)
-    fields: JsonObject = {}
-    for name, inner in value.items():
-        if name in LISTS_OF_LABELS and isinstance(inner, list):
-            detections += [
-                Detection(element) for element in inner if isinstance(element, str) and element
-            ]
-        is_leaf = not inner or isinstance(inner, int | float)  # most are: no call for each
-        fields[name] = (
-            inner if is_leaf else _walked(inner, frame, depth - 1, least, detections, listed=listed)
-        )
-    return value if all(map(is_, fields.values(), value.values())) else fields
-
-
 def looks_like_json(text: str) -> bool:
     """Returns whether a text begins as a JSON array or object does."""
     return text.lstrip()[:1] in _JSON
-
-
-def _without_hypotheses(value: JsonObject, best: JsonObject, least: float) -> JsonValue:
-    if _is_below(_hypothesis(best), least):
-        return None
-    results = value["results"]
-    kept: list[JsonValue] = [
-        None if isinstance(result, dict) and _is_below(_hypothesis(result), least) else result
-        for result in (results if isinstance(results, list) else ())
-    ]
-    return {**value, "results": kept} if None in kept else value
-
-
-def _is_below(value: JsonObject, least: float | None) -> bool:
-    return least is not None and (score := _score(value)) is not None and score < least
 
 
 def _label(value: JsonObject) -> str | None:
@@ -239,13 +219,13 @@ def _best_result(results: JsonValue) -> JsonObject | None:
     """Returns the hypothesis of the highest score; the first of several."""
     if not isinstance(results, list):
         return None
-    objects = [result for result in results if isinstance(result, dict)]
-    return max(objects, key=_rank, default=None)
-
-
-def _rank(result: JsonObject) -> float:
-    score = _score(_hypothesis(result))
-    return -math.inf if score is None else score
+    scored = [
+        (-math.inf if score is None else score, result)
+        for result in results
+        if isinstance(result, dict)
+        for score in [_score(_hypothesis(result))]
+    ]
+    return max(scored, key=itemgetter(0), default=(0.0, None))[1]
 
 
 def _hypothesis(result: JsonObject) -> JsonObject:
