@@ -316,8 +316,7 @@ class _TopicRuns:
         Then, and where no run goes on, what follows an older run is not known.
         """
         self._join()
-        is_silent = gap.empty or view.stream.first([topic], gap) is None
-        if not self._is_open or not is_silent:
+        if not self._is_open or (not gap.empty and view.stream.first([topic], gap) is not None):
             self._is_open, self._begins = False, MAX_NS
 
 
