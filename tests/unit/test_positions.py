@@ -11,16 +11,13 @@ import numpy as np
 import pytest
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
     Msg,
-    boolean,
     header,
     make,
-    odom,
     point,
     quaternion,
     text,
@@ -31,7 +28,6 @@ from tests.support.bags import (
 from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 S = 10**9
@@ -44,13 +40,6 @@ def pose_stamped(ns: int, x: float, y: float, topic: str = "/pose") -> Msg:
     pose = make("geometry_msgs/msg/Pose", position=point(x, y), orientation=quaternion(YAW))
     body = make("geometry_msgs/msg/PoseStamped", header=header(ns, "map"), pose=pose)
     return Msg(topic, "geometry_msgs/msg/PoseStamped", ns, body)
-
-
-def turtle(ns: int, x: float, y: float) -> Msg:
-    body = make(
-        "turtlesim/msg/Pose", x=x, y=y, theta=YAW, linear_velocity=0.5, angular_velocity=-0.25
-    )
-    return Msg("/turtle1/pose", "turtlesim/msg/Pose", ns, body)
 
 
 def vehicle(ns: int, x: float, y: float) -> Msg:
@@ -112,20 +101,6 @@ def remembered(bag_dir: Path, recalls: bool) -> Memory:
 def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
     limits = QuerySettings(**given.pop("limits", {}))
     return asked(replace(remembered(bag_dir, recalls), limits=limits), bag_dir, tool, **given)
-
-
-@each_way
-@pytest.mark.parametrize(("made", "frame_id"), [(turtle, None), (vehicle, "body FRD")])
-def test_whatever_carries_a_velocity_answers_how_fast(
-    tmp_path: Path, recalls: bool, made: Callable[..., Msg], frame_id: str | None
-) -> None:
-    messages = [made(T0 + n * S // 10, 1.0 + n * 0.05, 2.0) for n in range(201)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    given = {"topic": messages[0].topic, "timestamp": T0_S + 10}
-    reply = ask(tmp_path, recalls, "get_velocity_at", **given)
-    assert reply["linear"] == {"x": 0.5, "y": 0.0, "z": 0.0}
-    assert reply["angular"] == {"x": 0.0, "y": 0.0, "z": -0.25}
-    assert reply["frame_id"] == frame_id
 
 
 @each_way
@@ -255,7 +230,6 @@ def moved(tenths: range) -> list[Msg]:
 
 
 FIXES = [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(60)]
-BODY_NOTE = "by transforms, of base_link: no topic has the robot's poses"
 
 
 @each_way
@@ -279,46 +253,6 @@ def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_pa
     assert (reply["timestamp"], reply["x"]) == (T0_S + 20, 21.0)
     refused = ask(tmp_path, False, "get_velocity_at", timestamp=T0_S + 1)["detail"]
     assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
-
-
-@pytest.mark.parametrize(
-    ("recalls", "others"),
-    [(True, []), (False, FIXES), (True, [pose_stamped(T0, 9.0, 9.0, "/goal_pose")])],
-    ids=["alone, catalogue", "fixes, plain", "goal, catalogue"],
-)
-def test_every_tool_that_places_the_robot_takes_its_transforms(
-    tmp_path: Path, recalls: bool, others: list[Msg]
-) -> None:
-    bumped = [boolean(T0 + n * S, n > 5) for n in range(60)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*moved(range(600)), *others, *bumped])
-    near = {"x": 11.0, "y": 0.0, "radius_m": 1.0}
-    span = {"start": T0_S, "end": T0_S + 59}
-    other = {"with_start": T0_S + 30, "with_end": T0_S + 59}
-    asked_for: list[tuple[str, dict[str, Any]]] = [
-        ("get_position_at", {"timestamp": T0_S + 20}),
-        ("visits", near),
-        ("visits", {**near, "by": "hour", **span}),
-        ("recap", span),
-        ("recap", {**span, "where": near}),
-        ("recap", {"around": T0_S + 6, "seconds_before": 3}),
-        ("trajectory_summary", span),
-        ("trajectory_summary", {**span, "by": "hour"}),
-        ("trajectory_summary", {**span, "by": "place"}),
-        ("trajectory_summary", {**span, "where": near}),
-        ("compare", {"start": T0_S, "end": T0_S + 29, **other}),
-        ("find_matches", {"topic": "/bumper", "condition_type": "equals", "value": True, **span}),
-    ]
-    limits = {"places": (Place("door", "map", Circle(11.0, 0.0, 1.0)),)}
-    found = [ask(tmp_path, recalls, tool, **given, limits=limits) for tool, given in asked_for]
-    for reply, (tool, given) in zip(found, asked_for, strict=True):
-        assert BODY_NOTE in reply["notes"], (tool, given, reply)
-    position, visits, by_hour, _, there, before, way, metres, of_place, inside, apart, match = found
-    assert (position["x"], visits["total"], by_hour["all"][2]) == (21.0, 1, 1)
-    assert (there["distance_m"], inside["distance_m"]) == pytest.approx((2.0, 2.0), abs=0.1)
-    assert (before["robot"]["x"], match["sightings"][0]["robot"]["x"]) == (7.0, 7.0)
-    assert (way["distance_m"], metres["all"][1]) == pytest.approx((59.0, 59.0), abs=0.1)
-    assert of_place["rows"][0] == ["door", 2.0, 2.0]
-    assert (apart["frame_id"], apart["farthest_apart"]["this"]["away_m"]) == ("map", 30.0)
 
 
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
@@ -357,25 +291,6 @@ def test_a_path_by_transforms_goes_on_from_hour_to_hour(tmp_path: Path) -> None:
     assert ask(tmp_path, False, "visits", x=0.0, y=0.0)["total"] == 1
 
 
-def test_the_body_is_placed_in_the_map_and_in_a_named_place(tmp_path: Path) -> None:
-    at = T0 + S
-    chain = (
-        transform(at, "map", "odom", (5.0, 0.0, 0.0)),
-        transform(at, "odom", "base_link", (1.0, 0.0, 0.0), YAW),
-        transform(at, "base_link", "arm", (0.0, 9.0, 0.0)),
-    )
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [tf(at, *chain)])
-    hall = Place("hall", "map", Rectangle(0.0, 9.0, -2.0, 2.0))
-    limits = {"places": (hall, Place("door", "map", Circle(6.0, 0.0, 0.5)))}
-    found = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 1, limits=limits)
-    assert (found["x"], found["frame_id"]) == (6.0, "map")
-    assert (found["in"], found["also_in"]) == ("door", ["hall"])
-    assert found["yaw_deg"] == pytest.approx(30)
-    asked_for = {"timestamp": T0_S + 1, "frame_id": "odom"}
-    assert ask(tmp_path, False, "get_position_at", **asked_for)["x"] == 1.0
-    assert "error" in ask(tmp_path, False, "get_position_at", timestamp=T0_S + 300)
-
-
 def test_where_no_topic_has_velocities_the_tool_that_computes_them_is_named(tmp_path: Path) -> None:
     poses = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(5)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
@@ -386,10 +301,3 @@ def test_where_no_topic_has_velocities_the_tool_that_computes_them_is_named(tmp_
     assert "no topic recorded does; trajectory_summary returns speeds from its poses" in detail
     way = {"topic": "/pose", "start": T0_S, "end": T0_S + 4}
     assert ask(tmp_path, False, "trajectory_summary", **way)["avg_speed"] == 1.0
-
-
-def test_a_topic_without_a_position_is_refused_with_those_that_have_one(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(T0, 1.0, 2.0), boolean(T0, True)])
-    reply = ask(tmp_path, False, "get_position_at", topic="/bumper", timestamp=T0_S)
-    assert reply["error"] == "invalid_arguments"
-    assert "carries no position; give a topic that does, such as /odom" in reply["detail"]

@@ -9,16 +9,15 @@ import math
 import random
 from collections import defaultdict
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
-from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.results import ValueWhen
 from tests.support.closed_form import (
     CAMERA,
     LASER,
@@ -40,11 +39,6 @@ if TYPE_CHECKING:
 
 WRITTEN = "written"
 """In place of a session: the one that the test writes."""
-LONG = [
-    pytest.param(WRITTEN, id=WRITTEN),
-    pytest.param(SESSIONS["session_mcap"], id="session_mcap", marks=needs_recorded),
-]
-long_ones = pytest.mark.parametrize("session", LONG, indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -108,22 +102,6 @@ def test_the_position_is_the_closed_form_at_the_replys_own_timestamp(
         assert answer.time == max(each for each in known if each <= asked * 1e9 + 1000)
 
 
-def test_the_heading_is_the_closed_form(memory: Memory, session: Session) -> None:
-    begin, end = spanned(memory, session)
-    for step in range(20):
-        asked = session.at(begin + 0.2 + (end - begin - 0.4) * step / 19)
-        answer = queries.topic_value(memory, Call(), "/odom", AtTime(at_s=asked))
-        value = answer.sample.value
-        assert isinstance(value, dict)
-        orientation = value["orientation"]
-        assert isinstance(orientation, dict)
-        shown = orientation["yaw_deg"]
-        assert isinstance(shown, (int, float))
-        t = session.since(unix_from_ns(answer.sample.time))
-        # 5 ms between stamp and log time are 0.07 degrees
-        assert degrees_apart(shown, yaw_deg(t)) < 0.1
-
-
 @pytest.mark.parametrize(("sensor", "mount"), [("laser", LASER), ("camera", CAMERA)])
 def test_a_transform_is_interpolated_to_the_asked_moment(
     memory: Memory, session: Session, sensor: str, mount: tuple[float, float, float]
@@ -151,56 +129,3 @@ def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -
     for waypoint in answer.trajectory.waypoints:
         x, y = position(session.since(unix_from_ns(waypoint.time)))
         assert math.dist(waypoint.position[:2], (x, y)) < 0.005
-
-
-def test_the_last_scissors_are_found_to_the_second(memory: Memory, session: Session) -> None:
-    _, end = spanned(memory, session)
-    answer = queries.find_last_match(
-        memory, Call(), "/vision/*/scene_objects", "contains", "Scissors"
-    )
-    assert answer.found is not None
-    assert answer.found.topic == "/vision/scene/scene_objects"
-    seen = [t for t in range(int(end) + 1) if 12 <= t < 18 or 40 <= t < 46]
-    assert session.since(unix_from_ns(answer.found.sample.time)) == pytest.approx(
-        seen[-1], abs=0.05
-    )
-
-
-def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Session) -> None:
-    begin, end = spanned(memory, session)
-    span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
-    for sample in queries.topic_range(memory, Call(), "/odom", span, max_samples=60).samples:
-        again = queries.topic_value(
-            memory, Call(), "/odom", AtTime(at_s=unix_rounded_up(sample.time)), tolerance_s=0.0
-        )
-        assert again.sample.time == sample.time
-
-
-@long_ones
-def test_the_bumper_was_last_pressed_half_a_second_before_it_was_released(
-    memory: Memory, session: Session
-) -> None:
-    answer = queries.find_last_match(memory, Call(), "/bumper", "equals", value=True)
-    assert answer.found is not None
-    assert session.since(unix_from_ns(answer.found.sample.time)) == pytest.approx(25.5, abs=0.05)
-    for t, pressed in ((24.9, False), (25.2, True), (25.9, True), (26.2, False)):
-        moment = AtTime(at_s=session.at(t))
-        value = queries.topic_value(memory, Call(), "/bumper", moment, tolerance_s=0.6)
-        assert value.sample.value == {"value": pressed}
-
-
-@long_ones
-def test_the_battery_when_the_bumper_was_pressed(memory: Memory) -> None:
-    answer = queries.value_when(
-        memory,
-        Call(),
-        "/battery_state",
-        "/bumper",
-        condition_type="equals",
-        value=True,
-        fields=["percentage"],
-    )
-    assert isinstance(answer, ValueWhen)
-    assert answer.value is not None
-    value: Any = answer.value.sample.value
-    assert value["percentage"] == pytest.approx(0.775, abs=1e-4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 S = 10**9
 T0 = 1_700_000_000
-SHARED = ("topic", "type", "frame_id", "parent", "child", "clock")
 
 
 @pytest.fixture(scope="module")
@@ -36,25 +35,6 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
         ]
         write_mcap(folder / "a" / f"a_{number}.mcap", messages)
     return memory_of(folder)
-
-
-@pytest.mark.parametrize(
-    ("tool", "given"),
-    [
-        ("get_position_at", {}),
-        ("get_velocity_at", {"tolerance_s": 5.0}),
-        ("get_transform_at", {"parent": "odom", "child": "base_link"}),
-        ("get_topic_at_time", {"topic": "/odom", "fields": ["position.x"]}),
-    ],
-)
-def test_each_is_answered_as_alone(
-    memory: Memory, tmp_path: Path, tool: str, given: dict[str, Any]
-) -> None:
-    times = [T0 + 1, T0 + 5, T0 + 22]
-    told = asked(memory, tmp_path, tool, timestamps=times, **given)
-    for time, row in zip(times, told["results"], strict=True):
-        alone = asked(memory, tmp_path, tool, timestamp=time, **given)
-        assert {**{key: told[key] for key in SHARED if key in told}, **row} == alone
 
 
 def test_an_error_takes_the_place_of_what_is_not_there(memory: Memory, tmp_path: Path) -> None:

@@ -82,51 +82,11 @@ def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool)
     assert "notes" not in reply
 
 
-def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path) -> None:
-    write_splits(tmp_path, ALL)
-    memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 60)
-    [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
-    assert [each["text"] for each in stop["before"]] == [
-        "/cmd_vel went to zero while a goal was active",
-        "/bumper became true",
-        "warning of motor: 81 C",
-    ]
-    [bump] = [each for each in reply["events"] if each["text"] == "/bumper became true"]
-    assert bump["before"][0]["text"] == "warning of motor: 81 C"
-    assert all("before" not in each or each["before"] for each in reply["events"])
-
-
 def test_a_window_that_begins_with_the_stop_knows_what_changed_before(tmp_path: Path) -> None:
     write_splits(tmp_path, ALL)
     reply = asked(memory_of(tmp_path), tmp_path, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
     assert "/bumper became true" in [each["text"] for each in stop["before"]]
-
-
-def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(tmp_path: Path) -> None:
-    calm = [
-        *driving(40, 20),
-        *(boolean(at(t), False) for t in range(40)),
-        *(diagnostics(at(t), motor=(0, "ok")) for t in range(40)),
-        log_entry(at(3), 20, "motor", "on"),
-    ]
-    write_splits(tmp_path, calm)
-    reply = before(tmp_path, 20.0)
-    assert reply["before"] == []
-    assert reply["looked_at"] == ["/bumper", "/diagnostics", "/rosout"]
-    assert reply["recorded_topics"] == 4
-    assert reply["notes"] == ["nothing changed on the topics looked at in the 10 s before"]
-    assert before(tmp_path, 7.123457)["around"] == at(7.123457) / 1e9
-    later = before(tmp_path, 500.0)["notes"]
-    assert "nothing was recorded in the 10 s before" in later
-    assert not [each for each in later if "nothing changed" in each]
-
-
-def test_a_command_that_ends_without_a_goal_is_no_change(tmp_path: Path) -> None:
-    done = [goals(at(5), {1: RUNNING}), goals(at(18), {1: SUCCEEDED})]
-    write_splits(tmp_path, [*driving(40, 20), *commanded(40, 20), *done])
-    assert told(before(tmp_path, 20.0)) == [("/drive goal succeeded", 2.0)]
 
 
 def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path) -> None:

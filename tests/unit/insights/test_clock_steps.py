@@ -248,47 +248,6 @@ def set_ahead(folder: Path) -> Memory:
     return recorded(folder, shown=lambda t: t + 8.0 * (t > WHEN))
 
 
-def ahead_notes(reply: dict[str, Any]) -> list[str]:
-    return [note for note in reply.get("notes", []) if " ahead at " in note]
-
-
-def test_durations_are_without_what_the_clock_skipped_and_a_note_says_so(tmp_path: Path) -> None:
-    for memory in each_known(set_ahead(tmp_path)):
-        span = {"start": BEGIN, "end": BEGIN + 207.9}
-        found = asked(memory, tmp_path, "find_matches", **FLAG)
-        assert found["sightings"][0]["duration_s"] == pytest.approx(199.0, abs=0.02)
-        assert ahead_notes(found) == [
-            f"the clock was set 8 s ahead at {BEGIN + 54.9:.6f}: durations are without that"
-        ]
-        recap = asked(memory, tmp_path, "recap", **span)
-        assert recap["duration_s"] == pytest.approx(199.9, abs=0.02)
-        way = asked(memory, tmp_path, "trajectory_summary", **span)
-        assert way["duration_s"] == pytest.approx(199.9, abs=0.02)
-        assert way["avg_speed"] == pytest.approx(SPEED, abs=0.01)
-        near = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0)
-        bounded = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0, **span)
-        for reply in (near, bounded):
-            assert reply["visits"][0]["duration_s"] == pytest.approx(20.0, abs=0.25)
-        other = {"with_start": BEGIN + 100, "with_end": BEGIN + 200}
-        differs = asked(memory, tmp_path, "compare", start=BEGIN, end=BEGIN + 100, **other)
-        assert differs["duration_s"] == differs["recorded_s"]
-        assert differs["duration_s"] == {"this": pytest.approx(92.0, abs=0.05), "with": 100.0}
-        for reply in (recap, way, near, bounded, differs):
-            assert len(ahead_notes(reply)) == 1
-            assert "gap_m" not in reply
-            assert not [note for note in reply["notes"] if "gap" in note]
-
-
-def test_bins_are_without_what_the_clock_skipped(tmp_path: Path) -> None:
-    for memory in each_known(set_ahead(tmp_path)):
-        reply = asked(memory, tmp_path, "find_matches", **FLAG, by="hour")
-        assert len(ahead_notes(reply)) == 1
-        for column, expected in (("recorded_s", 199.9), ("topic_s", 199.0), ("seconds", 199.0)):
-            at = reply["columns"].index(column)
-            assert reply["all"][at - 1] == pytest.approx(expected, abs=0.11)
-            assert sum(row[at] for row in reply["rows"]) == pytest.approx(expected, abs=0.2)
-
-
 def test_windows_that_adjoin_within_a_step_add_up(tmp_path: Path) -> None:
     memory = set_ahead(tmp_path)
     cuts = [BEGIN + each for each in (0.0, 30.0, 56.0, 60.0, 63.5, 100.0)]
@@ -298,10 +257,3 @@ def test_windows_that_adjoin_within_a_step_add_up(tmp_path: Path) -> None:
     ]
     assert sum(lengths) == pytest.approx(92.0, abs=0.05)
     assert lengths[2] == 0.0
-
-
-def test_an_answer_that_no_step_is_in_does_not_name_it(tmp_path: Path) -> None:
-    memory = set_ahead(tmp_path)
-    for tool, more in (("recap", {}), ("find_matches", FLAG), ("visits", {"x": 0.0, "y": 0.0})):
-        reply = asked(memory, tmp_path, tool, start=BEGIN + 100, end=BEGIN + 150, **more)
-        assert not ahead_notes(reply)

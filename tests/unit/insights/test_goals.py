@@ -117,20 +117,6 @@ def test_a_search_of_a_window_finds_what_ended_in_it_by_a_status_that_there_is(
         found_in(memory_of(tmp_path), "equals", "lost")
 
 
-def test_a_reply_has_a_row_for_each_goal_and_counts_them_by_day(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
-    given = {"topic": TOPIC, "condition_type": "equals", "value": "failed"}
-    memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "find_matches", **given)
-    rows = [(row["value"]["status"], row["duration_s"]) for row in reply["sightings"]]
-    assert rows == [("canceled", 6), ("aborted", 12)]
-    assert "count" not in reply["sightings"][0]
-    day = {"by": "day", "start": BEGIN / S, "end": BEGIN / S + 70}
-    reply = asked(memory, tmp_path, "find_matches", **given, **day)
-    assert len(reply["rows"]) == 1
-    assert table(reply)["all"]["count"] == 2
-
-
 ENDS = st.sampled_from([4, 5, 6])
 
 
@@ -162,24 +148,6 @@ def test_however_the_history_is_cut_the_same_is_told(
         (f"/drive goal {status} after {end - begin:g} s", begin, end)
         for _, status, begin, end, _ in reversed(searched)
     ] == expected
-
-
-def test_a_goal_that_its_server_lost_is_known_until_it_was_listed_last(tmp_path: Path) -> None:
-    lost = history((10, {1: 2}), (15, {1: 2}), (30, {2: 2}), (35, {2: 4}), (40, {2: 4, 3: 2}))
-    no_more = "listed no more by its server"
-    assert told(tmp_path, lost, 0, 50, cut=2, recalls=False) == [
-        ("goal", f"/drive goal last heard of after 5 s, and {no_more}", 10, 15, False),
-        ("goal", "/drive goal succeeded after 5 s", 30, 35, False),
-        ("goal", "/drive goal accepted", 40, None, True),
-    ]
-    memory = memory_of(tmp_path)
-    assert found_in(memory, "equals", "executing") == [
-        (3, "executing", 40, 40, True),
-        (1, "executing", 10, 15, True),
-    ]
-    given = {"topic": TOPIC, "condition_type": "equals", "value": "executing"}
-    reply = asked(memory, tmp_path, "find_matches", **given)
-    assert any("1 goal whose end was not published" in note for note in reply["notes"])
 
 
 def test_a_goal_that_goes_on_lasts_as_far_as_something_is_recorded(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import FLAG, MOST
-from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
@@ -29,7 +28,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, memory_of
 from tests.unit.analysis.motion.test_standstills import world
 
 S = 10**9
@@ -89,46 +88,6 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> Non
     )
 
 
-def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(tmp_path: Path) -> None:
-    """It saw scissors for 5 s of 65, and the table all the time."""
-    rows = [(at / 5, "scissors") for at in range(60, 85)]
-    rows += [(at / 5 + 0.1, "table") for at in range(325)]
-    messages = [
-        detections(BEGIN + round(at * S), [label], topic=f"/vision/{label}") for at, label in rows
-    ]
-    messages += [odom(BEGIN + n * S, 0.1 * n, 0.0, 0.0) for n in range(66)]
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path)
-    answer = over(memory, 0, 65)
-    assert answer.throughout == ("table",)
-    assert times(answer.events, "thing") == [("scissors in view", 12.0)]
-    assert over(memory, 12.5, 16).throughout == ("scissors", "table")
-    # What the memory does not hold was not looked at.
-    assert over(memory, 0, 80).throughout == ()
-    assert over(memory, -10, 60).throughout == ()
-
-
-def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> None:
-    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
-    seen = [
-        detections(BEGIN + at * S, ["cup"] if at < 9 else ["fork"] if at > 11 else [])
-        for at in range(20)
-    ]
-    flips = [boolean(BEGIN + at * S, 3 <= at < 7) for at in range(20)]
-    write_splits(tmp_path, [*stood, *seen, *flips], 20)
-    answer = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 30).events}
-    assert answer == {
-        "stood at x 1.00, y 2.00": True,
-        "cup in view": False,
-        "fork in view": True,
-        "/bumper became true": False,
-        "/bumper became false": True,
-    }
-    before = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 8).events}
-    assert before["stood at x 1.00, y 2.00"]
-    assert "cup in view" not in before  # all the time
-
-
 def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
     stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
     write_splits(tmp_path, [*stood, *(boolean(BEGIN + at * S, False) for at in range(60))], 20)
@@ -159,40 +118,6 @@ def test_a_stop_in_which_the_map_jumps_is_where_it_began(tmp_path: Path) -> None
     events = over(in_places(memory_of(tmp_path)), 0, 60).events
     [stop] = [each for each in events if each.kind == "stop"]
     assert (stop.text, stop.places) == ("stood at x 0.00, y 2.00", ("room",))
-
-
-@each_way
-def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
-    tmp_path: Path, recalls: bool
-) -> None:
-    """Stands at x 0, 2 and 4 of odometry, which the map then has 1, 2 and 3 m north of x 0."""
-    messages = []
-    for step in range(600):
-        at, nth = BEGIN + step * S // 10, step // 200
-        x = 2.0 * nth + min(max(step % 200 - 150, 0) * 0.04, 2.0)
-        messages.append(odom(at, x, 0.0))
-        if step % 10 == 0:
-            messages.append(tf(at, transform(at, "map", "odom", (-2.0 * nth, nth + 1.0, 0.0))))
-    write_splits(tmp_path, messages)
-    memory = in_places(memory_of(tmp_path))
-    memory = with_store(memory, tmp_path) if recalls else memory
-    span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 200)
-    found = recap(memory, Call(), span)
-    own = recap(memory, Call(), span, frame_id="odom")
-    assert (found.frame_id, own.frame_id) == ("map", "odom")
-    assert [(each.text, each.places) for each in found.events if each.kind == "stop"] == [
-        ("stood at x 0.00, y 1.00", ("room",)),
-        ("stood at x 0.00, y 2.00", ("room",)),
-        ("stood at x 0.00, y 3.00", ("corner", "room")),
-    ]
-    assert [each.text for each in own.events if each.kind == "stop"] == [
-        "stood at x 0.00, y 0.00",
-        "stood at x 2.00, y 0.00",
-        "stood at x 4.00, y 0.00",
-    ]
-    assert [each.places for each in own.events] == [each.places for each in found.events]
-    with pytest.raises(InvalidArgumentsError, match="frame_id"):
-        recap(memory, Call(), span, frame_id="moon")
 
 
 def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
@@ -261,27 +186,6 @@ def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(tmp_p
     assert things(min_score=0.7)[0] == []
     memory = replace(memory, limits=replace(memory.limits, min_score=0.7))
     assert things()[0] == []
-
-
-def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(tmp_path: Path) -> None:
-    """Drives 0.5 m/s, crawls from 12 s on for 3 s, drives, and brakes to stand at 30 s."""
-    messages: list[Msg] = []
-    x = 0.0
-    for step in range(800):
-        at, seconds = BEGIN + step * S // 20, step / 20
-        messages.append(odom(at, x, 0.0))
-        x += (0.05 if 12 <= seconds < 15 else 0.0 if seconds >= 30 else 0.5) / 20
-        if step % 20 == 0:
-            messages.append(boolean(at, int(seconds) in {11, 12, 13}, topic="/blocked"))
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path)
-    answer = over(memory, 0, 40)
-    [drop] = [each for each in answer.events if each.kind == "drop"]
-    assert drop.text == "slowed down suddenly from 0.50 to 0.05 m/s"
-    assert (drop.start - BEGIN) / S == pytest.approx(12, abs=0.6)
-    assert drop.before[0].text == "/blocked became true"
-    assert [each.kind for each in answer.events if each.kind == "stop"] == ["stop"]
-    assert ("speed drops", 1) in answer.counts
 
 
 def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: Path) -> None:

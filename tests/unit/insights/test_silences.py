@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.state_files import LOST, Loss, append_losses
-from ros2_memory.core.timebase import local_text
 from tests.support.bags import boolean, detections, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
@@ -68,36 +67,6 @@ def test_a_recap_has_it_as_an_event(memory: Memory, bag_dir: Path) -> None:
     ]
     before = asked(memory, bag_dir, "recap", start=BEGIN, end=BEGIN + 90)
     assert "silences" not in before["counts"]
-
-
-NEVER = {"topic": SEEN, "condition_type": "contains", "value": "unicorn"}
-
-
-def test_never_seen_names_when_the_detector_was_silent(memory: Memory, bag_dir: Path) -> None:
-    note = (
-        f"silent while the robot was on, so not searched: {SEEN} "
-        f"{BEGIN + 99}.000001 to {BEGIN + 190}.000001 "
-        f"({local_text((BEGIN + 99) * S)} to {local_text((BEGIN + 190) * S)})"
-    )
-    assert asked(memory, bag_dir, "find_last_match", **NEVER)["notes"] == [note]
-    assert asked(memory, bag_dir, "find_matches", **NEVER)["notes"] == [note]
-    held = {"value_topic": "/odom", "condition_topic": SEEN}
-    when = {**held, "condition_type": "contains", "value": "unicorn"}
-    assert asked(memory, bag_dir, "get_value_when", **when)["notes"] == [note]
-
-
-def test_several_topics_that_fall_silent_together_are_one_event(tmp_path: Path) -> None:
-    names = [f"/sensor_{number}" for number in range(5)]
-    messages = [odom(BEGIN * S + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLITS * SPLIT)]
-    for second in range(SPLITS * SPLIT):
-        heard = ["/a", *names] if second // SPLIT not in BLIND else ["/a"]
-        at = (BEGIN + second) * S
-        messages += [boolean(at + nth, data=True, topic=name) for nth, name in enumerate(heard)]
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 400) * S))
-    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 300)
-    [event] = [each for each in reply["events"] if "silent" in each["text"]]
-    assert event["text"] == "/sensor_0, /sensor_1, /sensor_2 and 2 more were silent"
 
 
 def test_compare_counts_how_long_a_topic_was_silent_while_the_robot_was_on(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
-from mcap.writer import Writer
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.heartbeat import RecorderState
@@ -18,7 +17,6 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.status import memory_status
-from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
 from tests.support.bags import (
     McapLayout,
@@ -208,15 +206,6 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     assert ("the recorder died" in reply["doubts"]) == (now == "wall")
 
 
-def test_how_often_a_topic_comes_leaves_out_when_the_robot_was_off(tmp_path: Path) -> None:
-    days = [BEGIN + day * 86_400 * S for day in range(3)]
-    messages = [odom(day + t * S, 0.0, 0.0) for day in days for t in range(600)]
-    heard = [boolean(day + t * S, True) for day in days for t in range(550)]
-    memory = remembering(tmp_path, [*messages, *heard[:-10]])
-    fallen = SilentTopic("/bumper", days[2] + 539 * S)
-    assert memory_status(memory, Call()).fell_silent == (fallen,)
-
-
 @pytest.mark.parametrize(("later", "fell"), [(0, ["/bumper"]), (S, [])])
 def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
     tmp_path: Path, later: int, fell: list[str]
@@ -284,14 +273,6 @@ class TestWhatIsMissingIsNamedAndCounted:
             f"  relative_file_paths:\n{names}  files:\n{files}"
         )
 
-    def test_an_empty_folder(self, tmp_path: Path) -> None:
-        assert self.doubts(tmp_path).startswith("no bag is here")
-
-    def test_a_bag_that_a_crash_left_open(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)])
-        path.write_bytes(path.read_bytes()[:-100])
-        assert self.doubts(tmp_path).startswith("1 bag was left open by a crash")
-
     def test_a_file_that_may_be_being_written_or_left_by_a_crash(self, tmp_path: Path) -> None:
         messages = [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)]
         path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
@@ -311,22 +292,6 @@ class TestWhatIsMissingIsNamedAndCounted:
         assert young in doubts(memory_of(tmp_path, clock=clock))
         beat(tmp_path, clock.now(), recordings=("rec",))
         assert young not in doubts(memory_of(tmp_path, clock=clock))
-
-    def test_files_that_are_not_read(self, tmp_path: Path) -> None:
-        write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 0.0, 0.0)])
-        for n in range(3):
-            (tmp_path / f"old_{n}.db3").write_bytes(b"SQLite format 3\0")
-        assert self.doubts(tmp_path) == "3 files are not read; data_time_range says why"
-
-    def test_a_topic_that_cannot_be_decoded(self, tmp_path: Path) -> None:
-        with (tmp_path / "bag.mcap").open("wb") as stream:
-            writer = Writer(stream)
-            writer.start()
-            schema = writer.register_schema("odd.Odd", "protobuf", b"")
-            channel = writer.register_channel("/odd", "protobuf", schema)
-            writer.add_message(channel, BEGIN, b"", BEGIN)
-            writer.finish()
-        assert self.doubts(tmp_path) == "1 topic cannot be decoded: /odd"
 
     @pytest.mark.parametrize(
         ("listed", "doubts"),
@@ -348,27 +313,6 @@ class TestWhatIsMissingIsNamedAndCounted:
     ) -> None:
         self.recording(tmp_path / "rec", *listed)
         assert self.doubts(tmp_path).endswith(doubts)
-
-    def test_a_recording_of_which_metadata_alone_is_left(self, tmp_path: Path) -> None:
-        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
-        for each in (tmp_path / "rec").glob("*.mcap"):
-            each.unlink()
-        doubts = self.doubts(tmp_path)
-        assert "lists 2 missing files and 10 messages" in doubts
-
-    def test_metadata_that_cannot_be_read_is_not_compared_and_reported(
-        self, tmp_path: Path
-    ) -> None:
-        self.recording(tmp_path / "rec", ("rec_0.mcap", 5))
-        (tmp_path / "rec" / "metadata.yaml").write_text("")
-        assert self.doubts(tmp_path).startswith("metadata.yaml of rec cannot be read")
-
-    def test_the_oldest_splits_that_retention_deleted_are_not_missing(self, tmp_path: Path) -> None:
-        listed = [(f"rec_{n}.mcap", 5) for n in range(-3, 3)]
-        self.recording(tmp_path / "rec", *listed)
-        assert "lists 4 missing files" in self.doubts(tmp_path)
-        beat(tmp_path, BEGIN + 59 * S, RecorderState.STOPPED)
-        assert "lists 1 missing file and 5 messages" in self.doubts(tmp_path)
 
     def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
         self, tmp_path: Path

@@ -48,22 +48,6 @@ def test_an_image_is_its_size_encoding_and_shape(encoding: str, shape: list[int]
     assert view(image(encoding), "data") == {"bytes": 24, "encoding": encoding, "shape": shape}
 
 
-def test_a_point_cloud_is_its_size_and_points() -> None:
-    cloud = bags.make(
-        "sensor_msgs/msg/PointCloud2",
-        header=bags.header(0, ""),
-        height=2,
-        width=100,
-        fields=[],
-        is_bigendian=False,
-        point_step=16,
-        row_step=1600,
-        data=np.zeros(3200, dtype=np.uint8),
-        is_dense=True,
-    )
-    assert view(cloud, "data") == {"bytes": 3200, "points": 200, "shape": [2, 100]}
-
-
 @pytest.mark.parametrize(
     "node", [None, [1.0, 2.0, 3.0], {"x": True, "y": 2.0, "z": 3.0}, {"x": 10**400, "y": 2, "z": 3}]
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 from tests.support.bags import Msg, write_splits
@@ -122,52 +121,15 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     assert not any("from one run" in note for note in reply.get("notes", ()))
 
 
-def test_of_odometry_that_began_anew_only_what_one_window_saw_was_not_looked_at(
-    tmp_path: Path,
-) -> None:
-    person = ("person", 3.0, 0.5)
-    first = looked(0, 30, HERE, BOOK, ("book", 3.5, 1.5), person, in_map=False)
-    write_splits(tmp_path, first, name="first")
-    write_splits(tmp_path, looked(60, 90, HERE, BOOK, MUG, person, in_map=False), name="second")
-    reply = ask(tmp_path, **EARLIER, **LATER)
-    assert labels(reply) == {
-        "not_comparable": ["book"],
-        "not_looked_at": ["mug", "book"],
-        "movers": ["person"],
-    }
-    [mover] = reply["things"]["movers"]
-    assert mover.keys() == {"label", "was", "is"}
-
-
 def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
     someone, elsewhere = ("person", 3.0, 0.5), ("person", 4.0, -1.2)
     first = looked(0, 30, HERE, someone)
     here = compared(tmp_path / "here", [*first, *looked(60, 90, HERE, someone)])
     assert here["things"] == {}
-    moved = compared(tmp_path / "moved", [*first, *looked(60, 90, HERE, elsewhere)])
-    assert moved["things"]["movers"] == [
-        {
-            "label": "person",
-            "was": {
-                "times": 30,
-                "at_once": 1,
-                "x": 3.0,
-                "y": 0.5,
-                "in": "kitchen",
-                "last_seen": BEGIN + 29,
-            },
-            "is": {
-                "times": 30,
-                "at_once": 1,
-                "x": 4.0,
-                "y": -1.2,
-                "in": "kitchen",
-                "last_seen": BEGIN + 89,
-            },
-        }
-    ]
     two = compared(tmp_path / "two", [*first, *looked(60, 90, HERE, someone, elsewhere)])
-    assert two["things"]["movers"][0]["is"]["at_once"] == 2
+    [person] = two["things"]["movers"]
+    assert (person["was"]["at_once"], person["is"]["at_once"]) == (1, 2)
+    assert person["was"]["last_seen"] == BEGIN + 29
     alone = compared(tmp_path / "alone", [*first, *looked(60, 90, HERE)])
     [person] = alone["things"]["movers"]
     assert person.keys() == {"label", "was"}
@@ -185,14 +147,3 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
     until_its_end = ask(tmp_path, **{**within, "end": BEGIN + 89})
     assert labels(until_its_end) == {"appeared": ["book"]}
     assert not any("things" in each for each in until_its_end["notes"])
-
-
-def test_a_thing_that_was_detected_without_a_place_after_it_was_missed_is_not_missed(
-    tmp_path: Path,
-) -> None:
-    lost = ("mug", math.nan, math.nan)
-    missed = [*looked(0, 20, HERE, MUG), *looked(30, 50, HERE)]
-    reply = compared(tmp_path / "later", [*missed, *looked(60, 90, AWAY, lost)])
-    assert labels(reply) == {"not_looked_at": ["mug"]}
-    appeared = [*looked(0, 20, HERE), *looked(20, 29, AWAY, lost), *looked(60, 90, HERE, MUG)]
-    assert labels(compared(tmp_path / "earlier", appeared)) == {"not_looked_at": ["mug"]}

@@ -14,13 +14,12 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis import sights
-from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.core.text import abbreviate
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.things import unseen
 from tests.support.bags import (
     Msg,
-    detections,
     header,
     make,
     odom,
@@ -114,32 +113,6 @@ def told_of(bag_dir: Path, messages: Sequence[Msg], **given: Any) -> Any:
     """The reply about what is seen in some messages."""
     write_splits(bag_dir, messages)
     return ask(bag_dir, **given)
-
-
-def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path) -> None:
-    places = (KITCHEN, Place("table", "map", Circle(3.0, 0.0, 1.0)))
-    messages = looked(0, 20, HERE, ("Mug", 3.0, 0.5))
-    reply = told_of(tmp_path, messages, limits=replace(NAMED, places=places), label="coffee mug")
-    [mug] = reply["things"]
-    assert (reply["frame_id"], reply["total"]) == ("map", 1)
-    assert (mug["label"], mug["also_seen_as"]) == ("mug", ["Mug"])
-    assert mug["place"] == {"x": 3.0, "y": 0.5, "z": 0.7}
-    assert (mug["in"], mug["also_in"]) == ("table", ["kitchen"])
-    assert (mug["first_seen"], mug["last_seen"], mug["count"]) == (BEGIN, BEGIN + 19, 20)
-    assert mug["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
-    assert mug["score"]["best"] == 0.9
-    assert mug["still_there"] == {"in_view": BEGIN + 19}
-    assert "from 0 to 1" in ask(tmp_path, label="mug", min_score=60)["detail"]
-
-
-def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> None:
-    empty = looked(0, 3, HERE)
-    assert "notes" not in told_of(tmp_path / "sees nothing", empty)
-    reply = told_of(tmp_path / "none", [each for each in empty if "vision" not in each.topic])
-    [note] = reply["notes"]
-    assert "no message has a detection" in note
-    assert reply["things"] == []
-    assert ask(tmp_path / "none", label="cup")["notes"] == [note]
 
 
 CUP_AS_JSON = json.dumps(
@@ -370,19 +343,6 @@ def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -
     )
     [note] = ask(tmp_path, label="mug", min_score=0.4)["notes"]
     assert note == "it was detected 20 times below min_score 0.4, which does not count"
-
-
-def test_labels_without_a_place_are_named(tmp_path: Path) -> None:
-    at = BEGIN * S
-    lost = [detections(at + nth * S, ["Scissors (open)"], at=(0.0, 0.0, 0.0)) for nth in range(5)]
-    reply = told_of(tmp_path, lost)
-    times = f"from {BEGIN}.000000 to {BEGIN + 4}.000000"
-    note = f"detected, but could not be placed: scissors (open) (5 times, {times})"
-    assert (reply["things"], reply["notes"]) == ([], [note])
-    [note, *_] = ask(tmp_path, label="scissors (open)")["notes"]
-    assert note == "5 detections of it could not be placed, and are left out"
-    [note] = ask(tmp_path, label="scissors")["notes"]
-    assert "did you mean scissors (open)?" in note
 
 
 def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(

@@ -45,23 +45,6 @@ def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None
     assert mug.missed_by == 117 * 10**9
 
 
-def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_always_seen() -> None:
-    rarely = [
-        bag_of(*[(HERE, seen_at(2, 0) if each % 5 == 0 else []) for each in range(20)], start=t)
-        for t in (0, 20, 40)
-    ]
-    empty = bag_of(*[(HERE, [])] * 12, start=100)
-    [mug] = estimate(whole([*rarely, empty]), LABELS).instances
-    assert mug.missed_by is None
-
-
-def test_a_name_that_is_rarely_given_to_a_thing_is_its_other_name() -> None:
-    messages = [(HERE, seen_at(2, 0, "cup" if nth % 10 == 0 else "mug")) for nth in range(100)]
-    [mug] = estimate(whole([bag_of(*messages)]), LABELS).instances
-    assert mug.key == "mug"
-    assert mug.stays[0].also == {"cup": 10}
-
-
 @pytest.mark.parametrize("away_m", [0.62, 0.88, 0.92, 0.96])
 def test_a_thing_that_was_moved_by_less_than_a_metre_after_long_is_where_it_was_seen_last(
     away_m: float,

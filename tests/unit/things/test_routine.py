@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 HOUR: Final = 3600 * 10**9
 DAY: Final = 24 * HOUR
 PLACES: Final = np.array([[1000, 1000], [4000, 2000], [7000, 5000], [2000, 8000]])
-KNOWN_DAYS: Final = 20
 DAYS: Final = 30
 
 Drawn: TypeAlias = "tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]"
@@ -63,24 +62,6 @@ def month(seed: int, whereabouts: Whereabouts) -> Drawn:
 def told(drawn: Drawn, at: int) -> tuple[UsualPlace, ...] | None:
     times, seen, _ = drawn
     return usual_places(times[times < at], seen[times < at], at, lambda _: 0)
-
-
-def place_of(x: float, y: float) -> int:
-    return int(np.hypot(*(PLACES - [x, y]).T).argmin())
-
-
-def place_at(usual: UsualPlace) -> int:
-    return place_of(1000 * usual.place[0], 1000 * usual.place[1])
-
-
-def test_its_places_have_their_hours_and_shares() -> None:
-    usual = told(month(1, by_routine), KNOWN_DAYS * DAY + 12 * HOUR)
-    assert usual is not None
-    hours = {place_at(each): each.hours for each in usual}
-    # Nobody looks at night.
-    assert (hours[0], hours[1], hours[2]) == ("07-09", "09-17", "17-23")
-    assert usual[0].likely == max(each.likely for each in usual)
-    assert sum(each.share for each in usual) <= 1.0
 
 
 @pytest.mark.parametrize("whereabouts", [at_random, seldom_moved, mostly_at_home])

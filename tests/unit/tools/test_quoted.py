@@ -163,28 +163,6 @@ def test_a_reply_says_first_where_it_repeats_what_messages_say(
     assert {*places} <= {*reply["quoted"]}
 
 
-def test_what_holds_no_text_of_a_message_has_no_mark(tmp_path: Path) -> None:
-    spoken_to(tmp_path, "scissors")
-    memory = memory_of(tmp_path)
-    for tool, given in (
-        ("get_position_at", {"timestamp": T0_S + 9}),
-        ("get_topic_at_time", {"topic": "/odom", "timestamp": T0_S + 9}),
-        ("get_topic_at_time", {"topic": "/tf", "timestamp": T0_S + 9}),
-        (
-            "get_topic_in_range",
-            {"topic": "/vision/objects", **AROUND, "fields": ["detections.label"]},
-        ),
-        ("find_matches", {"topic": "/vision/objects", **CONTAINS, "value": "scissors"}),
-        ("find_things", {}),
-        ("list_frames", {}),
-        ("trajectory_summary", AROUND),
-        ("memory_status", {}),
-    ):
-        reply = asked(memory, tmp_path, tool, **given)
-        assert "error" not in reply
-        assert "quoted" not in reply, tool
-
-
 @pytest.mark.parametrize(
     ("tool", "given"),
     [
