@@ -31,12 +31,12 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
 from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Look, Spot
-from ros2_memory.core.arrays import Flags, Ints, distinct_rows, run_starts
+from ros2_memory.core.arrays import Flags, Ints, distinct_rows, places_among, run_starts
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.sights import Floats
     from ros2_memory.columns.sights import JoinedSights
@@ -140,15 +140,12 @@ def _density(cells: Ints, mass: Floats) -> Floats:
     reach = _PEAK_MM // _CELL_MM
     low = cells.min(axis=0) - reach
     width = int(cells[:, 1].max() - low[1]) + reach + 1
-    keys = (cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1])
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
+    keys = (cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1])  # ascending, as the cells
     around = [*product(range(-reach, reach + 1), repeat=2)]
     steps = [dx * width + dy for dx, dy in around if dx * dx + dy * dy <= reach * reach]
-    near = np.array(steps)[:, None] + keys
-    row = np.minimum(np.searchsorted(ordered, near), len(ordered) - 1)
+    row, is_there = places_among(np.array(steps)[:, None] + keys, keys)
     # Whole numbers, whose sums do not depend on their order.
-    density: Floats = np.where(ordered[row] == near, mass[order[row]], 0.0).sum(axis=0)
+    density: Floats = np.where(is_there, np.append(mass, 0.0)[row], 0.0).sum(axis=0)
     return density
 
 
@@ -221,7 +218,7 @@ def stays_in(sightings: Sightings, thing: Ints) -> list[Ints]:
     """
     series = _Series.of(sightings, thing)
     begins = run_starts(series.thing)
-    variance = _visit_variances(*_differences(series), len(begins))
+    variance = _visit_variances(_differences(series))
     stays = np.cumsum(_are_moved(series, variance))
     return np.split(stays - stays[begins][series.thing], begins[1:])
 
@@ -251,10 +248,10 @@ class _Series(NamedTuple):
         return cls(columns, n, visits_of(first, last, thing), thing)
 
 
-def _differences(series: _Series) -> tuple[Floats, Ints]:
-    """Returns what visits add to the variance (mm²), by each two of a thing in a row; its number.
+def _differences(series: _Series) -> list[Floats]:
+    """Returns what visits add to the variance (mm²) of each thing, by each two in a row.
 
-    Not by the two that differ most: between these it may have been moved. Ascending for each thing.
+    Not by the two that differ most: between these it may have been moved.
     """
     starts = run_starts(series.visit)
     sums, thing = np.add.reduceat(series.columns, starts, axis=1), series.thing[starts]
@@ -265,26 +262,23 @@ def _differences(series: _Series) -> tuple[Floats, Ints]:
     off = means[3:] - np.einsum("iv,vij->jv", means[:3], fit[thing])
     by_looks = 1 / sums[0, :-1] + 1 / sums[0, 1:]
     variance = ((np.diff(off) ** 2).sum(axis=0) / (2 * math.log(2)) - by_looks) / 2
-    is_of_one = thing[1:] == thing[:-1]
-    variance, thing = variance[is_of_one], thing[1:][is_of_one]
-    order = np.lexsort((variance, thing))
-    variance, thing = variance[order], thing[order]
-    is_greatest = np.diff(thing, append=-1) != 0
-    return variance[~is_greatest], thing[~is_greatest]
+    # What lies between two things is of neither.
+    of_things = (variance[begin : end - 1] for begin, end in pairwise([*begins, len(thing)]))
+    return [np.sort(of_thing)[:-1] for of_thing in of_things]
 
 
-def _visit_variances(differences: Floats, thing: Ints, things: int) -> Floats:
+def _visit_variances(differences: Sequence[Floats]) -> Floats:
     """Returns what visits add to the variance (mm²) of each thing."""
-    median = float(np.median(differences)) if len(differences) else 0.0
-    usual = _shrunk(len(differences), median, _VISIT_MM**2)
-    sizes = np.bincount(thing, minlength=things)
-    begins = np.cumsum(sizes) - sizes
-    visited = np.flatnonzero(sizes)
-    medians = np.zeros(things)
-    low = begins[visited] + (sizes[visited] - 1) // 2
-    high = begins[visited] + sizes[visited] // 2
-    medians[visited] = (differences[low] + differences[high]) / 2
-    return _shrunk(sizes, medians, usual)
+    every = np.sort(np.concatenate(differences))
+    usual = _shrunk(len(every), _median(every), _VISIT_MM**2)
+    sizes = np.array([*map(len, differences)])
+    return _shrunk(sizes, np.array([*map(_median, differences)]), usual)
+
+
+def _median(ordered: Floats) -> float:
+    """Returns the median of values in order; 0 without any. `numpy.median` takes longer for few."""
+    n = len(ordered)
+    return float(ordered[(n - 1) // 2] + ordered[n // 2]) / 2 if n else 0.0
 
 
 def _shrunk(n: Ints | int, median: Floats | float, usual: Floats | float) -> Floats:

@@ -12,7 +12,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -67,21 +67,6 @@ AROUND_NS: Final[Ns] = 12 * NS_PER_S
 """How far around a stretch poses and transforms are read."""
 
 
-class SessionSights(NamedTuple):
-    """What the detectors of one session saw.
-
-    Attributes:
-        frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
-            lead to the map.
-        sights: of each topic; those without a topic have the fixes.
-        detectors: topics that are surely of detectors.
-    """
-
-    frame_id: str
-    sights: tuple[Sights, ...]
-    detectors: frozenset[str]
-
-
 class Placer:
     """Makes sights of rows.
 
@@ -100,8 +85,12 @@ class Placer:
         session: Session,
         lender: Session,
         units: Iterable[Rows],
-    ) -> SessionSights | None:
+    ) -> tuple[str, list[Sights], set[str]] | None:
         """Returns the sights of some rows of a session; None where there are no messages.
+
+        First the frame of all places and poses: the map, or that of the robot's poses where no
+        transforms lead to the map. Then the sights of each topic; those without a topic have the
+        fixes. Last the topics that are surely of detectors.
 
         Args:
             window: the rows are of this time.
@@ -124,7 +113,7 @@ class Placer:
         if target == self._view.limits.map_frame and len(poses):
             times = np.concatenate([messages.log_times for messages in detected.values()])
             sights.append(self._fixes(session, poses.frames.words[0], frames, times))
-        return SessionSights(target, tuple(sights), frozenset(detectors))
+        return target, sights, detectors
 
     def spots_by_bag(
         self,

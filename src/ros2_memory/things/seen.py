@@ -472,16 +472,17 @@ class Watching:
                 ]
             seen = self._placer.placed(around.window, session, lender, units)
             if seen is not None:
-                spots = sum(len(sights.spots) for sights in seen.sights)
+                frame_id, sights_of_topics, detectors = seen
+                spots = sum(len(sights.spots) for sights in sights_of_topics)
                 topics = tuple(
                     TopicSights(
                         sights.topics,
-                        not seen.detectors.isdisjoint(sights.topics),
+                        not detectors.isdisjoint(sights.topics),
                         packed(sights),
                     )
-                    for sights in seen.sights
+                    for sights in sights_of_topics
                 )
-                stretches.append(SeenStretch((number,), (start,), seen.frame_id, spots, topics))
+                stretches.append(SeenStretch((number,), (start,), frame_id, spots, topics))
         return Seen(tuple(stretches))
 
     def _rows(self, window: TimeWindow) -> Iterator[Rows]:
