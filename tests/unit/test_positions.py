@@ -20,7 +20,6 @@ from tests.support.bags import (
     make,
     point,
     quaternion,
-    text,
     tf,
     transform,
     write_mcap,
@@ -103,32 +102,6 @@ def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
     return asked(replace(remembered(bag_dir, recalls), limits=limits), bag_dir, tool, **given)
 
 
-@each_way
-def test_a_satellite_fix_is_reported_in_degrees(tmp_path: Path, recalls: bool) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(9)])
-    assert ask(tmp_path, recalls, "get_position_at", topic="/fix", timestamp=T0_S + 2) == {
-        "x": None,
-        "y": None,
-        "z": None,
-        "yaw_deg": None,
-        "latitude": 48.1234767,
-        "longitude": 11.7654321,
-        "altitude": 519.5,
-        "timestamp": T0_S + 2.0,
-        "topic": "/fix",
-        "frame_id": "gps",
-    }
-    way = {"topic": "/fix", "start": T0_S, "end": T0_S + 9}
-    refused = ask(tmp_path, recalls, "trajectory_summary", **way)
-    assert "latitude and longitude in degrees, and no position in metres" in refused["detail"]
-    near = {"topic": "/fix", "condition_type": "near_position", "value": {"x": 48.12, "y": 11.77}}
-    refused = ask(tmp_path, recalls, "find_last_match", **near)
-    assert "degrees" in refused["detail"]
-    only = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 2)
-    assert only["topic"] == "/fix"
-    assert only["notes"][0].startswith("by /fix, the only topic for it: data.pose_topic is /odom")
-
-
 GLOBAL = "px4_msgs/msg/VehicleGlobalPosition"
 
 
@@ -164,13 +137,6 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
         assert note in ask(tmp_path, False, tool, **given)["notes"]
 
 
-ABOUT_POSES: list[tuple[str, dict[str, Any]]] = [
-    ("get_position_at", {"timestamp": T0_S + 1}),
-    ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),
-    ("visits", {"x": 0.0, "y": 0.0}),
-]
-
-
 def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> None:
     states = [fix(T0 + n * S, n * 1e-5, 0.0, -1 if n < 5 else 0) for n in range(9)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", states)
@@ -204,17 +170,6 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     in_degrees = "(sensor_msgs/msg/NavSatFix): get_position_at answers them by topic"
     assert (in_degrees in detail) == (tool != "get_velocity_at")
     assert "data.pose_topic is /odom" in detail
-
-
-@pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
-def test_a_topic_of_an_unlisted_type_is_named_where_its_messages_have_poses(
-    tmp_path: Path, tool: str, given: dict[str, Any]
-) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "up"), local(T0 + S, 1.0, 2.0)])
-    detail = ask(tmp_path, False, tool, **given)["detail"]
-    assert "poses are on /fmu/out/vehicle_local_position" in detail
-    assert "set data.pose_topic=/fmu/out/vehicle_local_position" in detail
-    assert "/chatter" not in detail
 
 
 def moved(tenths: range) -> list[Msg]:
@@ -289,15 +244,3 @@ def test_a_path_by_transforms_goes_on_from_hour_to_hour(tmp_path: Path) -> None:
     path = ask(tmp_path, False, "trajectory_summary", **whole)
     assert (path["distance_m"], path["poses"]) == (pytest.approx(129.9), 1300)
     assert ask(tmp_path, False, "visits", x=0.0, y=0.0)["total"] == 1
-
-
-def test_where_no_topic_has_velocities_the_tool_that_computes_them_is_named(tmp_path: Path) -> None:
-    poses = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(5)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
-    detail = ask(tmp_path, False, "get_velocity_at", timestamp=T0_S + 2)["detail"]
-    assert "nor another with velocities; poses are on /pose" in detail
-    assert "trajectory_summary returns speeds from them, by topic" in detail
-    detail = ask(tmp_path, False, "get_velocity_at", topic="/pose", timestamp=T0_S + 2)["detail"]
-    assert "no topic recorded does; trajectory_summary returns speeds from its poses" in detail
-    way = {"topic": "/pose", "start": T0_S, "end": T0_S + 4}
-    assert ask(tmp_path, False, "trajectory_summary", **way)["avg_speed"] == 1.0

@@ -160,34 +160,6 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     assert (robot["frame_id"], robot["in"]) == ("odom", "room")
 
 
-def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(tmp_path: Path) -> None:
-    messages = []
-    for second in range(30):
-        at = BEGIN + second * S
-        cup = 0.62 if second == 14 else 0.3
-        messages.append(detections(at, ["cup"], score=cup, topic="/front/detections"))
-        messages.append(detections(at, ["ghost"] if second % 7 < 3 else [], score=0.4))
-        messages.append(detections(at, ["cup"], score=0.5, topic="/back/detections"))
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path)
-
-    def things(**given: float) -> tuple[list[tuple[str, float]], list[str], list[str]]:
-        span = {"start": BEGIN / S - 20, "end": BEGIN / S + 60}
-        reply = asked(memory, tmp_path, "recap", **span, **given)
-        rows = {(each["text"], each["score"]) for each in reply["events"] if "score" in each}
-        notes = [each for each in reply.get("notes", ()) if "min_score" in each]
-        return sorted(rows), reply.get("seen_throughout", []), notes
-
-    assert things() == ([("cup in view", 0.62), ("ghost in view", 0.4)], [], [])
-    assert things(min_score=0.4)[0] == [("cup in view", 0.62), ("ghost in view", 0.4)]
-    found, _, [note] = things(min_score=0.55)
-    assert found == [("cup in view", 0.62)]
-    assert "no score in it reaches min_score 0.55" in note
-    assert things(min_score=0.7)[0] == []
-    memory = replace(memory, limits=replace(memory.limits, min_score=0.7))
-    assert things()[0] == []
-
-
 def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: Path) -> None:
     """A robot that drives at 0.5 m/s, recorded for 20 s, an hour later, and another hour later."""
     for run in range(3):
