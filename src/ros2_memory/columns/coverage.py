@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from threading import Lock
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment, TopicExtent
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray, Mask
-
-
-_NEVER: Final = TimeWindow(0, 0)
 
 
 class CoveredSegment(NamedTuple):
@@ -50,11 +47,6 @@ class CoveredSegment(NamedTuple):
     def is_missing(self) -> Mask:
         """Which bags are not stored."""
         return self.numbers < 0
-
-    def misses_in(self, window: TimeWindow) -> bool:
-        """Returns whether a bag that is not stored may begin in a window."""
-        starts = self.segment.bags.starts[self.is_missing]
-        return bool(starts.size) and window.overlaps(int(starts.min()), int(starts.max()))
 
 
 class Coverage:
@@ -187,14 +179,13 @@ class Covering:
             return coverage
 
     def _covered_segments(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
-        before = state if self._latest is None else self._latest[1].state
-        changed = self.store.begins_since(before, state) if before != state else _NEVER
+        is_same = self._latest is not None and self._latest[1].state == state
         remembered = {
             id(segment): covered
             for segment in timeline.segments
             if (covered := self._by_id.get(id(segment))) is not None
             and covered.segment is segment
-            and not covered.misses_in(changed)
+            and (is_same or not covered.to_store.any())
         }
         unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
         rows = self.store.rows_of([segment.bags for segment in unknown], self._root, state.deletion)

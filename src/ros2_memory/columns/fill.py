@@ -120,7 +120,7 @@ class Filling:
         self._trimmed: dict[BagKey, Ns] = {}
         self._shared: tuple[Timeline, frozenset[str]] | None = None
         self._merged: list[Span] = []
-        self._whole_parts: list[tuple[list[int], list[BagFile]]] = []
+        self._whole_parts: list[tuple[Sequence[int], list[BagFile]]] = []
 
     def waiting(self, timeline: Timeline) -> list[BagFile]:
         """Returns the bags to be stored, the newest first.
@@ -316,8 +316,7 @@ class Filling:
         if written.parts and level > Level.BAG:
             begin = _slot(bags[0], level)[1]
             self._merged.append((begin, begin + level.length))
-            self._whole_parts.append(([*written.parts], bags))
-            self._scanner.remember(written.parts)
+            self._whole_parts.append((written.parts, bags))
         if written.bags:
             spent = ms_from_ns(time.perf_counter_ns() - begun)
             log.debug(

@@ -249,7 +249,6 @@ class Fragments(Generic[T]):
         kind: see there.
         settings: what all of them depend on, as a text.
         remembered: those of all kinds that were asked for last.
-        fresh: parts of which none are stored yet, as far as is known.
     """
 
     def __init__(
@@ -258,13 +257,11 @@ class Fragments(Generic[T]):
         kind: FragmentKind[T],
         settings: str,
         remembered: ByteLru[object],
-        fresh: set[int] | frozenset[int] = frozenset(),
     ) -> None:
         self._store = store
         self._kind = kind
         self._name = f"{kind.name} {settings}"
         self._remembered = remembered
-        self._fresh = fresh
         self._waiting: deque[tuple[FragmentKey, T]] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.Lock()
 
@@ -276,8 +273,7 @@ class Fragments(Generic[T]):
         """
         # By name: each kind has one type.
         fragment = cast("T | None", self._remembered.get((self._kind.name, key)))
-        is_new = not self._fresh.isdisjoint(key.parts)
-        if fragment is None and self._store is not None and not is_new:
+        if fragment is None and self._store is not None:
             for other, data in self._store.fragments(self._name, key, also_before):
                 if self._remembered.get((self._kind.name, other)) is not None:
                     continue

@@ -56,8 +56,6 @@ STRETCH_NS: Final[Ns] = 4 * 3600 * NS_PER_S
 """What follows from the rows of so much of the clock is joined once."""
 _ATTEMPTS: Final = 5
 """How often a scan looks what is stored, while that changes; then it reads the bags."""
-_MOST_LOOKED_UP: Final = 64
-"""Parts whose columns are looked up at once."""
 _MOST_DECODED: Final = 16
 """Bags whose tables a scan keeps, to compare them with others."""
 _MOST_BYTES: Final = 64 << 20
@@ -191,11 +189,11 @@ class Scan:
         """
         sources, ruled_out = self._asked_sources(newest_first=newest_first, among=among)
         waiting: list[Rows] = []
-        for nth, (source, together) in enumerate(_with_next(sources)):
+        for nth, source in enumerate(sources):
             self._request.check(source.last if newest_first else source.first)
             waiting += [
                 Rows(unit, partial(self._counting, unit), source.number not in ruled_out)
-                for unit in self._units(source, together)
+                for unit in self._units(source)
             ]
             # A bag has a table for each type: one may be later than the next bag, the other not.
             waiting.sort(key=lambda rows: -rows.last if newest_first else rows.first)
@@ -343,9 +341,9 @@ class Scan:
             if id(source) in shared
             or (self._request.repeats_latched and self._may_be_late(source.number))
         ]
-        for source, together in _with_next(asked):
+        for source in asked:
             self._request.check(source.first)
-            for unit in self._units(source, together):
+            for unit in self._units(source):
                 repeated = self._repeated(unit)
                 if repeated.size:
                     yield Rows.of(unit, np.unique(repeated))
@@ -406,12 +404,12 @@ class Scan:
         counting = self._coverage.of_part(part.number, part.bags)
         return self._coverage.bag(int(counting[0])) if counting.size else None
 
-    def _units(self, source: _Source, together: Sequence[PartHead]) -> Iterable[Unit]:
-        """Returns what a source has; of parts `together` with it what is known is read at once."""
+    def _units(self, source: _Source) -> Iterable[Unit]:
+        """Returns what a source has."""
         if source.part is None and self._request.stored:
             return ()
         if source.part is not None and self._coverage is not None:
-            unit = self._scanner.part(source.part, self._coverage, together)
+            unit = self._scanner.part(source.part, self._coverage)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         return self._units_of_bag(source.bag)
@@ -494,8 +492,7 @@ class Scan:
 
         `judge` is given all of their messages in the window.
         """
-        sources = _with_next(self._sources_in(window))
-        units = [unit for source in sources for unit in self._units(*source)]
+        units = [unit for source in self._sources_in(window) for unit in self._units(source)]
         if len({unit.first_bag.recording for unit in units}) > 1:
             rows = [np.flatnonzero(_in_window(unit, window)) for unit in units]
             judged = judge(self._messages(units, rows))
@@ -596,18 +593,6 @@ def _in_window(unit: Unit, window: TimeWindow) -> Mask:
 
 def _heads(sources: Iterable[_Source]) -> list[PartHead]:
     return [source.part for source in sources if source.part is not None]
-
-
-def _with_next(sources: Sequence[_Source]) -> Iterator[tuple[_Source, Sequence[PartHead]]]:
-    """Yields sources, each with parts to look up together: who goes on reads many."""
-    heads: Sequence[PartHead] = ()
-    ahead = together = 1
-    for nth, source in enumerate(sources):
-        if nth == ahead:
-            together = min(2 * together, _MOST_LOOKED_UP)
-            ahead += together
-            heads = _heads(sources[nth:ahead])
-        yield source, heads
 
 
 def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:

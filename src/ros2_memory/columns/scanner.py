@@ -19,24 +19,23 @@ from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, 
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.stored import StoredTable, lazy_columns
-from ros2_memory.columns.table import Column, Table, Texts, Zone, column_bytes
+from ros2_memory.columns.table import Column, Table, Texts, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
 from ros2_memory.columns.writing import BAG, LOG_TIME
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.large_reads import LargeReads
-from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.transforms import Pair
-    from ros2_memory.columns.writing import PackedPart
+    from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Channel, IntArray, Mask
 
@@ -47,26 +46,17 @@ _HEAD_BYTES: Final = 400
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
-_FETCHED_BYTES: Final = 1 << 20
-"""How much of compressed columns that a scan wants next is read at once."""
 DECODED_BYTES: Final = 8 << 20
 """The tables of a bag that is not stored are remembered if they take no more memory than this."""
-_FEW_DAYS_NS: Final = 3 * DAY_NS
-"""Of windows up to this long, only the parts of the days that they touch are looked up."""
 _DROPPED: Final = "beyond the share of the store (store.max_share)"
-_ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
-"""Stands for a column that a part does not have."""
-_WRITTEN_BYTES: Final = 16 << 20
-"""So many compressed bytes of parts just written stay in memory until what follows is made."""
 _MOST_DAMAGED: Final = 10_000
 """Files whose damage is remembered."""
 
 
 class _Heads(NamedTuple):
-    """The parts of a topic in a span, in order of their first log times.
+    """The parts of a topic, in order of their first log times.
 
     Attributes:
-        span: of log time.
         coverage: of the timeline that they were compared with.
         heads: the parts.
         firsts: their first log times.
@@ -74,7 +64,6 @@ class _Heads(NamedTuple):
         live: of how many of its bags the rows of each count.
     """
 
-    span: TimeWindow
     coverage: Coverage
     heads: Sequence[PartHead]
     firsts: IntArray
@@ -82,10 +71,9 @@ class _Heads(NamedTuple):
     live: IntArray
 
     @classmethod
-    def of(cls, span: TimeWindow, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
+    def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
         """Returns the parts as of a coverage."""
         return cls(
-            span,
             coverage,
             heads,
             np.array([head.first for head in heads], np.int64),
@@ -99,6 +87,36 @@ class _Heads(NamedTuple):
         return [self.heads[nth] for nth in np.flatnonzero(is_within).tolist()]
 
 
+class _Known(NamedTuple):
+    """What is known of a column of a topic in all parts up to the newest, without values.
+
+    Attributes:
+        newest: the newest of these parts; it need not have the column.
+        packed: by part, how the column is packed.
+        zones: those of the parts.
+    """
+
+    newest: int
+    packed: Mapping[int, Packed]
+    zones: Zones
+
+    def joined(self, newest: int, packed: Mapping[int, Packed]) -> _Known:
+        """Returns it with what is known of newer parts."""
+        zones = Zones.of([*packed], [of_part.zone for of_part in packed.values()])
+        newest = max([newest, *packed])
+        return _Known(newest, {**self.packed, **packed}, self.zones.joined(zones))
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        words = (of_part.zone.words for of_part in self.packed.values())
+        texts = sum(map(len, filter(None, words)))
+        return _COLUMN_BYTES * len(self.packed) + texts + self.zones.memory_bytes
+
+
+_UNKNOWN: Final = _Known(0, {}, Zones.of([], []))
+
+
 @dataclass(frozen=True, slots=True)
 class Caches:
     """What scanners read last, and what they made of it, within one capacity for all of them.
@@ -107,10 +125,8 @@ class Caches:
 
     Attributes:
         read: by part and path, unpacked columns; by kind and key, fragments.
-        packed: by part and path, what is known of a column.
-        fetched: by part and path, compressed columns that are wanted next, until they are.
-        zones: by topic and path, the zones of its parts.
-        heads: by topic, its parts in the days that were asked for last.
+        known: by topic, path and state of the store, what is known of a column in its parts.
+        heads: by topic, its parts.
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
         pairs: by part, the parents and children of its transforms.
         clock_steps: by pause and the bags beside it, the steps of the clock in it.
@@ -120,9 +136,7 @@ class Caches:
     """
 
     read: ByteLru[object]
-    packed: ByteLru[Packed]
-    fetched: ByteLru[bytes]
-    zones: ByteLru[tuple[Zones, int]]
+    known: ByteLru[_Known]
     heads: ByteLru[_Heads]
     decoded: ByteLru[list[list[Table]]]
     pairs: ByteLru[frozenset[Pair]]
@@ -172,10 +186,9 @@ class Scanner:
         self.caches = Caches.of() if caches is None else caches.namespace()
         self._reading = reading
         self._damaged: dict[tuple[str | Ns, ...], str] = {}
-        self._fresh: set[int] = set()
-        self._written: dict[int, PackedPart] = {}
+        self._deletion = 0
         # They follow from columns alone, and are of use where these were dropped.
-        self._outlines = Fragments(store, OUTLINE, "", self.caches.read, self._fresh)
+        self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
 
     def met_damage(self, bag: BagFile, error: BagError) -> None:
@@ -196,7 +209,7 @@ class Scanner:
     def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
-            fragments = Fragments(self.store, kind, self._reading, self.caches.read, self._fresh)
+            fragments = Fragments(self.store, kind, self._reading, self.caches.read)
             self._fragments.setdefault(kind.name, fragments)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
@@ -225,14 +238,16 @@ class Scanner:
 
     def write_fragments(self) -> None:
         """Stores the fragments that were made since."""
-        self._fresh.clear()
-        self._written.clear()
         for fragments in [*self._fragments.values()]:
             cast("Fragments[Sized]", fragments).write()
 
     def coverage(self, timeline: Timeline) -> Coverage | None:
         """Returns which bags of a timeline are stored; None without a store."""
-        return None if self._covering is None else self._covering.of(timeline)
+        if self._covering is None:
+            return None
+        coverage = self._covering.of(timeline)
+        self._deletion = coverage.state.deletion
+        return coverage
 
     def channels(self, timeline: Timeline, bag: BagFile) -> list[Channel]:
         """Returns the channels of all that was ever stored; none where a bag is not stored."""
@@ -247,13 +262,6 @@ class Scanner:
             return []
         state = coverage.state
         cached = self.caches.heads.get(topic)
-        if cached is None or window.intersect(cached.span) != window:
-            span = window.aligned(DAY_NS)
-            if span.stop - span.start > _FEW_DAYS_NS:
-                span = TimeWindow.everything()
-            cached = None
-        else:
-            span = cached.span
         if cached is None or cached.coverage is not coverage:
             failures = self.store.failures
             heads: list[PartHead] = []
@@ -261,9 +269,9 @@ class Scanner:
                 heads = [*cached.heads]
             if cached is None or cached.coverage.state != state:
                 newest = max((head.number for head in heads), default=0)
-                heads += self.store.parts(topic, span, newest)
+                heads += self.store.parts(topic, newest)
                 heads.sort(key=lambda head: (head.first, head.number))
-            cached = _Heads.of(span, heads, coverage)
+            cached = _Heads.of(heads, coverage)
             if self.store.failures == failures:
                 size = sum(_HEAD_BYTES + head.bags.nbytes for head in heads)
                 self.caches.heads.put(topic, cached, 1000 + size)
@@ -308,40 +316,35 @@ class Scanner:
 
     def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
         """Returns the zones of a column in some parts of a topic."""
+        return self._known(topic, path, int(parts.max(initial=0))).zones.among(parts)
+
+    def _known(self, topic: int, path: str, part: int) -> _Known:
+        """Returns what is known of a column of a topic, in a part and in all that are older."""
         store = self._store_of_parts
-        key = (topic, path)
-        zones, newest = self.caches.zones.get(key) or (Zones.of([], []), 0)
-        asked = int(parts.max(initial=0))
-        if asked > newest:
+        key = (topic, path, self._deletion)
+        known = self.caches.known.get(key) or _UNKNOWN
+        if part > known.newest:
             failures = store.failures
-            zones = zones.joined(store.zones(topic, path, newest))
+            known = known.joined(part, store.zones(topic, path, known.newest))
             if store.failures == failures:
-                # Not each part has each column, so what was asked for counts, too.
-                newest = max([asked, *zones.parts[-1:].tolist()])
-                self.caches.zones.put(key, (zones, newest), zones.memory_bytes)
-        return zones.among(parts)
+                self.caches.known.put(key, known, known.memory_bytes)
+        return known
 
-    def part(
-        self, head: PartHead, coverage: Coverage, together: Sequence[PartHead] = ()
-    ) -> Unit | None:
+    def part(self, head: PartHead, coverage: Coverage) -> Unit | None:
         """Returns a part; None where no row of it counts.
-
-        What is known of its columns is read at once for the parts `together` with it.
 
         Raises:
             GoneError: it was deleted meanwhile.
         """
-        # Those that a scan from the newest on comes to next.
-        older = max(head.first - together[-1].first, 0) if together else 0
         offset = self._store_of_parts.offset
         topic = self._store_of_parts.topic(head.topic)
         if topic is None:
             raise GoneError
-        packed = partial(self.packed, head, together=together)
+        packed = partial(self.packed, head, {LOG_TIME, BAG} | topic.layout.slots.keys())
 
         def column_at(path: str) -> Column | None:
             column = packed(path)
-            return None if column is None else self._column(head, path, column, together)
+            return None if column is None else self._column(head.number, path, column)
 
         def load(path: str) -> Column:
             column = column_at(path)
@@ -376,7 +379,7 @@ class Scanner:
             left_out,
             define=lambda: topic.definition,
             packed=packed,
-            outline=partial(self._outlines.get, _outline_key(head), older),
+            outline=partial(self._outlines.get, _outline_key(head), DAY_NS),
             memory=self.caches.read,
             number=head.number,
         )
@@ -392,62 +395,35 @@ class Scanner:
             counting.size == head.bags.size,
         )
 
-    def remember(self, parts: Mapping[int, PackedPart]) -> None:
-        """Remembers parts that were written, by their numbers: what follows is made of these."""
-        self._fresh.update(parts)
-        room = _WRITTEN_BYTES - sum(part.size for part in self._written.values())
-        for number, part in parts.items():
-            room -= part.size
-            if room >= 0:
-                self._written[number] = part
-
-    def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:
+    def packed(self, head: PartHead, always: Collection[str], path: str) -> Packed | None:
         """Returns what is known of a column of a part; None where it has no such one.
 
-        It is read at once for those parts of the same topic that are `together` with it.
-
         Raises:
-            GoneError: the part was deleted meanwhile, or the store cannot be read.
+            GoneError: it is one that each part has `always`, and the part was deleted meanwhile, or
+                the store cannot be read.
         """
-        written = self._written.get(head.number)
-        if written is not None:
-            return written.columns.get(path)
-        cached = self.caches.packed.get((head.number, path))
-        if cached is None:
-            numbers = [head.number, *(part.number for part in together if part.topic == head.topic)]
-            store = self._store_of_parts
-            failures = store.failures
-            read = store.packed(head.topic, path, numbers)
-            others = [number for number in numbers if number not in read]
-            # A part that is gone has no columns either: only of one that is there it says anything.
-            present = store.packed(head.topic, LOG_TIME, others) if others else {}
-            if store.failures != failures:
-                raise GoneError
-            read.update(dict.fromkeys(present, _ABSENT))
-            for number, packed in read.items():
-                self.caches.packed.put((number, path), packed, _COLUMN_BYTES)
-            cached = read.get(head.number)
-            if cached is None:
-                raise GoneError
-        return None if cached is _ABSENT else cached
+        packed = self._known(head.topic, path, head.number).packed.get(head.number)
+        if packed is None and path in always:
+            raise GoneError
+        return packed
 
-    def _column(
-        self, head: PartHead, path: str, packed: Packed, together: Sequence[PartHead]
-    ) -> Column:
-        """Returns a column of a part.
+    def _column(self, part: int, path: str, packed: Packed) -> Column:
+        """Returns a column of a part, of which the compressed bytes are not kept.
 
         Raises:
             GoneError: the part was deleted meanwhile, or the store cannot be read, or is damaged.
         """
-        key = (head.number, path)
+        key = (part, path)
         cached = self.caches.read.get(key)
         if cached is not None:
             return cast("Column", cached)
-        stored = b""
+        stored: bytes | None = b""
         # The one value of a constant is its least, unless it is a text.
         is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
         if packed.count and not is_constant:
-            stored = packed.data or self._stored(head, path, together)
+            stored = self._store_of_parts.part_data(part, path)
+            if stored is None:
+                raise GoneError
             if is_large(stored):
                 self._large.acquire()
         try:
@@ -463,30 +439,6 @@ class Scanner:
             column = column.astype(np.min_scalar_type(column.max(initial=0)))
         self.caches.read.put(key, column, column_bytes(column))
         return column
-
-    def _stored(self, head: PartHead, path: str, together: Sequence[PartHead]) -> bytes:
-        """Returns the compressed bytes of a column, which are kept no longer.
-
-        Where that of the part before was read, too, those of the next parts are fetched with it.
-
-        Raises:
-            GoneError: the part was deleted meanwhile, or the store cannot be read.
-        """
-        stored = self.caches.fetched.take((head.number, path))
-        if stored is None:
-            numbers = [part.number for part in together if part.topic == head.topic]
-            nth = numbers.index(head.number) if head.number in numbers else 0
-            goes_on = nth > 0 and self.caches.read.get((numbers[nth - 1], path)) is not None
-            later = numbers[nth + 1 :] if goes_on else []
-            unread = [one for one in later if self.caches.read.get((one, path)) is None]
-            wanted = [head.number, *unread]
-            fetched = self._store_of_parts.part_data(wanted, path, _FETCHED_BYTES)
-            stored = fetched.pop(head.number, None)
-            for number, data in fetched.items():
-                self.caches.fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
-            if stored is None:
-                raise GoneError
-        return stored
 
 
 def _outline_key(head: PartHead) -> FragmentKey:

@@ -33,7 +33,6 @@ from ros2_memory.columns.writing import (
     Layouts,
     Level,
     LongBag,
-    PackedPart,
     ReadBag,
     bytes_of_topics,
     delete_bags,
@@ -41,24 +40,22 @@ from ros2_memory.columns.writing import (
     thin_parts,
     zone_of,
 )
-from ros2_memory.columns.zones import Zones
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.timeline import SEGMENT_BAGS
 from ros2_memory.storage.base import Channel, Definition, IntArray, Schema
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.fragments import FragmentKey
     from ros2_memory.columns.table import Table
 
 FILE: Final = "columns.sqlite"
-_ALL_TIME: Final = TimeWindow.everything()
 LONG_NS: Final[Ns] = 2 * Level.TEN_MINUTES.length
 """A bag that lasts longer becomes parts of an hour at once."""
 
@@ -113,23 +110,20 @@ class State(NamedTuple):
         part: the newest part.
         deletion: the newest deletion: while it is the same, what was stored is stored.
         change: the newest change, of this connection.
-        bag: the newest bag.
-        renewal: changes of another connection, and how often this one has changed a bag: while it
-            is the same, only newer bags are stored since.
+        others: likewise, of other connections.
     """
 
     part: int
     deletion: int
     change: int
-    bag: int
-    renewal: tuple[int, int]
+    others: int
 
 
 class Written(NamedTuple):
-    """How many bags are stored, and the parts that were made of them by their numbers."""
+    """How many bags are stored, and the numbers of the parts that were made of them."""
 
     bags: int
-    parts: Mapping[int, PackedPart]
+    parts: Sequence[int]
 
 
 class PartHead(NamedTuple):
@@ -185,7 +179,6 @@ class ColumnStore(Database):
         self._definitions = definitions
         self._topics: dict[int, Topic] = {}
         self._layouts = Layouts()
-        self._renewals = 0
 
     # Reading
 
@@ -193,31 +186,12 @@ class ColumnStore(Database):
         """Returns what tells whether anything has changed."""
 
         def ask(connection: sqlite3.Connection) -> State:
-            part, bag = connection.execute(
-                "SELECT (SELECT max(id) FROM part), (SELECT max(id) FROM bag)"
-            ).fetchone()
+            [part] = connection.execute("SELECT max(id) FROM part").fetchone()
             [others] = connection.execute("PRAGMA data_version").fetchone()
-            return State(
-                self.offset + int(part or 0),
-                self._deletion(connection),
-                connection.total_changes,
-                int(bag or 0),
-                (others, self._renewals),
-            )
+            newest = self.offset + int(part or 0)
+            return State(newest, self._deletion(connection), connection.total_changes, others)
 
-        return self.read(ask, State(-1, -1, -1, -1, (-1, -1)))
-
-    def begins_since(self, before: State, now: State) -> TimeWindow:
-        """Returns a window (log time) in which the bags begin that are stored since a state.
-
-        The deletion is the same.
-        """
-        if before.renewal != now.renewal:
-            return _ALL_TIME
-        query = "SELECT min(first_ns), max(first_ns) FROM bag WHERE id > ?"
-        unknown: tuple[Ns | None, Ns | None] = MIN_NS, MAX_NS
-        first, last = self._asked(lambda rows: rows.fetchone(), unknown, query, before.bag)
-        return TimeWindow(first or 0, 0 if last is None else last + 1)
+        return self.read(ask, State(-1, -1, -1, -1))
 
     def known_bags(self, bag_dir: Path) -> list[BagRows]:
         """Returns the bags that are stored, as they were indexed, in order of time."""
@@ -340,21 +314,15 @@ class ColumnStore(Database):
         """Returns a topic by its number; None where there is none."""
         return self._topics.get(number) or self.topics().get(number)
 
-    def parts(self, topic: str, span: TimeWindow = _ALL_TIME, after: int = 0) -> list[PartHead]:
-        """Returns the parts of a topic, of all its types, in the order of their first messages.
-
-        Args:
-            topic: its name.
-            span: of log time.
-            after: a part; those that are newer are returned.
-        """
+    def parts(self, topic: str, after: int = 0) -> list[PartHead]:
+        """Returns the parts of a topic, of all its types, that are newer than a part."""
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
                 "SELECT bags, id, topic, first_ns, last_ns, messages, dropped, level FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?)"
-                " AND first_ns < ? AND last_ns >= ? AND id > ? ORDER BY first_ns, id",
-                (topic, span.stop, span.start, max(after - self.offset, 0)),
+                " AND id > ? ORDER BY first_ns, id",
+                (topic, max(after - self.offset, 0)),
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
             texts = [bags[1:-1] for bags, *_ in rows]
@@ -386,28 +354,17 @@ class ColumnStore(Database):
 
         return self.read(ask, [])
 
-    def zones(self, topic: int, path: str, after: int = 0) -> Zones:
-        """Returns the zones of a column in all parts of a topic that are newer than a part."""
+    def zones(self, topic: int, path: str, after: int = 0) -> dict[int, Packed]:
+        """Returns what is known of a column in all parts of a topic that are newer than a part.
 
-        def ask(connection: sqlite3.Connection) -> Zones:
-            rows = connection.execute(
-                "SELECT part, least, greatest, nulls, words FROM zone"
-                " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
-                (topic - self.offset, path, max(after - self.offset, 0)),
-            ).fetchall()
-            parts = [self.offset + part for part, *_ in rows]
-            return Zones.of(parts, [zone_of(*zone) for _, *zone in rows])
-
-        return self.read(ask, Zones.of([], []))
-
-    def packed(self, topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
-        """Returns what is known of a column in some parts of a topic, without its values."""
+        By the numbers of the parts, which ascend; without values.
+        """
 
         def ask(connection: sqlite3.Connection) -> dict[int, Packed]:
             rows = connection.execute(
                 "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
-                " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
-                (topic - self.offset, path, self._ids(parts)),
+                " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
+                (topic - self.offset, path, max(after - self.offset, 0)),
             )
             return {
                 part + self.offset: Packed(intern(codec), count, error, zone_of(*zone), b"")
@@ -416,30 +373,20 @@ class ColumnStore(Database):
 
         return self.read(ask, {})
 
-    def part_data(self, parts: Sequence[int], path: str, most_bytes: int) -> dict[int, bytes]:
-        """Returns the compressed bytes of a column by part, in the order of `parts`.
-
-        Parts that were deleted are left out, and those that follow `most_bytes` in all.
-        """
-
-        def ask(connection: sqlite3.Connection) -> dict[int, bytes]:
-            rows = connection.execute(
-                "SELECT own.part, coalesce(own.data, other.data) FROM json_each(?) AS wanted"
-                " CROSS JOIN part_column AS own ON own.part = wanted.value AND own.path = ?"
-                " LEFT JOIN part_column AS other ON other.part = own.part AND other.path = own.same"
-                " WHERE coalesce(own.data, other.data) IS NOT NULL",
-                (self._ids(parts), path),
-            )
-            by_part: dict[int, bytes] = {}
-            size = 0
-            for part, data in rows:
-                by_part[part + self.offset] = data
-                size += len(data)
-                if size > most_bytes:
-                    break
-            return by_part
-
-        return self.read(ask, {})
+    def part_data(self, part: int, path: str) -> bytes | None:
+        """Returns the compressed bytes of a column; None where its part was deleted."""
+        query = (
+            "SELECT coalesce(own.data, other.data) FROM part_column AS own"
+            " LEFT JOIN part_column AS other ON other.part = own.part AND other.path = own.same"
+            " WHERE own.part = ? AND own.path = ?"
+        )
+        none: bytes | None = None
+        return self._asked(
+            lambda rows: next((data for (data,) in rows), None),
+            none,
+            query,
+            *(part - self.offset, path),
+        )
 
     def fragments(
         self, kind: str, key: FragmentKey, also_before: Ns = 0
@@ -531,7 +478,7 @@ class ColumnStore(Database):
             tables: with all of their messages.
             level: of the parts.
         """
-        written = Written(0, {})
+        written = Written(0, ())
 
         def write(connection: sqlite3.Connection) -> None:
             nonlocal written
@@ -553,9 +500,9 @@ class ColumnStore(Database):
                 connection, new, tables, self._definitions, self._layouts, level=level
             )
             done = len(bags) - len(missing) + len(new)
-            written = Written(done, {self.offset + row: part for row, part in parts.items()})
+            written = Written(done, [self.offset + row for row in parts])
 
-        return written if self.write(write) else Written(0, {})
+        return written if self.write(write) else Written(0, ())
 
     def renew(self, key: BagKey, bag: BagFile) -> bool:
         """Keeps what is stored of a bag whose sidecar is another one now; returns whether it did.
@@ -570,7 +517,6 @@ class ColumnStore(Database):
                 " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
                 (key.sidecar_ns, *key[:3], bag.summary.data, bag.summary.schema.to_json()),
             )
-            self._renewals += 1
             return cursor.rowcount > 0
 
         return self.write(write)
@@ -592,14 +538,9 @@ class ColumnStore(Database):
         if not self.write(long.begin):
             return False
         is_whole = False
-
-        def end(connection: sqlite3.Connection) -> bool:
-            self._renewals += 1
-            return long.end(connection)
-
         try:
             goes_on = all(self.write(partial(long.add, tables=tables)) for tables in groups)
-            is_whole = goes_on and self.write(end)
+            is_whole = goes_on and self.write(long.end)
         finally:
             if not is_whole:
                 self.write(long.delete_half)

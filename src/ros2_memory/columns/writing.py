@@ -324,8 +324,8 @@ def insert_bags(
     layouts: Layouts,
     *,
     level: Level,
-) -> dict[int, PackedPart]:
-    """Inserts bags of one recording, in parts for each topic; returns these by their ids.
+) -> list[int]:
+    """Inserts bags of one recording, in parts for each topic; returns the ids of these.
 
     Args:
         connection: to the store.
@@ -344,7 +344,7 @@ def insert_bags(
     ids = np.zeros(max(bags, default=0) + 1, np.int64)
     for number, bag in bags.items():
         ids[number] = insert_bag(connection, bag, definitions if number in lacking else "")
-    parts: dict[int, PackedPart] = {}
+    parts: list[int] = []
     for table in tables:
         is_stored = np.isin(table.bag_numbers, [*bags])
         if is_stored.any():
@@ -352,7 +352,7 @@ def insert_bags(
             rows = table if is_stored.all() else table.rows(np.flatnonzero(is_stored))
             for piece in _in_parts(rows):
                 part = pack_rows(layout, piece, ids[piece.bag_numbers])
-                parts[_insert_part(connection, topic, part, level)] = part
+                parts.append(_insert_part(connection, topic, part, level))
     return parts
 
 

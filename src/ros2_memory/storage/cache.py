@@ -50,13 +50,6 @@ class ByteLru(Generic[T]):
             self._all.values.move_to_end((self, key))
             return entry[0]
 
-    def take(self, key: Hashable) -> T | None:
-        """Returns the value of the key, which is not cached any more, or None."""
-        with self._all.lock:
-            value, size = self._all.values.pop((self, key), (None, 0))
-            self._all.bytes -= size
-            return value
-
     def put(self, key: Hashable, value: T, size: int) -> None:
         """Caches `value`, which takes about `size` bytes, and drops others."""
         entries = self._all

@@ -31,7 +31,7 @@ from tests.support.bags import (
 from tests.support.column_worlds import World, check_all, store_file, times
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -113,11 +113,7 @@ def stored_rows(file: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-@pytest.mark.parametrize("held_bytes", [16 << 20, 2_000], ids=["held", "read again"])
-def test_rows_of_this_format_do_not_change_their_meaning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held_bytes: int
-) -> None:
-    monkeypatch.setattr("ros2_memory.columns.scanner._WRITTEN_BYTES", held_bytes)
+def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None:
     write_all_that_is_derived(tmp_path)
     world = World.of(tmp_path)
     world.fill_alone()
@@ -232,13 +228,13 @@ def test_a_write_that_fails_meanwhile_costs_no_answer(
     write_bags(tmp_path)
     World.of(tmp_path).fill()
     world = World.of(tmp_path)
-    read = world.store.packed
+    read = world.store.zones
 
-    def read_while_a_write_fails(topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
+    def read_while_a_write_fails(topic: int, path: str, after: int) -> dict[int, Packed]:
         assert not world.store.write(full_disk)
-        return read(topic, path, parts)
+        return read(topic, path, after)
 
-    monkeypatch.setattr(world.store, "packed", read_while_a_write_fails)
+    monkeypatch.setattr(world.store, "zones", read_while_a_write_fails)
     assert times(world, "/odom") == times(world.unstored(), "/odom")
     assert world.store.is_failing
 
@@ -247,7 +243,7 @@ def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(
     world: World, tmp_path: Path
 ) -> None:
     scanner, [head, *_] = Scanner(world.store, tmp_path), world.store.parts("/odom")
-    assert scanner.packed(head, "no such column", []) is None
+    assert scanner.packed(head, ["#log_time"], "no such column") is None
     assert world.store.delete(world.store.paths())
     with pytest.raises(GoneError):
-        scanner.packed(head, "#publish_time", [])
+        scanner.packed(head, ["#log_time"], "#log_time")
