@@ -25,8 +25,7 @@ next (a plane of high bytes hardly varies, so it compresses to nothing)::
     delta   ^ slope # n-1     differences of neighbours, less the slope
 
 Differences have a sign: 0, -1, 1, -2, 2 are written 0, 1, 2, 3, 4. Sums start anywhere: the least
-of the zone says where. Numbers that are 2**62 apart and more are arranged `plain`: all 8 bytes, and
-nothing subtracted.
+of the zone says where. Numbers that are 2**62 apart and more are `flat`.
 
 Texts are `text constant` (one word) or `text`, arrangement and bytes of their codes, whose least is
 0. Their bytes begin with the words, the codes follow::
@@ -60,7 +59,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
-FORMAT: Final = 32
+FORMAT: Final = 33
 """Version of the file. Raise it with every change of its tables, of their bytes, and of the rules
 by which fragments are made: only those of sights have a version of their own."""
 MOST_WORDS_BYTES: Final = 4_096
@@ -304,16 +303,14 @@ def _arranged(column: _Whole) -> Packed:
     """Returns a column arranged so that its numbers have the fewer bits, by some of them."""
     flat = left = column.numbers
     name, head = "flat", b""
-    if int(flat.view(np.uint64).max()) >= _FAR_APART:
-        name = "plain"
-    else:
+    if int(flat.view(np.uint64).max()) < _FAR_APART:
         slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
         delta = np.diff(flat) - slope
         step = max(1, len(flat) // _LOOKED_AT)
         if _bits_of(delta[::step]) < _bits_of(flat[::step] - flat.mean()):
             name, head, left = "delta", struct.pack("<q", slope[0]), (delta << 1) ^ (delta >> 63)
     greatest = int(left.view(np.uint64).max(initial=0))
-    width = 8 if name == "plain" else (greatest.bit_length() + 7) // 8
+    width = (greatest.bit_length() + 7) // 8
     data = b"".join((column.head, head, byte_planes(left, width)))
     codec = f"{column.form} {name} {width}"
     return Packed(codec, len(flat), column.error, column.zone, data)
@@ -331,7 +328,7 @@ def _bits_of(numbers: Numbers) -> float:
 def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> IntArray:
     """Returns the whole numbers that were arranged; the least of them is `least`."""
     name, _, width = arrangement.partition(" ")
-    if name in {"plain", "flat"}:
+    if name == "flat":
         return np.add(from_planes(data, 0, count, int(width)).astype(np.int64), _wrapped(least))
     if name != "delta":
         raise ValueError(f"packed columns are not arranged {name!r}")
