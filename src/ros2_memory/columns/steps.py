@@ -78,7 +78,6 @@ _JOINTS: Final = {
     "sensor_msgs/msg/JointState": frozenset({"position"}),
     "trajectory_msgs/msg/JointTrajectoryPoint": frozenset({"positions"}),
 }
-_ROTATIONS: Final = frozenset({"orientation", "rotation", "quaternion"})
 _VELOCITIES: Final = frozenset({"linear", "angular", "linear_velocity", "angular_velocity"})
 _PLACES: Final = frozenset(
     {"position", "translation", "point", "points", "location", "origin", "center", "centroid"}
@@ -89,13 +88,12 @@ _ANGLES: Final = frozenset({"roll", "pitch", "yaw", "theta", "heading", "azimuth
 _ENDS_OF_ANGLES: Final = ("_angle", "_yaw", "_heading")
 
 
-def step_of(path: str, definition: Definition | None = None) -> Step:
+def step_of(path: str, definition: Definition | None) -> Step:
     """Returns how exactly a column of floats is stored.
 
     Args:
         path: the field, as `pose.pose.position.x`; of elements `<sequence>.<field>`.
-        definition: that of the topic. Without it the field's name and that of the message around it
-            decide.
+        definition: that of the topic.
 
     Returns:
         0.1 mm for coordinates of points and for vectors that are named as positions are, 0.1 mrad
@@ -111,7 +109,7 @@ def step_of(path: str, definition: Definition | None = None) -> Step:
         return RADIANS
     if name in "xyz":
         return _axis(name, owner, around.rpartition(".")[2])
-    if name == "w" and _is_rotation(owner, around.rpartition(".")[2]):
+    if name == "w" and owner == _QUATERNION:
         return QUATERNION
     if name in _GLOBE:
         return DEGREES
@@ -131,14 +129,10 @@ def _type_at(path: str, definition: Definition | None) -> str:
 
 
 def _axis(name: str, owner: str, field: str) -> Step:
-    if _is_rotation(owner, field):
+    if owner == _QUATERNION:
         return QUATERNION
     if owner in _POINTS or (owner in _POSES_2D and name != "z"):
         return METRES
-    if owner in {_VECTOR, ""} and field in _PLACES:
+    if owner == _VECTOR and field in _PLACES:
         return METRES
     return VELOCITY if owner == _VECTOR and field in _VELOCITIES else RELATIVE
-
-
-def _is_rotation(owner: str, field: str) -> bool:
-    return owner == _QUATERNION or (not owner and field in _ROTATIONS)

@@ -65,19 +65,3 @@ ROBOT = Definition(
 )
 def test_steps_follow_the_type_of_the_message(path: str, step: Step) -> None:
     assert step_of(path, ROBOT) == step
-
-
-@pytest.mark.parametrize(
-    ("path", "step"),
-    [
-        ("pose.position.x", METRES),
-        ("pose.orientation.w", QUATERNION),
-        ("twist.linear.x", RELATIVE),
-        ("theta", RADIANS),
-        ("ranges.0", RELATIVE),
-        ("longitude", DEGREES),
-        ("w", RELATIVE),
-    ],
-)
-def test_steps_follow_names_where_there_is_no_definition(path: str, step: Step) -> None:
-    assert step_of(path) == step
