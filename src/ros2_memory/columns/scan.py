@@ -31,7 +31,7 @@ from ros2_memory.columns.units import (
 from ros2_memory.columns.writing import DELAY, PUBLISH_TIME
 from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
+from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.segment import in_time
 from ros2_memory.storage.base import REPEATED_NS, IntArray, Mask
@@ -61,43 +61,6 @@ _MOST_DECODED: Final = 16
 _MOST_BYTES: Final = 64 << 20
 """Columns that are held at once; those of a bag with more are not, and it is read."""
 _TOO_LARGE: Final = "its messages are too large to hold their columns"
-
-
-@dataclass(frozen=True, slots=True)
-class ScanRequest:
-    """What a scan is of.
-
-    Attributes:
-        topic: its name.
-        window: of log time.
-        timeline: the bags.
-        decode: decodes a topic of a bag that is not stored.
-        shared: the half-open spans in which different recordings may hold copies, in order.
-        repeats_latched: whether recordings may have received a message again, as a latched one.
-        may_match: says by zones which parts may have rows that are wanted, of each or of all;
-            the others are left out.
-        may_not_match: whether the others are yielded, too, as such.
-        may_be_empty: whether rows are yielded also where none of them counts. Which do is then
-            found out only where that is asked.
-        within: half-open spans, in order and apart; tables that overlap none of them are left out.
-            None: none is.
-        stored: whether bags that are not stored are left out.
-        check: is called before each table with a log time that what is left does not lie behind
-            (with `newest_first`: is not later than); raises where the call's time is over.
-    """
-
-    topic: str
-    window: TimeWindow
-    timeline: Timeline
-    decode: Decode
-    shared: Sequence[Span] = ()
-    repeats_latched: bool = False
-    may_match: Callable[[PartZones], bool | Mask] | None = None
-    may_not_match: bool = False
-    may_be_empty: bool = False
-    within: Sequence[Span] | None = None
-    stored: bool = False
-    check: Callable[[Ns], None] = lambda _: None
 
 
 class _Source(NamedTuple):
@@ -133,48 +96,67 @@ class Stretch(NamedTuple):
         return None if self.parts is None else FragmentKey(self.window.start, settings, self.parts)
 
 
+@dataclass(eq=False)
 class Scan:
     """One scan of a topic: its sources, and which rows of them are copies.
 
-    Args:
+    Attributes:
         scanner: has what is stored.
-        request: what it is of.
+        topic: its name.
+        window: of log time.
+        timeline: the bags.
+        decode: decodes a topic of a bag that is not stored.
+        shared: the half-open spans in which different recordings may hold copies, in order; once
+            it is made, those of them in which two sources may have the same messages.
+        repeats_latched: whether recordings may have received a message again, as a latched one.
+        may_match: says by zones which parts may have rows that are wanted, of each or of all;
+            the others are left out.
+        may_not_match: whether the others are yielded, too, as such.
+        may_be_empty: whether rows are yielded also where none of them counts. Which do is then
+            found out only where that is asked.
+        within: half-open spans, in order and apart; tables that overlap none of them are left out.
+            None: none is.
+        stored: whether bags that are not stored are left out.
+        check: is called before each table with a log time that what is left does not lie behind
+            (with `newest_first`: is not later than); raises where the call's time is over.
     """
 
-    def __init__(self, scanner: Scanner, request: ScanRequest) -> None:
-        self._scanner = scanner
-        self._request = request
+    scanner: Scanner
+    topic: str
+    window: TimeWindow
+    timeline: Timeline
+    decode: Decode
+    shared: Sequence[Span] = ()
+    repeats_latched: bool = False
+    may_match: Callable[[PartZones], bool | Mask] | None = None
+    may_not_match: bool = False
+    may_be_empty: bool = False
+    within: Sequence[Span] | None = None
+    stored: bool = False
+    check: Callable[[Ns], None] = lambda _: None
+
+    def __post_init__(self) -> None:
         self._coverage: Coverage | None = None
-        since = bisect_right(request.shared, request.window.start, key=itemgetter(1))
-        until = bisect_left(request.shared, request.window.stop, since, key=itemgetter(0))
-        self._shared = [*request.shared[since:until]]
+        since = bisect_right(self.shared, self.window.start, key=itemgetter(1))
+        until = bisect_left(self.shared, self.window.stop, since, key=itemgetter(0))
+        self.shared = self.shared[since:until]
         self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
         self._latched_again: dict[object, IntArray] = {}
         self._latched_again_since = MAX_NS
-        reach = request.window
-        if request.repeats_latched:
+        reach = self.window
+        if self.repeats_latched:
             reach = TimeWindow.everything()
-        elif self._shared:
+        elif self.shared:
             reach = reach.widened(2 * COPY_HORIZON_NS)
         self._sources = self._ordered(self._settled(reach))
         self._firsts = np.array([source.first for source in self._sources], np.int64)
         self._lasts = np.array([source.last for source in self._sources], np.int64)
         self._latest = np.maximum.accumulate(self._lasts)
-        if self._shared:
-            self._shared = self._holding_copies()
-        self._ends = [stop for _, stop in self._shared]
-
-    @property
-    def shared(self) -> Spans:
-        """The half-open spans in which two sources may have the same messages, in order."""
-        return self._shared
-
-    @property
-    def window(self) -> TimeWindow:
-        """The window that it is of."""
-        return self._request.window
+        if self.shared:
+            self.shared = self._holding_copies()
+        self._ends = [stop for _, stop in self.shared]
 
     def rows(
         self, *, newest_first: bool = False, among: TimeWindow | None = None
@@ -190,7 +172,7 @@ class Scan:
         sources, ruled_out = self._asked_sources(newest_first=newest_first, among=among)
         waiting: list[Rows] = []
         for nth, source in enumerate(sources):
-            self._request.check(source.last if newest_first else source.first)
+            self.check(source.last if newest_first else source.first)
             waiting += [
                 Rows(unit, partial(self._counting, unit), source.number not in ruled_out)
                 for unit in self._units(source)
@@ -200,28 +182,27 @@ class Scan:
             after = sources[nth + 1] if nth + 1 < len(sources) else None
             while waiting and _is_next(waiting[0], after, newest_first=newest_first):
                 rows = waiting.pop(0)
-                if self._request.may_be_empty or len(rows):
+                if self.may_be_empty or len(rows):
                     yield rows
 
     def _asked_sources(
         self, *, newest_first: bool, among: TimeWindow | None
     ) -> tuple[Sequence[_Source], set[int]]:
         """Returns the sources that are asked for, in their order; and the parts without a match."""
-        request = self._request
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
-        sources = [s for s in sources if request.window.overlaps(s.first, s.last)]
+        sources = [s for s in sources if self.window.overlaps(s.first, s.last)]
         ruled_out: set[int] = set()
-        if request.may_match is not None:
+        if self.may_match is not None:
             heads = _heads(sources)
-            wanted = self._scanner.matching(heads, request.may_match)
+            wanted = self.scanner.matching(heads, self.may_match)
             ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
-        if not request.may_not_match:
+        if not self.may_not_match:
             sources = [source for source in sources if source.number not in ruled_out]
-        if request.within is not None:
-            sources = [s for s in sources if overlaps_any(request.within, s.first, s.last)]
+        if self.within is not None:
+            sources = [s for s in sources if overlaps_any(self.within, s.first, s.last)]
         return sources, ruled_out
 
     def stretches(self, beside: Ns = 0) -> list[Stretch]:
@@ -231,7 +212,7 @@ class Scan:
         and after, and what lies between them.
         """
         stretches: list[Stretch] = []
-        until = self._request.window.stop
+        until = self.window.stop
 
         def between(start: Ns) -> Iterator[Stretch]:
             if start < until:
@@ -241,7 +222,7 @@ class Scan:
         for stretch in self._settled_stretches(beside) if self._sources else ():
             stretches += [*between(stretch.window.stop), stretch]
             until = stretch.window.start
-        return [*stretches, *between(self._request.window.start)]
+        return [*stretches, *between(self.window.start)]
 
     def whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
         """Returns the whole parts that all rows in a window are of; None where others are, too.
@@ -249,11 +230,7 @@ class Scan:
         With them those that latched messages in the window may have been received in before.
         """
         parts = self._parts_reaching_into(window)
-        late = [
-            part
-            for part in parts or ()
-            if self._request.repeats_latched and self._may_be_late(part)
-        ]
+        late = [part for part in parts or () if self.repeats_latched and self._may_be_late(part)]
         if not late:
             return parts
         published = min(self._published[part][0] for part in late)
@@ -305,8 +282,8 @@ class Scan:
 
     def _settled_stretches(self, beside: Ns) -> list[Stretch]:
         """Returns the stretches of which all rows are of whole parts; see `stretches`."""
-        window, firsts, latest = self._request.window, self._firsts, self._latest
-        newest = self._request.timeline.latest
+        window, firsts, latest = self.window, self._firsts, self._latest
+        newest = self.timeline.latest
         starts = np.unique(firsts // STRETCH_NS)[::-1] * STRETCH_NS
         stops = starts + STRETCH_NS
         begin, end = np.searchsorted(firsts, starts), np.searchsorted(firsts, stops)
@@ -321,7 +298,7 @@ class Scan:
             around = TimeWindow(start - beside, last + beside + 1)
             # Which rows are copies follows from those beside them, too.
             copied = around.widened(2 * COPY_HORIZON_NS)
-            has_copies = overlaps_any(self._shared, copied.start, copied.stop)
+            has_copies = overlaps_any(self.shared, copied.start, copied.stop)
             parts = self.whole_parts(copied if has_copies else around)
             if parts is not None:
                 stretches.append(Stretch(TimeWindow(start, stop), last, parts))
@@ -333,16 +310,15 @@ class Scan:
         Raises:
             QueryTimeoutError: as for `rows`.
         """
-        spans = [TimeWindow(*span) for span in self._shared]
+        spans = [TimeWindow(*span) for span in self.shared]
         shared = {id(source) for span in spans for source in self._sources_in(span)}
         asked = [
             source
             for source in self._sources
-            if id(source) in shared
-            or (self._request.repeats_latched and self._may_be_late(source.number))
+            if id(source) in shared or (self.repeats_latched and self._may_be_late(source.number))
         ]
         for source in asked:
-            self._request.check(source.first)
+            self.check(source.first)
             for unit in self._units(source):
                 repeated = self._repeated(unit)
                 if repeated.size:
@@ -350,12 +326,12 @@ class Scan:
 
     def _settled(self, reach: TimeWindow) -> list[_Source]:
         """Returns the sources that may have rows in a window, as the store is at one moment."""
-        store = self._scanner.store
+        store = self.scanner.store
         for _ in range(_ATTEMPTS):
             if store is None:
                 break
             failures = store.failures
-            self._coverage = self._scanner.coverage(self._request.timeline)
+            self._coverage = self.scanner.coverage(self.timeline)
             sources = [*self._sources_of(reach)]
             # Meanwhile another process may have replaced parts, or the file may have failed: rows
             # would be missing.
@@ -370,19 +346,19 @@ class Scan:
 
     def _sources_of(self, reach: TimeWindow) -> Iterator[_Source]:
         """Yields the sources that may have rows in a window."""
-        topic, timeline, coverage = self._request.topic, self._request.timeline, self._coverage
-        if coverage is None or self._scanner.store is None:
-            extents = timeline.extents(topic, reach)
+        coverage = self._coverage
+        if coverage is None or self.scanner.store is None:
+            extents = self.timeline.extents(self.topic, reach)
         else:
-            for head in self._scanner.parts(topic, reach, coverage):
+            for head in self.scanner.parts(self.topic, reach, coverage):
                 yield _Source(head.first, head.last, head)
-            if self._request.stored:
+            if self.stored:
                 # Of bags nothing is read: those near the window tell what does not settle in it.
-                reach = reach.intersect(self._request.window.widened(2 * STRETCH_NS))
-            extents = coverage.missing_extents(topic, reach)
+                reach = reach.intersect(self.window.widened(2 * STRETCH_NS))
+            extents = coverage.missing_extents(self.topic, reach)
         of_bags: dict[str, _Source] = {}
         for bag, *span in extents:
-            first, last = bag.summary.span_of([topic]) if bag.file in of_bags else span
+            first, last = bag.summary.span_of([self.topic]) if bag.file in of_bags else span
             of_bags[bag.file] = _Source(first, last, None, bag)
         yield from of_bags.values()
 
@@ -406,10 +382,10 @@ class Scan:
 
     def _units(self, source: _Source) -> Iterable[Unit]:
         """Returns what a source has."""
-        if source.part is None and self._request.stored:
+        if source.part is None and self.stored:
             return ()
         if source.part is not None and self._coverage is not None:
-            unit = self._scanner.part(source.part, self._coverage)
+            unit = self.scanner.part(source.part, self._coverage)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         return self._units_of_bag(source.bag)
@@ -417,8 +393,8 @@ class Scan:
     def _units_of_bag(self, bag: BagFile) -> list[BagUnit]:
         """Returns the tables of a bag, which is decoded unless it was one of the last."""
         if bag.file not in self._decoded:
-            hashed = bool(self._shared) or self._request.repeats_latched
-            tables = self._request.decode(bag, self._request.topic, hashed)
+            hashed = bool(self.shared) or self.repeats_latched
+            tables = self.decode(bag, self.topic, hashed)
             held = _without_columns_if_large(tables)
             units = [BagUnit(bag, table, nth) for nth, table in enumerate(held) if len(table)]
             self._decoded[bag.file] = units
@@ -433,7 +409,7 @@ class Scan:
 
     def _counting(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None: all do."""
-        window = self._request.window
+        window = self.window
         is_covered = window.covers(unit.first, unit.last)
         is_counted = unit.counting() if is_covered else _in_window(unit, window)
         repeated = self._repeated(unit)
@@ -446,7 +422,7 @@ class Scan:
 
     def _holding_copies(self) -> list[Span]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
-        starts, stops = np.array(self._shared, np.int64).T
+        starts, stops = np.array(self.shared, np.int64).T
         begins, ends = np.searchsorted(self._latest, starts), np.searchsorted(self._firsts, stops)
         counts = np.maximum(ends - begins, 0)
         source, span = in_ranges(begins, counts), np.repeat(np.arange(counts.size), counts)
@@ -456,11 +432,11 @@ class Scan:
         order = order[(self._lasts[source] >= starts[span])[order]]
         before, after = order[:-1], order[1:]
         may_repeat = (span[before] == span[after]) & (latest[before] >= earliest[after])
-        return [self._shared[nth] for nth in np.unique(span[before][may_repeat]).tolist()]
+        return [self.shared[nth] for nth in np.unique(span[before][may_repeat]).tolist()]
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
-        for start, stop in self._shared[bisect_right(self._ends, unit.first) :]:
+        for start, stop in self.shared[bisect_right(self._ends, unit.first) :]:
             if start > unit.last:
                 break
             first = start + max(unit.first - start, 0) // _SLICE_NS * _SLICE_NS
@@ -470,7 +446,7 @@ class Scan:
                     end = min(begin + _SLICE_NS, stop)
                     self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
         copies = self._copies.get(unit.key, [])
-        if self._request.repeats_latched:
+        if self.repeats_latched:
             copies = [*copies, self._received_again(unit)]
         return np.concatenate(copies) if copies else np.empty(0, np.int64)
 
@@ -530,7 +506,7 @@ class Scan:
         return self._bounds(PUBLISH_TIME)
 
     def _bounds(self, path: str) -> dict[int | None, tuple[float, float]]:
-        bounds = self._scanner.bounds(_heads(self._sources), path)
+        bounds = self.scanner.bounds(_heads(self._sources), path)
         return {number: span for number, span in bounds.items()}  # noqa: C416 - also of None
 
     def _may_be_late(self, part: int | None) -> bool:
@@ -572,7 +548,7 @@ class Scan:
         published, hashes, numbers = published.copy(), hashes.copy(), unit.bag_numbers()
         for number in np.unique(numbers[unknown]).tolist():
             rows = np.flatnonzero(numbers == number)
-            for table in self._request.decode(unit.bag_of(number), self._request.topic, True):
+            for table in self.decode(unit.bag_of(number), self.topic, True):
                 if table.payload_hashes is None or table.channel.type != unit.table.channel.type:
                     continue
                 # A part has ten minutes of a long bag.

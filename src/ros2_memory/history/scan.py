@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypedDict, TypeVar, Unpack
 import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, Sized, joining
-from ros2_memory.columns.scan import Scan, ScanRequest, Stretch
+from ros2_memory.columns.scan import Scan, Stretch
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import QueryTimeoutError
@@ -56,7 +56,7 @@ def scan(
 
 
 class Wanted(TypedDict, total=False):
-    """What of a topic a scan is of; each is as in `ScanRequest`."""
+    """What of a topic a scan is of; each is as in `Scan`."""
 
     shared: Sequence[Span]
     may_match: Callable[[PartZones], bool | Mask]
@@ -101,10 +101,16 @@ def open_scan(
 
     wanted.setdefault("shared", () if copies else view.timeline.shared_times)
     repeats_latched = not copies and view.stream.may_be_repeated([topic])
-    asked = ScanRequest(
-        topic, window, view.timeline, decode, repeats_latched=repeats_latched, check=check, **wanted
+    return Scan(
+        view.memory.scanner,
+        topic,
+        window,
+        view.timeline,
+        decode,
+        repeats_latched=repeats_latched,
+        check=check,
+        **wanted,
     )
-    return Scan(view.memory.scanner, asked)
 
 
 def joined_back(
