@@ -36,7 +36,7 @@ _NAMED: Final = (
     ((_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)),
 )
 """Which columns of which tables are topics, and labels."""
-_TIMES: Final = {
+_TIMES: Final[dict[int, list[int]]] = {
     _SPOTS: [Spot.FIRST, Spot.LAST],
     _LOOKS: [Look.FIRST, Look.LAST],
     _UNPLACED: [Unplaced.FIRST, Unplaced.LAST],
@@ -220,8 +220,8 @@ def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], Ints]:
             of_table.append(np.cumsum(steps.reshape(columns, count), axis=1, dtype=np.int64))
         for at, times in _TIMES.items():
             tables[at][-1][times] *= NS_PER_US
-        for places, numbers_of, own in zip(_NAMED, names, own_names, strict=True):
-            codes = np.array([numbers_of.setdefault(name, len(numbers_of)) for name in own], int)
+        for kind, (places, numbers_of) in enumerate(zip(_NAMED, names, strict=True)):
+            own = [numbers_of.setdefault(name, len(numbers_of)) for name in own_names[kind]]
             for at, column in places:
-                tables[at][-1][column] = codes[tables[at][-1][column]]
+                tables[at][-1][column] = np.array(own, np.int64)[tables[at][-1][column]]
     return [np.concatenate(of_table, axis=1) for of_table in tables], np.concatenate(rows)
