@@ -11,7 +11,7 @@ import re
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -74,7 +74,7 @@ _MOST_TYPES: Final = 3
 """Types of which the constants are looked at: each costs the channels of a file."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
-_TOGETHER_NS: Final[Ns] = NS_PER_S
+_TOGETHER_NS: Final = NS_PER_S
 """Messages that may match and are no farther apart are read at once."""
 _MOST_TOGETHER: Final = 256
 _NO_TIMES: Final = np.empty(0, np.int64)
@@ -366,14 +366,6 @@ class RowCondition:
         return TruthValues(surely, perhaps)
 
 
-class _TableCandidates(NamedTuple):
-    """A table's last log time (ns), its topic, and when messages of it may match, ascending."""
-
-    last: Ns
-    topic: str
-    times: IntArray
-
-
 class CandidateRows:
     """Finds the times of messages of a window that may meet a condition.
 
@@ -388,9 +380,8 @@ class CandidateRows:
         self.ruled_out = False
         self.has_looked = False
         newest = view.timeline.latest
+        # Of each topic, from when on all is looked at.
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(window.stop, newest + 1))
-        # Of each table that is open: its newest time that is left, negative, and the older ones.
-        self._ready: list[tuple[Ns, str, int, Iterator[Ns]]] = []
         self._group: list[tuple[Ns, str]] = []
         self._view = view
         self._window = window
@@ -402,7 +393,8 @@ class CandidateRows:
         They do not overlap.
         """
         most = 1
-        for time, topic in chain(self._times(), [(MIN_NS - 1, "")]):
+        times = heapq.merge(*map(self._times_of, self._left), reverse=True)
+        for time, topic in chain(times, [(MIN_NS - 1, "")]):
             group = self._group
             if group and (group[-1][0] - time > _TOGETHER_NS or len(group) >= most):
                 (latest, _), (earliest, _) = group[0], group[-1]
@@ -419,34 +411,22 @@ class CandidateRows:
     @property
     def reached(self) -> Ns:
         """The log time from which on all has been looked at, and what may match was searched."""
-        waiting = [-time + 1 for time, *_ in self._ready] + [time + 1 for time, _ in self._group]
-        return max([*self._left.values(), *waiting], default=MIN_NS)
+        return max(
+            [*self._left.values(), *(time + 1 for time, _ in self._group[:1])], default=MIN_NS
+        )
 
-    def _times(self) -> Iterator[tuple[Ns, str]]:
-        """Yields the log times of messages that may match, newest first, each once."""
-        ready, newer = self._ready, (MAX_NS, "")
-        tables = heapq.merge(*map(self._tables_of, self._left), key=lambda table: -table.last)
-        for number, table in enumerate(
-            chain(tables, [_TableCandidates(MIN_NS - 1, "", _NO_TIMES)])
-        ):
-            # What is left is no newer than the next table.
-            while ready and -ready[0][0] > table.last:
-                negative, topic, nth, older = ready[0]
-                if (negative, topic) != newer:
-                    yield -negative, topic
-                newer = negative, topic
-                heapq.heappop(ready)
-                for time in islice(older, 1):
-                    heapq.heappush(ready, (-time, topic, nth, older))
-            times = map(int, table.times[::-1])
-            for time in islice(times, 1):
-                heapq.heappush(ready, (-time, table.topic, number, times))
-
-    def _tables_of(self, topic: str) -> Iterator[_TableCandidates]:
-        """Yields when messages of a topic may match, table by table, the newest first."""
+    def _times_of(self, topic: str) -> Iterator[tuple[Ns, str]]:
+        """Yields the log times of messages of a topic that may match, newest first, each once."""
+        waiting = _NO_TIMES  # ascending; no table that is left is newer than what was yielded
 
         def reached(last: Ns) -> None:
-            self._left[topic] = min(last + 1, self._window.stop)
+            newest = max([last, *waiting[-1:].tolist()])
+            self._left[topic] = min(newest + 1, self._window.stop)
+
+        def newest_after(last: Ns) -> Iterator[tuple[Ns, str]]:
+            for time in map(int, waiting[np.searchsorted(waiting, last, "right") :][::-1]):
+                self._left[topic] = time + 1
+                yield time, topic
 
         for rows in scan(
             self._view,
@@ -457,9 +437,11 @@ class CandidateRows:
             may_be_empty=True,
             reached=reached,
         ):
-            times = self._candidates(rows)
+            yield from newest_after(rows.last)
+            waiting = waiting[: np.searchsorted(waiting, rows.last, "right")]
+            waiting = np.union1d(waiting, self._candidates(rows))
             reached(rows.last)
-            yield _TableCandidates(rows.last, topic, times)
+        yield from newest_after(MIN_NS)
         self._left[topic] = MIN_NS
 
     def _may_match(self, parts: PartZones) -> bool | Mask:
@@ -478,7 +460,7 @@ class CandidateRows:
         if rows.index is not None:
             may = may[rows.index]
         self.ruled_out |= not may.all()
-        return np.sort(rows.times[may])
+        return rows.times[may]
 
 
 def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
