@@ -13,6 +13,7 @@ a thing was missed before or after it was last seen.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import combinations, groupby
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 Floats: TypeAlias = NDArray[np.float64]
+_Sums: TypeAlias = tuple[int, int, int]
+"""Of a spot: the number of its detections, and the sums of x and of y (mm)."""
 
 CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100
@@ -291,52 +294,32 @@ def _clusters(group: Ints, message: Ints, x: Ints, y: Ints) -> Ints:
     return spots
 
 
-class _GrowingSpot:
-    """A spot while it grows; `x` and `y` are its mean (mm)."""
-
-    __slots__ = ("n", "sum_x", "sum_y", "x", "y")
-
-    def __init__(self) -> None:
-        self.n = self.sum_x = self.sum_y = 0
-        self.x = self.y = 0.0
-
-    def add(self, n: int, sum_x: int, sum_y: int) -> None:
-        """Adds so many detections."""
-        self.n, self.sum_x, self.sum_y = self.n + n, self.sum_x + sum_x, self.sum_y + sum_y
-        self.x, self.y = self.sum_x / self.n, self.sum_y / self.n
-
-    def squared_to(self, x: float, y: float) -> float:
-        """Returns the squared distance of a place."""
-        dx, dy = self.x - x, self.y - y
-        return dx * dx + dy * dy
-
-
 def _cluster_label(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[int]:
     """Returns the spot of each detection of one label, which are ordered by message."""
-    spots: list[_GrowingSpot] = []
-    together: dict[tuple[int, int], int] = {}
+    spots: list[_Sums] = []
+    together: Counter[tuple[int, int]] = Counter()
     assigned: list[int] = []
     for _, in_message in groupby(range(len(messages)), key=messages.__getitem__):
         chosen = _assign(spots, [places[nth] for nth in in_message])
         assigned += chosen
-        for pair in combinations(sorted(spot for spot in chosen if spot >= 0), 2):
-            together[pair] = together.get(pair, 0) + 1
-    into = _merge_spots(spots, together)
-    return [spot if spot < 0 else into[spot] for spot in assigned]
+        together.update(combinations(sorted(spot for spot in chosen if spot >= 0), 2))
+    # What has no spot, at -1, stays so.
+    into = [*_merge_spots(spots, together), -1]
+    return [into[spot] for spot in assigned]
 
 
-def _assign(spots: list[_GrowingSpot], places: Sequence[tuple[int, int]]) -> list[int]:
+def _assign(spots: list[_Sums], places: Sequence[tuple[int, int]]) -> list[int]:
     """Adds the detections of a message to spots, and returns these; -1 where there are too many."""
     if len(spots) * len(places) < _MANY_PAIRS:
         pairs = [
             (squared, nth, which)
-            for nth, place in enumerate(places)
-            for which, spot in enumerate(spots)
-            if (squared := spot.squared_to(*place)) <= _GATE_SQUARED
+            for nth, (x, y) in enumerate(places)
+            for which, (n, sum_x, sum_y) in enumerate(spots)
+            if (squared := (sum_x / n - x) ** 2 + (sum_y / n - y) ** 2) <= _GATE_SQUARED
         ]
     else:
-        middles = np.array([(spot.x, spot.y) for spot in spots])
-        away = ((middles - np.array(places)[:, None]) ** 2).sum(axis=2)
+        sums = np.array(spots)
+        away = ((sums[:, 1:] / sums[:, :1] - np.array(places)[:, None]) ** 2).sum(axis=2)
         near = np.nonzero(away <= _GATE_SQUARED)
         pairs = [*zip(away[near].tolist(), *(column.tolist() for column in near), strict=True)]
     taken: dict[int, int] = {}
@@ -350,25 +333,28 @@ def _assign(spots: list[_GrowingSpot], places: Sequence[tuple[int, int]]) -> lis
         which = taken.get(nth, -1)
         if which < 0 and len(spots) < MAX_SPOTS:
             which = len(spots)
-            spots.append(_GrowingSpot())
+            spots.append((0, 0, 0))
         if which >= 0:
-            spots[which].add(1, *place)
+            spots[which] = _added(spots[which], (1, *place))
         chosen.append(which)
     return chosen
 
 
-def _merge_spots(
-    spots: Sequence[_GrowingSpot], together: Mapping[tuple[int, int], int]
-) -> list[int]:
+def _added(one: _Sums, other: _Sums) -> _Sums:
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+
+
+def _merge_spots(spots: list[_Sums], together: Mapping[tuple[int, int], int]) -> list[int]:
     """Returns into which spot each goes: those that lie together, and no messages have both of."""
     into = [*range(len(spots))]
     for first, other in combinations(range(len(spots)), 2):
         if into[first] != first or into[other] != other:
             continue
-        a, b = spots[first], spots[other]
+        (n, x, y), (more, to_x, to_y) = spots[first], spots[other]
+        squared = (x / n - to_x / more) ** 2 + (y / n - to_y / more) ** 2
         both = together.get((first, other), 0)
-        if both <= _TOGETHER_SHARE * min(a.n, b.n) and a.squared_to(b.x, b.y) < _SAME_SQUARED:
-            a.add(b.n, b.sum_x, b.sum_y)
+        if both <= _TOGETHER_SHARE * min(n, more) and squared < _SAME_SQUARED:
+            spots[first] = _added(spots[first], spots[other])
             into[other] = first
     return into
 
