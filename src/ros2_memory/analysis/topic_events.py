@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES
+from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES, Stated
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, visible_in
 from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
@@ -20,7 +21,6 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from ros2_memory.analysis.facts import Stated
 
 MAX_PER_BAG: Final = 64
 """Intervals, changes and errors of one topic in one bag that a lake holds; the rest is counted."""
@@ -186,16 +186,30 @@ def _states_and_changes(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[C
     is_new = (np.diff(names[order], prepend=-1) != 0) | (np.diff(values[order], prepend=0) != 0)
     news = np.sort(order[is_new])
     columns = facts.codes[news], stated.times[facts.rows[news]], values[news]
+    rows = zip(*(column.tolist() for column in columns), strict=True)
     states: dict[tuple[str, str], KnownState] = {}
-    changes: list[Change] = []
-    for code, at, value in zip(*(column.tolist() for column in columns), strict=True):
-        kind, name, text = facts.words[code]
-        if (kind, name) in states:
-            changes.append(Change(kind, name, at, value, text))
-            states[kind, name] = states[kind, name]._replace(last=value)
-        else:
-            states[kind, name] = KnownState(kind, name, at, value, value, text)
+    words = facts.words
+    changes = _changed(
+        states,
+        (
+            KnownState(words[code].kind, words[code].name, at, value, value, words[code].text)
+            for code, at, value in rows
+        ),
+    )
     return tuple(states.values()), tuple(changes)
+
+
+def _changed(
+    states: dict[tuple[str, str], KnownState], following: Iterable[KnownState]
+) -> list[Change]:
+    """Returns the changes from states to what follows them, which `states` then have, too."""
+    changes: list[Change] = []
+    for held in following:
+        before = states.get(held[:2])
+        states[held[:2]] = held if before is None else before._replace(last=held.last)
+        if before is not None and before.last != held.first:
+            changes.append(Change(held.kind, held.name, held.at, held.first, held.text))
+    return changes
 
 
 def _joined_states(
@@ -209,15 +223,9 @@ def _joined_states(
     changes: list[Change] = []
     left_out = 0
     for part in parts:
-        between: list[Change] = []
-        for held in part.known:
-            before = states.get(held[:2])
-            if before is None and len(states) >= MAX_HELD:
-                left_out += 1
-                continue
-            states[held[:2]] = held if before is None else before._replace(last=held.last)
-            if before is not None and before.last != held.first:
-                between.append(Change(held.kind, held.name, held.at, held.first, held.text))
+        between = _changed(states, part.known)
+        left_out += max(len(states) - MAX_HELD, 0)
+        states = dict(islice(states.items(), MAX_HELD))
         changes += sorted([*between, *part.changes], key=lambda change: change.time)
     return tuple(states.values()), tuple(changes), left_out
 
