@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, overload
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from ros2_memory.columns.detections import (
 )
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts, joined_texts
-from ros2_memory.core.arrays import begins_of, in_ranges, merged_times
+from ros2_memory.core.arrays import begins_of, merged_times
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.scan import messages_of, of_columns
 from ros2_memory.messages.conversions import nanoseconds
 from ros2_memory.messages.detections import Detection, detections_of
@@ -28,12 +28,11 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray, Mask
 
-_LONGEST_LATENCY_NS: Final[Ns] = 10 * NS_PER_S
+_LONGEST_LATENCY_NS: Final = 10 * NS_PER_S
 """So long a large model may look at an image before it says what is in it."""
 
 
@@ -58,7 +57,10 @@ class Detected(NamedTuple):
 
         Those of their stamps where these agree with the log times, else those.
         """
-        return np.where(_agree(self.log_times, self.stamps), self.stamps, self.log_times)
+        latency = self.log_times - self.stamps
+        # A stamp of another clock cannot be compared with those of transforms.
+        agrees = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
+        return np.where(agrees, self.stamps, self.log_times)
 
     def new_since(self, time: Ns) -> Detected:
         """Returns the messages from a log time (ns) on that do not repeat the one before.
@@ -68,22 +70,22 @@ class Detected(NamedTuple):
         """
         rows, labels, scores, places, frames = self.found
         columns = np.column_stack((labels.codes, frames.codes, scores, places))
-        order = np.lexsort((self.stamps, self.frames.codes))
-        before, after = order[:-1], order[1:]
-        begins = begins_of(rows, len(order) + 1)
-        sizes = np.diff(begins)
-        is_alike = (self.stamps[before] == self.stamps[after]) & (self.stamps[after] != 0)
-        is_alike &= self.frames.codes[before] == self.frames.codes[after]
-        is_alike &= sizes[before] == sizes[after]
-        before, after = before[is_alike], after[is_alike]
-        was, now = (columns[in_ranges(begins[some], sizes[some])] for some in (before, after))
-        is_same = ((was == now) | (np.isnan(was) & np.isnan(now))).all(axis=1)
-        pair = np.repeat(np.arange(len(after)), sizes[after])
+        begins = begins_of(rows, len(self.log_times)).tolist()
+        said: dict[tuple[Ns, int], bytes] = {}
         is_new = self.log_times >= time
-        is_new[after[np.bincount(pair, ~is_same, len(after)) == 0]] = False
+        headers = zip(self.stamps.tolist(), self.frames.codes.tolist(), strict=True)
+        for nth, (stamp, frame) in enumerate(headers):
+            found = columns[begins[nth] : begins[nth + 1]].tobytes()
+            if stamp and said.get((stamp, frame)) == found:
+                is_new[nth] = False
+            said[stamp, frame] = found
         which = np.flatnonzero(is_new)
-        found, of_messages = self.found.at(which), self.frames.rows(which)
-        return Detected(self.log_times[which], self.stamps[which], found, of_messages)
+        return Detected(
+            self.log_times[which],
+            self.stamps[which],
+            self.found.at(which),
+            self.frames.rows(which),
+        )
 
 
 def joined_detected(parts: Sequence[Detected]) -> Detected:
@@ -168,7 +170,7 @@ def seen_at(view: View, stored: StoredMessage) -> Ns:
     stamp if the first one that had it agrees with its log time.
     """
     topic, stamp = stored.topic, _stamp(view, stored)
-    if _agree(stored.time, stamp):
+    if -AGREEMENT_NS <= stored.time - stamp <= _LONGEST_LATENCY_NS:
         return stamp
     before = view.stream.last(topic, stored.time)
     if before is not None and _stamp(view, before) == stamp:
@@ -202,16 +204,6 @@ def _stamp(view: View, stored: StoredMessage) -> Ns:
 
 def _stamp_of(message: object) -> Ns | None:
     return nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
-
-
-@overload
-def _agree(log_time: Ns, stamp: Ns) -> bool: ...
-@overload
-def _agree(log_time: IntArray, stamp: IntArray) -> Mask: ...
-def _agree(log_time: Ns | IntArray, stamp: Ns | IntArray) -> bool | Mask:
-    # A stamp of another clock cannot be compared with those of transforms.
-    latency = log_time - stamp
-    return (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
 
 
 def _rounded(detected: Detected) -> Detected:

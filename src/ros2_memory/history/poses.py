@@ -103,21 +103,6 @@ def pose_rows(
         yield reader.block(together)
 
 
-def poses_of(samples: Sequence[tuple[Ns, Pose, float | None]]) -> Poses:
-    """Returns poses with their log times, and the speed (m/s) that each message states, if any."""
-    times, poses, speeds = zip(*samples, strict=True) if samples else ((), (), ())
-    turns = [pose.orientation or (math.nan,) * 4 for pose in poses]
-    places = np.array([pose.position for pose in poses], np.float64).reshape(-1, 3)
-    frames = Texts.of([pose.frame_id for pose in poses])
-    return Poses(
-        np.array(times, np.int64),
-        rounded(places, METRES),
-        np.array(turns, np.float64).reshape(-1, 4),
-        FrameCodes(frames.codes, frames.words),
-        np.array([math.nan if speed is None else speed for speed in speeds], np.float64),
-    )
-
-
 def poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> dict[str, Poses]:
     """Returns the poses of each of some bags, by their files; of none in which a message has none.
 
@@ -207,7 +192,7 @@ class PoseReader:
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
-        return poses_of(self._decoded(rows)) if poses is None else joined_poses(poses)
+        return self._by_messages(rows) if poses is None else joined_poses(poses)
 
     def _by_columns(self, rows: Rows) -> Poses | None:
         read = partial(self._columns.of, rows.table, rows.times, rows.index)
@@ -216,9 +201,9 @@ class PoseReader:
             return rows.table.remember("poses", read, lambda poses: 1000 + 76 * len(poses or ()))
         return read()
 
-    def _decoded(self, rows: Rows) -> list[tuple[Ns, Pose, float | None]]:
+    def _by_messages(self, rows: Rows) -> Poses:
         extractor = self._view.extractor
-        samples: list[tuple[Ns, Pose, float | None]] = []
+        samples: list[tuple[Ns, Pose, float]] = []
         for stored in messages_of(self._view, rows):
             message = self._view.bags.decode(stored, self._failures)
             if message is not None:
@@ -226,7 +211,18 @@ class PoseReader:
                 twist = extractor.twist(message, stored.type)
                 if pose is None:
                     raise InvalidArgumentsError(describe_lack(self._view, "position", stored))
-                speed = None if twist is None else math.hypot(*twist.linear)
+                speed = math.nan if twist is None else math.hypot(*twist.linear)
                 samples.append((stored.time, pose, speed))
         # Those of a part come bag after bag, in the order in which bags were stored.
-        return sorted(samples, key=itemgetter(0))
+        samples.sort(key=itemgetter(0))
+        times, poses, speeds = zip(*samples, strict=True) if samples else ((), (), ())
+        turns = [pose.orientation or (math.nan,) * 4 for pose in poses]
+        places = np.array([pose.position for pose in poses], np.float64).reshape(-1, 3)
+        frames = Texts.of([pose.frame_id for pose in poses])
+        return Poses(
+            np.array(times, np.int64),
+            rounded(places, METRES),
+            np.array(turns, np.float64).reshape(-1, 4),
+            FrameCodes(frames.codes, frames.words),
+            np.array(speeds, np.float64),
+        )
