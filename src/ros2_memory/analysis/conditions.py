@@ -429,7 +429,7 @@ def positions(value: JsonValue) -> Iterator[Vector3]:
     the objects found at any depth under `position`, `point` or `translation`.
     """
     for node in points(value, lambda axis: isinstance(axis, int | float | None)):
-        yield (_coordinate(node["x"]), _coordinate(node["y"]), _coordinate(node.get("z")))
+        yield (as_float(node["x"]), as_float(node["y"]), as_float(node.get("z")))
 
 
 def points(value: T, is_axis: Callable[[T], bool]) -> Iterator[dict[str, T]]:
@@ -494,8 +494,8 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
         raise InvalidArgumentsError(
             f"'near_position' knows x, y, z and frame_id only, not {abbreviate(unknown)}; {example}"
         )
-    x, y = _coordinate(value.get("x")), _coordinate(value.get("y"))
-    z = None if value.get("z") is None else _coordinate(value["z"])
+    x, y = as_float(value.get("x")), as_float(value.get("y"))
+    z = None if value.get("z") is None else as_float(value["z"])
     for axis, coordinate in (("x", x), ("y", y), ("z", z)):
         if coordinate is not None and not math.isfinite(coordinate):
             raise InvalidArgumentsError(
@@ -564,8 +564,8 @@ def _own_points(value: T, is_axis: Callable[[T], bool]) -> Iterator[dict[str, T]
             yield node
 
 
-def _coordinate(value: JsonValue) -> float:
-    """Returns a number as metres; NaN for anything else, so that it is near nothing."""
+def as_float(value: JsonValue) -> float:
+    """Returns a number as it is; NaN for anything else, so that it is near nothing."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     try:

@@ -292,9 +292,9 @@ def messages_at(view: View, rows: Rows) -> Iterator[tuple[int, StoredMessage]]:
                 met[stored.time] += 1
 
 
-def _within(rows: Rows, window: TimeWindow) -> Rows:
-    times = rows.times
-    return rows.some(np.flatnonzero((times >= window.start) & (times < window.stop)))
+def positions_in(times: Ints, window: TimeWindow) -> Ints:
+    """Returns the positions of those times that are in a window."""
+    return np.flatnonzero((times >= window.start) & (times < window.stop))
 
 
 class Counted(NamedTuple):
@@ -357,8 +357,7 @@ def count_messages(
             # A bag has a row for each type of the topic.
             to_read.add(segment.bags[bags[row]].file)
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
-    near_those = united(sorted(spans))
-    for rows in scan(view, topic, window, columns=proves, shared=shared, within=near_those):
+    for rows in scan(view, topic, window, columns=proves, shared=shared, within=united(spans)):
         for _, positions in rows.bag_rows(to_read):
             counted.add_times(rows.times[positions], edges)
     return counted
@@ -400,7 +399,10 @@ def pick(
         for piece in np.unique(pieces).tolist():
             part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
             nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
-            tables = [_within(rows, part) for rows in _in_order([*opened.rows(among=part)])]
+            tables = [
+                rows.some(positions_in(rows.times, part))
+                for rows in _in_order([*opened.rows(among=part)])
+            ]
             begins = np.cumsum([0, *map(len, tables)])
             times = np.concatenate([np.empty(0, np.int64), *(rows.times for rows in tables)])
             order = np.argsort(times, kind="stable")

@@ -27,7 +27,7 @@ from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorde
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
-from ros2_memory.history.view import TimeRange, open_span
+from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.places.pose_frames import (
     NEWEST_POSE_NS,
     known_track,
@@ -44,14 +44,13 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.frames import Floats, Times
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import View
 
 _FARTHEST_FROM: Final = "farthest_from"
-_AROUND_NS: Final[Ns] = 10 * NS_PER_S
+_AROUND_NS: Final = 10 * NS_PER_S
 _OFF_TRACK_M: Final = 0.1
 """No pose is as far from the line of a track."""
 _MOST_TRIED: Final = 20
-_SPEED_NS: Final[Ns] = NS_PER_S
+_SPEED_NS: Final = NS_PER_S
 """Over so long a speed is measured: what is shorter is noise."""
 _FEWEST_WAYPOINTS: Final = 2
 _TURNED_RAD: Final = math.radians(10.0)
@@ -153,10 +152,10 @@ def _fastest(line: Line, start: Ns, stop: Ns, driven_m: float) -> float | None:
     ends = line.times[np.searchsorted(line.times, start + _SPEED_NS) :]
     ends = ends[: np.searchsorted(ends, stop)] - _SPEED_NS
     begin = np.concatenate(([start, end], inner, ends))
-    driven = line.metres_at(begin + _SPEED_NS) - line.metres_at(begin)
+    here, there = line.at(begin), line.at(begin + _SPEED_NS)
     # Metres are without jumps, but noise may shift some of them along the way.
-    moved = line.places_at(begin + _SPEED_NS) - line.places_at(begin)
-    return float(np.minimum(driven, np.sqrt((moved * moved).sum(axis=1))).max())
+    moved = np.linalg.norm(there.places - here.places, axis=1)
+    return float(np.minimum(there.metres - here.metres, moved).max())
 
 
 def way_inside(line: Line, spans: Sequence[Stay], at_most: int) -> tuple[Waypoint, ...]:
@@ -180,8 +179,7 @@ def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoin
     if waypoint.yaw_rad is None or np.isin(waypoint.time, line.times):
         return waypoint
     window = TimeWindow.before(waypoint.time, NEWEST_POSE_NS)
-    newest = newest_pose(view, topic, window)
-    pose = None if newest is None else newest[1]
+    _, pose = newest_pose(view, topic, window) or (None, None)
     orientation = None if pose is None else pose.orientation
     if orientation is None:
         return dataclasses.replace(waypoint, yaw_rad=None)

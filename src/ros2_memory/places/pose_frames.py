@@ -54,13 +54,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
+    from ros2_memory.history.sessions import Session
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Mask
 
 WHEREABOUTS: Final = "where the robot was"
 """What is not known without poses, for sentences."""
-NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
+NEWEST_POSE_NS: Final = SILENCE_NS
 """The robot may have moved since an older pose."""
 
 
@@ -302,17 +303,18 @@ def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
         for recording, span in view.timeline.recordings(topic).items()
         if any(window.overlaps(*span) for window in asked)
     )
-    joined = {sessions.of(spans[0][2])} if spans else set()
-    reach = spans[0][1] if spans else MIN_NS
+    joined: set[Session] = set()
+    reach = MIN_NS
     for first, last, recording in spans:
-        if (session := sessions.of(recording)) not in joined:
+        session = sessions.of(recording)
+        if joined and session not in joined:
             both = TimeWindow(first, max(min(reach, last) + 1, first))
             bags = view.stream.overlapping_bags([topic], both)
             # One that a wrong clock dated spans years, without bags.
             has_overlap = len({span.bag.recording for span in bags}) > 1
             if not has_overlap or recordings_apart(view, [topic], both) != frozenset():
                 return False
-            joined.add(session)
+        joined.add(session)
         reach = max(reach, last)
     return True
 

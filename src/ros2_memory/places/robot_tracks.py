@@ -56,7 +56,14 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.robots import recordings_apart
-from ros2_memory.history.scan import in_time, joined_back, open_scan, remembered, scan
+from ros2_memory.history.scan import (
+    in_time,
+    joined_back,
+    open_scan,
+    positions_in,
+    remembered,
+    scan,
+)
 from ros2_memory.history.transforms import (
     edges_of_rows,
     frames_over,
@@ -254,8 +261,8 @@ class TrackReader:
                 continue
             stored = None if key is None else self._view.memory.scanner.fragments(TRACKS).get(key)
             if stored is not None and not stored.left_out:
-                yield rows.first, stored.some(_positions_in(stored.times, window))
-            elif (inside := _positions_in(rows.times, window)).size:
+                yield rows.first, stored.some(positions_in(stored.times, window))
+            elif (inside := positions_in(rows.times, window)).size:
                 lent_spans = self._lent_spans(rows, window)
                 yield rows.first, self._track_by(rows.some(inside), None, lent_spans)
 
@@ -489,11 +496,6 @@ def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed
     return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
 
 
-def _positions_in(times: Times, window: TimeWindow) -> Times:
-    """Returns the positions of those times that are in a window."""
-    return np.flatnonzero((times >= window.start) & (times < window.stop))
-
-
 def _tracks_by_robot(
     tracks: Sequence[PartialTrack], apart: Collection[str] | None
 ) -> tuple[PartialTrack, Times, Mask]:
@@ -557,38 +559,21 @@ def stays(track: RobotTrack, region: Region) -> list[Stay]:
     longer than `SILENCE_NS` is not known: it ends the time, and begins another.
     """
     count = len(track.times)
-    if not count:
-        return []
     # A piece of a single vertex is a step of no length.
     after = np.arange(count) + ~track.ends
     steps = Steps(track.x, track.y, track.x[after], track.y[after])
-    parts = clipped(region, steps)
-    lasted = track.times[after] - track.times
-    jumped = jumps(track)
-    if jumped[parts.step].any():
-        parts = _without_jumps(parts, jumped)
-    if not len(parts.step):
+    parts = _without_jumps(clipped(region, steps), jumps(track)) if count else None
+    if parts is None or not len(parts.step):
         return []
-    lasted = lasted[parts.step]
     begin = track.times[parts.step]
+    lasted = track.times[after[parts.step]] - begin
     starts = begin + np.rint(lasted * parts.start).astype(np.int64)
     stops = begin + np.rint(lasted * parts.stop).astype(np.int64)
-    piece = np.cumsum(track.begins)[parts.step]
+    piece = np.cumsum(track.begins)[parts.step] - 1
+    # Where the piece began, or ended, inside, it is not known.
+    opened, closed = (ends[piece] for ends in track.pieces)
     apart = (starts[1:] - stops[:-1] >= FLICKER_NS) | (piece[1:] != piece[:-1])
     first = np.append([True], apart)
     last = np.append(apart, [True])
-    # Whether the piece began, or ended, inside.
-    opens = np.flatnonzero(track.begins)
-    closes = np.append(opens[1:], [count]) - 1
-    piece_starts, piece_stops = track.times[opens], track.times[closes]
-    rows = zip(
-        starts[first].tolist(),
-        stops[last].tolist(),
-        piece_starts[piece[first] - 1].tolist(),
-        piece_stops[piece[last] - 1].tolist(),
-        strict=True,
-    )
-    return [
-        Stay(start, stop, entered=start > opened, left=stop < closed)
-        for start, stop, opened, closed in rows
-    ]
+    columns = starts[first], stops[last], (starts > opened)[first], (stops < closed)[last]
+    return [*map(Stay, *(column.tolist() for column in columns))]

@@ -11,20 +11,17 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
-from ros2_memory.core.arrays import Groups, distinct_rows
-from ros2_memory.core.regions import Steps
-from ros2_memory.core.timebase import Span, unix_from_ns
+from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, jumps
+from ros2_memory.core.arrays import Flags, Groups, Ints, distinct_rows
+from ros2_memory.core.regions import Region, Steps
+from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.results import FarFromOther, Pair, StandstillPlace
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from ros2_memory.analysis.frames import Floats, Times
-    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.regions import Region
-    from ros2_memory.core.timebase import Ns
 
 SAME_STAND_M: Final = 0.5
 """Standstills so near to each other are at one place."""
@@ -73,21 +70,15 @@ def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
 
     Nobody was between the ends of a jump, nor at a vertex that was jumped to and from.
     """
-    jumped = jumps(track)
-    ends = track.ends | jumped
-    after = np.arange(len(ends)) + ~ends
+    part = cut(track, window)
+    jumped = jumps(part)
+    ends = part.ends | jumped
     alone = ends & np.append([True], ends[:-1])[: len(ends)]
     alone &= ~(jumped & np.append([False], jumped[:-1])[: len(ends)])
-    real = (~ends | alone) & (track.times < window.stop) & (track.times[after] >= window.start)
-    first, last = np.flatnonzero(real), after[real]
-    start = np.maximum(track.times[first], window.start)
-    stop = np.minimum(track.times[last], window.stop - 1)
-    lasted = np.maximum(track.times[last] - track.times[first], 1)
-    here = np.column_stack((track.x[first], track.y[first]))
-    there = np.column_stack((track.x[last], track.y[last]))
-    share = ((start - track.times[first]) / lasted)[:, None]
-    until = ((stop - track.times[first]) / lasted)[:, None]
-    return _Steps(here + share * (there - here), here + until * (there - here), start, stop)
+    first = np.flatnonzero(~ends | alone)
+    last = first + ~ends[first]
+    places = np.column_stack((part.x, part.y))
+    return _Steps(places[first], places[last], part.times[first], part.times[last])
 
 
 def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarFromOther | None:
@@ -106,11 +97,11 @@ def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarFromOth
         ]
     )
     tried = np.argsort(-near, kind="stable")[:_CANDIDATES]
-    away = _distances_to(points[tried], other)
+    lines = Steps(*other.begin.T, *other.end.T)
+    away = [float(lines.nearest_to(x, y)[1].min()) for x, y in points[tried].tolist()]
     farthest = int(np.argmax(away))
-    nth = int(tried[farthest])
-    x, y = points[nth].tolist()
-    return FarFromOther((x, y), (), away[farthest], int(times[nth]))
+    x, y = points[tried[farthest]].tolist()
+    return FarFromOther((x, y), (), away[farthest], int(times[tried[farthest]]))
 
 
 def _sampled(steps: _Steps) -> tuple[Floats, Times]:
@@ -137,12 +128,6 @@ def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
         size *= 2
 
 
-def _distances_to(points: Floats, steps: _Steps) -> list[float]:
-    """Returns how far (m) each of some points is from the nearest step."""
-    lines = Steps(*steps.begin.T.copy(), *steps.end.T.copy())
-    return [float(lines.nearest_to(x, y)[1].min()) for x, y in points.tolist()]
-
-
 def placed_standstills(
     track: RobotTrack, spans: Iterable[Span], region: Region | None = None
 ) -> Iterator[PlacedStandstill]:
@@ -165,13 +150,10 @@ def placed_standstills(
 
 
 def _is_known(track: RobotTrack, at: Ints) -> Flags:
-    """Returns whether a track covers some times."""
-    last = np.searchsorted(track.times, at, side="right") - 1
-    following = np.minimum(last + 1, len(track.times) - 1)
-    before = (last >= 0) & (at - track.times[last] <= SILENCE_NS)
-    after = (track.times[following] >= at) & (track.times[following] - at <= SILENCE_NS)
-    between = (last >= 0) & (last + 1 < len(track.times)) & ~track.begins[following]
-    return np.asarray(between | before | after)
+    """Returns whether a track covers some times, or ends or begins `SILENCE_NS` from them."""
+    starts, stops = track.pieces
+    piece = np.searchsorted(starts - SILENCE_NS, at, side="right") - 1
+    return (piece >= 0) & (at <= stops[piece] + SILENCE_NS)
 
 
 def stood_at(
@@ -184,21 +166,26 @@ def stood_at(
     stands = [(stand, side) for side, window in enumerate((this, other)) for stand in window]
     stands.sort(key=lambda sided: (-sided[0].duration, sided[0]))
     middles = np.empty((len(stands), 2))
-    durations: list[list[Ns]] = []
-    since: list[list[Ns | None]] = []
+    by_place: list[tuple[list[PlacedStandstill], list[PlacedStandstill]]] = []
     for stand, side in stands:
-        count = len(durations)
+        nth = count = len(by_place)
         away = ((middles[:count] - (stand.x, stand.y)) ** 2).sum(axis=1)
-        nth = int(away.argmin()) if (away <= SAME_STAND_M**2).any() else count
-        if nth == count:
+        if (away <= SAME_STAND_M**2).any():
+            nth = int(away.argmin())
+        else:
             middles[nth] = stand.x, stand.y
-            durations.append([0, 0])
-            since.append([None, None])
-        durations[nth][side] += stand.duration
-        earliest = since[nth][side]
-        since[nth][side] = stand.start if earliest is None else min(earliest, stand.start)
-    places = zip(middles[: len(durations)].tolist(), durations, since, strict=True)
+            by_place.append(([], []))
+        by_place[nth][side].append(stand)
     return [
-        StandstillPlace((x, y), (), Pair(*map(unix_from_ns, lasted)), (first, second))
-        for (x, y), lasted, (first, second) in places
+        StandstillPlace(
+            (x, y),
+            (),
+            Pair(*(unix_from_ns(sum(stand.duration for stand in own)) for own in (these, those))),
+            (_first_of(these), _first_of(those)),
+        )
+        for (x, y), (these, those) in zip(middles.tolist(), by_place, strict=False)
     ]
+
+
+def _first_of(stands: Iterable[PlacedStandstill]) -> Ns | None:
+    return min((stand.start for stand in stands), default=None)

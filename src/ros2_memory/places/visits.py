@@ -47,12 +47,12 @@ from ros2_memory.results import PlaceVisits, Visit, Visits
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.frames import Floats, Times
+    from ros2_memory.analysis.frames import Times
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
 _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""
-_CLOSE_NS: Final[Ns] = 60 * NS_PER_S
+_CLOSE_NS: Final = 60 * NS_PER_S
 _MOST_TRIED: Final = 50
 _CLEARLY_M: Final = 5 * TOLERANCE_M
 
@@ -361,7 +361,7 @@ class ConfirmedStays:
         first = max(older.start, older.stop - TRACK_SLICE_NS)
         last = min(newer.stop, newer.start + TRACK_SLICE_NS)
         poses = self._poses(TimeWindow(first, last + 1))
-        inside = [*self._poses_inside(poses)]
+        inside = self._inside(poses)
         if not inside or inside[0] > older.stop or inside[-1] < newer.start:
             return False
         return not any(_absences(poses.times, inside))
@@ -375,7 +375,7 @@ class ConfirmedStays:
         # So near to the window's ends, poses decide on which side a visit begins, or ends.
         room = TRACK_SLICE_NS
         if window.start + room <= whole.start and whole.stop < window.stop - room:
-            if any(True for _ in self._vertices_inside(track, whole)):
+            if self._inside(track, whole.start, whole.stop):
                 return visit
             self._looked_at += 1
             if self._looked_at > _MOST_TRIED:
@@ -383,12 +383,14 @@ class ConfirmedStays:
         exact = self._by_poses(visit)
         if exact is None or not window.overlaps(exact.start, exact.stop):
             return None
-        cut = exact.within(window)
-        if cut != exact and not any(True for _ in self._vertices_inside(track, cut)):
-            poses = self._poses(TimeWindow(cut.start, cut.stop + 1))
-            if not any(True for _ in self._poses_inside(poses)):
+        inside = exact.within(window)
+        if inside != exact and not self._inside(track, inside.start, inside.stop):
+            poses = self._poses(TimeWindow(inside.start, inside.stop + 1))
+            if not self._inside(poses):
                 return None
-        return visit._replace(inside=visit.inside._replace(entered=cut.entered, left=cut.left))
+        return visit._replace(
+            inside=visit.inside._replace(entered=inside.entered, left=inside.left)
+        )
 
     def _by_poses(self, visit: TrackedStay) -> Stay | None:
         """Returns a visit from its first to its last pose inside, where it was entered and left.
@@ -405,27 +407,23 @@ class ConfirmedStays:
     def _inside_near(self, visit: TrackedStay, at: Ns) -> list[Ns]:
         """Returns when poses of a visit near its begin or its end, and its vertices, are inside."""
         whole, poses = visit.whole, self._poses_around(visit.track, at)
-        inside = [*self._poses_inside(poses)]
+        inside = self._inside(poses)
         absences = [*_absences(poses.times, inside)]
         # What lies beyond an absence is of the visit before, or after.
         begin = max((back for left, back in absences if left < whole.start), default=MIN_NS)
         end = min((left for left, back in absences if back > whole.stop), default=MAX_NS)
         own = (time for time in inside if begin <= time <= end)
-        return [*own, *self._vertices_inside(visit.track, whole)]
+        return [*own, *self._inside(visit.track, whole.start, whole.stop)]
 
-    def _poses_inside(self, poses: Placed) -> Iterator[Ns]:
-        return self._times_inside(poses.times, poses.x, poses.y)
-
-    def _times_inside(self, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
-        """Yields those of some times at which the robot was in the region."""
-        rows = zip(times.tolist(), x.tolist(), y.tolist(), strict=True)
-        return (time for time, *place in rows if self._region.contains(*place))
-
-    def _vertices_inside(self, track: RobotTrack, stay: Stay) -> Iterator[Ns]:
-        """Yields the times of a visit's vertices that are inside."""
-        first = np.searchsorted(track.times, stay.start, side="left")
-        last = np.searchsorted(track.times, stay.stop, side="right")
-        return self._times_inside(track.times[first:last], track.x[first:last], track.y[first:last])
+    def _inside(
+        self, path: Placed | RobotTrack, first: Ns = MIN_NS, last: Ns = MAX_NS - 1
+    ) -> list[Ns]:
+        """Returns when the robot was in the region, at the poses or vertices of a time."""
+        some = slice(*np.searchsorted(path.times, (first, last + 1)))
+        rows = zip(
+            path.times[some].tolist(), path.x[some].tolist(), path.y[some].tolist(), strict=True
+        )
+        return [time for time, *place in rows if self._region.contains(*place)]
 
     def _poses_around(self, track: RobotTrack, at: Ns) -> Placed:
         """Returns the poses between the vertices before and after a time, these included."""
@@ -436,20 +434,13 @@ class ConfirmedStays:
 
     def _closest(self, track: RobotTrack, stay: Stay, circle: Circle) -> tuple[float, Ns]:
         """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
-        first = max(int(np.searchsorted(track.times, stay.start, side="right")) - 1, 0)
-        last = int(np.searchsorted(track.times, stay.stop, side="left"))
-        times = track.times[first : last + 1]
-        inner = np.concatenate(([stay.start], times, [stay.stop])).clip(stay.start, stay.stop)
-        since = times[0]
-        x, y = (
-            np.interp(inner - since, times - since, column[first : last + 1])
-            for column in (track.x, track.y)
-        )
-        line = Steps(x[:-1], y[:-1], x[1:], y[1:])
-        along, off = line.nearest_to(circle.x, circle.y)
+        inner = track.times[(track.times > stay.start) & (track.times < stay.stop)]
+        inner = np.concatenate(([stay.start], inner, [stay.stop]))
+        x, y, _ = track.at(inner)
+        along, off = Steps(x[:-1], y[:-1], x[1:], y[1:]).nearest_to(circle.x, circle.y)
         nearest = int(off.argmin())
         lasted = int(inner[nearest + 1] - inner[nearest])
-        at = int(inner[nearest] + round(float(along[nearest]) * lasted))
+        at = int(inner[nearest]) + round(float(along[nearest]) * lasted)
         poses = self._poses_around(track, at)
         away_m = np.hypot(poses.x - circle.x, poses.y - circle.y)
         near = (poses.times >= stay.start) & (poses.times <= stay.stop)

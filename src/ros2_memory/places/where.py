@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.analysis.conditions import as_float
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -195,10 +196,10 @@ def _parse_place(
             raise InvalidArgumentsError(f"{what} has a radius_m and a range; {_EXPECTED}")
         return Where(Rectangle(*_parse_range(f"{what}: x", x), *_parse_range(f"{what}: y", y)))
     radius = value.get("radius_m", default_radius_m)
-    at_x, at_y, radius_m = map(_finite_number, (x, y, radius))
-    if at_x is None or at_y is None or radius_m is None or radius_m <= 0:
+    numbers = [*map(as_float, (x, y, radius))]
+    if not all(map(math.isfinite, numbers)) or numbers[-1] <= 0:
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
-    return Where(Circle(at_x, at_y, radius_m))
+    return Where(Circle(*numbers))
 
 
 def places_asked(
@@ -223,22 +224,13 @@ def _place_named(limits: QuerySettings, name: str) -> Place | None:
 
 
 def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
-    match [_finite_number(bound) for bound in value] if isinstance(value, list) else []:
-        case [float(low), float(high)] if low < high:
+    bounds = [*map(as_float, value)] if isinstance(value, list) else []
+    match bounds:
+        case [low, high] if low < high and all(map(math.isfinite, bounds)):
             return low, high
     raise InvalidArgumentsError(
         f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
     )
-
-
-def _finite_number(value: JsonValue) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:  # an integer of hundreds of digits
-        return None
-    return number if math.isfinite(number) else None
 
 
 def note_other_frame(

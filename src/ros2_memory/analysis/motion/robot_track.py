@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 TOLERANCE_M: Final = 0.05
 TOLERANCE_RAD: Final = 0.15
-TRACK_SLICE_NS: Final[Ns] = 10 * NS_PER_S
-_SLOT_NS: Final[Ns] = NS_PER_S // 5
+TRACK_SLICE_NS: Final = 10 * NS_PER_S
+_SLOT_NS: Final = NS_PER_S // 5
 """Of the poses in a slot of the clock the first and the last count: nothing bends a way between."""
 
-_JUMP_NS: Final[Ns] = 2 * NS_PER_S
+_JUMP_NS: Final = 2 * NS_PER_S
 """A step that is faster, and not longer than this, is a jump."""
 _MAX_M: Final = 1e8
 """Poses beyond are no place; northings of UTM are up to 1e7."""
@@ -203,7 +203,7 @@ def track_by(whole: PartialTrack, recordings: Times, fastest_mps: float = math.i
 
     `recordings`: the number of the recording of each vertex.
     """
-    order = _in_time(whole.times)
+    _, order = np.unique(whole.times, return_index=True)
     whole, recordings = whole.some(order), recordings[order]
     turns = _continuous(whole.turns, ~_is_new(recordings))
     heading = np.where(whole.known, turns * (math.tau / _TURN), np.nan)
@@ -227,7 +227,7 @@ def joined_tracks(
     columns = map(np.concatenate, zip(*(part.columns for part in parts_in_order), strict=True))
     whole = PartialTrack._make((*columns, 0, ""))
     numbers = np.repeat(np.arange(len(recordings)), sizes)
-    order = _in_time(whole.times, numbers)
+    order = np.lexsort((whole.times, numbers))
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.some(order), numbers[order]
     are_known = whole.settled & ~_is_new(numbers)
@@ -240,13 +240,6 @@ def joined_tracks(
         keeps, whole = keeps | ~settled, whole._replace(settled=settled)
     vertices = _vertices(whole, keeps, numbers)
     return whole.some(vertices), numbers[vertices]
-
-
-def _in_time(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
-    """Returns the order of times in each recording, of equal ones the first alone."""
-    numbers = np.broadcast_to(recordings, times.shape)
-    order = np.lexsort((times, numbers))
-    return order[_is_new(times[order], numbers[order])]
 
 
 def _continuous(turns: Times, are_known: Mask) -> Times:
@@ -321,12 +314,10 @@ def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
     """
     times = track.times
     first, last = np.searchsorted(times, (window.start, window.stop)).tolist()
-    at: list[Ns] = times[first:last].tolist()
-    begins: list[bool] = track.begins[first:last].tolist()
+    at, begins = times[first:last], track.begins[first:last]
     if 0 < first < len(times) and not track.begins[first] and window.start < times[first]:
-        at, begins = [window.start, *at], [False, *begins]
-    if 0 < last < len(times) and not track.begins[last] and at[-1:] != [window.stop - 1]:
-        at, begins = [*at, window.stop - 1], [*begins, False]
-    moments = np.array(at, np.int64)
-    places = track.at(moments) if at else (track.x[:0], track.y[:0], track.heading[:0])
-    return RobotTrack(moments, *places, np.array(begins, np.bool_), track.fastest_mps)
+        at, begins = np.append(window.start, at), np.append(False, begins)
+    if 0 < last < len(times) and not track.begins[last] and at[-1:].tolist() != [window.stop - 1]:
+        at, begins = np.append(at, window.stop - 1), np.append(begins, False)
+    places = track.at(at) if at.size else (track.x[:0], track.y[:0], track.heading[:0])
+    return RobotTrack(at, *places, begins, track.fastest_mps)

@@ -25,20 +25,18 @@ from ros2_memory.analysis.motion.odometry import (
     measured_path,
 )
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
-from ros2_memory.analysis.poses import headings, joined_poses
-from ros2_memory.core.arrays import rows_of, stacked
+from ros2_memory.analysis.poses import Poses, headings, joined_poses
+from ros2_memory.core.arrays import Flags, Floats, Vectors, rows_of, stacked
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.poses import Poses
-    from ros2_memory.core.arrays import Flags, Floats, Vectors
     from ros2_memory.core.model import Vector3
     from ros2_memory.storage.base import IntArray
 
-SLICE_NS: Final[Ns] = 300 * NS_PER_S
+SLICE_NS: Final = 300 * NS_PER_S
 """Slices are counted from the epoch. Every time zone is a multiple of this off UTC."""
 TOLERANCE_M: Final = 0.05
 """How far a pose may be from the drawn path, unless a limit on count widens it."""
@@ -145,10 +143,6 @@ class Line:
     def metres_at(self, times: IntArray) -> Floats:
         """Returns the metres driven up to some log times (ns); there must be a vertex."""
         return self._at(times, self.metres)
-
-    def places_at(self, times: IntArray) -> Vectors:
-        """Returns where the robot was at some log times (ns), as rows; there must be a vertex."""
-        return np.stack([self._at(times, axis) for axis in self.places.T], axis=1)
 
     def at(self, times: IntArray) -> Line:
         """Returns where the robot was at some log times (ns); beside a jump at the nearer vertex.
