@@ -29,8 +29,8 @@ from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
     reached,
-    recorded_reach,
     recording_gaps,
+    shown_span,
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
@@ -316,9 +316,7 @@ class BinnedWindow:
         self.asked = asked
         self._by = by
         self._topics = tuple(topics)
-        start, end = asked.asked()
-        first, last = recorded_reach(view.snapshot, asked) or (start, end)
-        start, end = max(start, first), min(end, last)
+        start, end = shown_span(view.snapshot, asked)
         if end < start:
             raise no_data_between(view, self._topics, asked)
         self.counted = reached(view.snapshot, asked)

@@ -39,10 +39,10 @@ from ros2_memory.analysis.intervals import (
 from ros2_memory.analysis.topic_events import TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import Spans, without
 from ros2_memory.core.spans import united as united_spans
-from ros2_memory.core.spans import without
 from ros2_memory.core.text import Quoted, counted, listed, named, shortened
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Span
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import BinnedWindow, By
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S, Call, Memory
@@ -50,9 +50,9 @@ from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
     reached,
-    recorded_reach,
     recording_gaps,
     seconds,
+    shown_span,
     unix_text,
 )
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
@@ -74,8 +74,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.spans import Spans
-    from ros2_memory.core.timebase import Ns
 
     _TrueSpans: TypeAlias = list[tuple[Ns, Ns, bool]]
     """From when to when something was true, and whether it is known to have begun then."""
@@ -454,13 +452,12 @@ def count_labels(
         )
     if len(rows) > _MOST_LABELS:
         view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
-    start, end = asked.asked()
-    first, last = recorded_reach(view.snapshot, asked) or (start, end)
+    start, end = shown_span(view.snapshot, asked)
     return Bins(
         by=BY_LABEL,
         about=tuple(topics),
-        start=min(max(start, seen.since or first), end),
-        end=max(min(end, last), start),
+        start=min(max(start, seen.since or start), asked.asked()[1]),
+        end=max(end, asked.asked()[0]),
         columns=_COLUMNS,
         rows=tuple(rows[:_MOST_LABELS]),
         all=_row(intervals, elapsed, seen.most_at_once_of_all),
@@ -600,9 +597,8 @@ def count_values(
     if len(fields) > 1:
         raise InvalidArgumentsError("by value counts one field: name one in fields")
     values = HeldValues(view, topic, *fields, asked="by value", until=asked.stop)
-    start, end = asked.asked()
-    first, last = recorded_reach(view.snapshot, asked) or (start, end)
-    start, stop = max(start, first), min(end, last) + 1
+    start, end = shown_span(view.snapshot, asked)
+    stop = end + 1
     try:
         values_held = values.during(start, stop)
     except QueryTimeoutError as error:

@@ -25,7 +25,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
-from ros2_memory.history.context import READING_S
+from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import note_no_fix, note_summarised
 from ros2_memory.history.robots import note_robots
@@ -35,7 +35,8 @@ from ros2_memory.history.view import TimeRange, View, open_span
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.history.context import Call, Memory
+    from numpy.typing import NDArray
+
     from ros2_memory.results import BinColumn, Bins
     from ros2_memory.storage.base import Definition, IntArray
 
@@ -225,8 +226,9 @@ class PieceNumbers:
             extractor = self._view.extractor
             self._columns[key] = column_of(table, self._fields[field], extractor)
         path, outline = self._columns[key], table.outline()
-        totals = None if path is None or outline is None else outline.totals(path)
-        zone = None if path is None or totals is None else table.zone(path)
+        if path is None or outline is None:
+            return None
+        totals, zone = outline.totals(path), table.zone(path)
         if totals is None or zone is None or not math.isfinite(totals.total):
             return None
         least = Extreme(zone.low, zone.low, *totals.least)
@@ -246,12 +248,20 @@ class PieceNumbers:
     def _numbers_of_fields(self, rows: Rows) -> tuple[Rows, list[FieldNumbers]] | None:
         """Returns rows with the numbers of all fields in them; None where columns lack some."""
         numbers_of_fields = []
-        for field in self._fields:
-            stored = numbers(rows.table, field, self._view.extractor)
-            if stored is None:
+        for field in range(len(self._fields)):
+            numbers_of_field = self._numbers(rows, field)
+            if numbers_of_field is None:
                 return None
-            numbers_of_fields.append(_numbers_that_count(stored, rows))
+            numbers_of_fields.append(numbers_of_field)
         return rows, numbers_of_fields
+
+    def _numbers(self, rows: Rows, field: int) -> FieldNumbers | None:
+        """Returns the numbers of the rows that count, by their positions among these."""
+        stored = numbers(rows.table, self._fields[field], self._view.extractor)
+        if stored is None or rows.index is None:
+            return stored
+        counting = _some(stored, np.flatnonzero(rows.mask()[stored.rows]))
+        return counting._replace(rows=np.searchsorted(rows.index, counting.rows))
 
     def _add_to_pieces(
         self,
@@ -272,7 +282,8 @@ class PieceNumbers:
             ):
                 begin, end = np.searchsorted(numbers_of_field.rows, [start, stop]).tolist()
                 if begin < end:
-                    part = _part_of(rows, numbers_of_field, (begin, end), (first, last), outline)
+                    some = _some(numbers_of_field, np.arange(begin, end))
+                    part = _part_of(rows, some, (first, last), outline)
                     self._parts[field, piece].append(part)
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[tuple[int, int, int]]:
@@ -342,9 +353,9 @@ class PieceNumbers:
             if self._reading.expired():
                 raise QueryTimeoutError("the rest is left out")
             for _, decoded in decoded_rows(self._view, rows):
-                stored = numbers(decoded.table, self._fields[field], self._view.extractor)
-                if stored is not None:
-                    least = min(least, _least(decoded, _numbers_that_count(stored, decoded), sign))
+                found = self._numbers(decoded, field)
+                if found is not None:
+                    least = min(least, _least(decoded, found, sign))
         return None if least == _NO_NUMBER else least
 
     def _least_in_columns(
@@ -354,15 +365,13 @@ class PieceNumbers:
         least = _NO_NUMBER
         undecided: list[Rows] = []
         for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):
-            stored = numbers(rows.table, self._fields[field], self._view.extractor)
-            if stored is not None and (not stored.error or stored.exactly is not None):
-                least = min(least, _least(rows, _numbers_that_count(stored, rows), sign))
-                continue
-            may_hold = np.arange(len(rows))
-            if stored is not None:
-                counting = _numbers_that_count(stored, rows)
-                off = counting.error if counting.errors is None else counting.errors
-                may_hold = counting.rows[sign * counting.numbers - off <= extreme.high]
+            found, may_hold = self._numbers(rows, field), np.arange(len(rows))
+            if found is not None:
+                if not found.error or found.exactly is not None:
+                    least = min(least, _least(rows, found, sign))
+                    continue
+                lows, _ = _bounds(found, sign)
+                may_hold = found.rows[lows <= extreme.high]
             for _, of_bag in rows.bag_rows():
                 positions = np.intersect1d(of_bag, may_hold)
                 if positions.size:
@@ -370,52 +379,46 @@ class PieceNumbers:
         return least, undecided
 
 
-def _numbers_that_count(field_numbers: FieldNumbers, rows: Rows) -> FieldNumbers:
-    """Returns the numbers of the rows that count, by their positions among these."""
-    if rows.index is None:
-        return field_numbers
-    kept = np.flatnonzero(rows.mask()[field_numbers.rows])
-    exactly = field_numbers.exactly
-    return field_numbers._replace(
-        rows=np.searchsorted(rows.index, field_numbers.rows[kept]),
-        numbers=field_numbers.numbers[kept],
-        errors=None if field_numbers.errors is None else field_numbers.errors[kept],
+def _some(of_field: FieldNumbers, kept: IntArray) -> FieldNumbers:
+    """Returns some of the numbers of a field, in their order."""
+    exactly = of_field.exactly
+    return of_field._replace(
+        rows=of_field.rows[kept],
+        numbers=of_field.numbers[kept],
+        errors=None if of_field.errors is None else of_field.errors[kept],
         exactly=None if exactly is None else lambda among: exactly(kept[among]),
     )
 
 
-def _extreme_of_column(
-    rows: Rows, field_numbers: FieldNumbers, bounds: tuple[int, int], sign: int
-) -> Extreme:
-    """Returns the extreme of the numbers from one index to another, as the column decides it."""
-    begin, end = bounds
-    if not field_numbers.error or field_numbers.exactly is not None:
-        return _least(rows, field_numbers, sign, bounds)
-    signed = sign * field_numbers.numbers[begin:end]
-    off = field_numbers.error if field_numbers.errors is None else field_numbers.errors[begin:end]
-    low, high = float((signed - off).min()), float((signed + off).min())
-    candidates = begin + np.flatnonzero(signed - off <= high)[[0, -1]]
-    return Extreme(low, high, *rows.times[field_numbers.rows[candidates]].tolist())
+def _bounds(of_field: FieldNumbers, sign: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the least and the greatest that each number, times the sign, may be."""
+    signed = sign * of_field.numbers.astype(np.float64)
+    off = of_field.error if of_field.errors is None else of_field.errors
+    return signed - off, signed + off
 
 
-def _part_of(
-    rows: Rows,
-    field_numbers: FieldNumbers,
-    bounds: tuple[int, int],
-    span: Span,
-    outline: Part | None,
-) -> Part:
-    """Returns some of the numbers of a field, in messages of a span (ns, inclusive), as a part."""
-    (begin, end), (first, last) = bounds, span
-    total = float((field_numbers.numbers[begin:end] * SUM_SCALE).sum())
-    extremes = [_extreme_of_column(rows, field_numbers, bounds, sign) for sign in (LEAST, GREATEST)]
+def _extreme_of_column(rows: Rows, of_field: FieldNumbers, sign: int) -> Extreme:
+    """Returns the extreme of numbers, as the column decides it."""
+    if not of_field.error or of_field.exactly is not None:
+        return _least(rows, of_field, sign)
+    lows, highs = _bounds(of_field, sign)
+    low, high = float(lows.min()), float(highs.min())
+    candidates = np.flatnonzero(lows <= high)[[0, -1]]
+    return Extreme(low, high, *rows.times[of_field.rows[candidates]].tolist())
+
+
+def _part_of(rows: Rows, of_field: FieldNumbers, span: Span, outline: Part | None) -> Part:
+    """Returns numbers of a field, in messages of a span (ns, inclusive), as a part."""
+    first, last = span
+    total = float((of_field.numbers * SUM_SCALE).sum())
+    extremes = [_extreme_of_column(rows, of_field, sign) for sign in (LEAST, GREATEST)]
     if outline is not None:
         # Those of the whole table are exact, where they lie here.
         extremes = [
             stated if first <= stated.first <= stated.last <= last else computed
             for computed, stated in zip(extremes, (outline.least, outline.greatest), strict=True)
         ]
-    return Part(first, last, end - begin, total, *extremes)
+    return Part(first, last, of_field.rows.size, total, *extremes)
 
 
 def _numbers_of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
@@ -435,25 +438,17 @@ def numbers_in(value: JsonValue) -> Iterator[float]:
             yield leaf
 
 
-def _least(
-    rows: Rows, field_numbers: FieldNumbers, sign: int, bounds: tuple[int, int] | None = None
-) -> Extreme:
-    """Returns the least exact number of all, or of those from one index to another."""
-    positions = np.arange(*(bounds or (0, field_numbers.rows.size)))
+def _least(rows: Rows, of_field: FieldNumbers, sign: int) -> Extreme:
+    """Returns the least exact number."""
+    positions, values = np.arange(of_field.rows.size), of_field.numbers
     if not positions.size:
         return _NO_NUMBER
-    values = field_numbers.numbers[positions]
-    if field_numbers.error and field_numbers.exactly is not None:
-        off = (
-            field_numbers.error if field_numbers.errors is None else field_numbers.errors[positions]
-        )
-        candidates = np.flatnonzero(sign * values - off <= (sign * values + off).min())
-        positions = positions[candidates]
-        values = field_numbers.exactly(positions)
+    if of_field.error and of_field.exactly is not None:
+        lows, highs = _bounds(of_field, sign)
+        positions = np.flatnonzero(lows <= highs.min())
+        values = of_field.exactly(positions)
     nth = int(values.argmin() if sign == LEAST else values.argmax())
-    return Extreme.known(
-        sign * values[nth].item(), int(rows.times[field_numbers.rows[positions[nth]]])
-    )
+    return Extreme.known(sign * values[nth].item(), int(rows.times[of_field.rows[positions[nth]]]))
 
 
 _CELL: Final[tuple[tuple[str, BinColumn], ...]] = (

@@ -17,7 +17,7 @@ from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import path_by_poses, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import note_robots, require_one_robot
-from ros2_memory.history.view import TimeRange, clamped, open_span, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, clamped, open_span, open_view, search_window
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Region
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import View
     from ros2_memory.results import Bins
 
 

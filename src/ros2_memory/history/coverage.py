@@ -30,6 +30,7 @@ from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
 from ros2_memory.bag_dir.state_files import (
     INTERRUPTIONS,
+    Loss,
     deleted_spans,
     excluded_between,
     read_losses,
@@ -62,7 +63,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state_files import Loss
     from ros2_memory.history.view import View
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
@@ -175,11 +175,10 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
         return
     texts = defaultdict[tuple[str, str], list[str]](list)
     gone = united([*deleted_spans(bag_dir), *excluded_spans(bag_dir)])
-    unread = [snapshot.unread_bounds[aside] for aside in (*snapshot.damaged, *snapshot.unread)]
-    unread += snapshot.bounds_of(_absent(view)).values()
+    absent = _absent(view)
     for part in chain.from_iterable(_unrecorded(snapshot, gap, gone) for gap in touched):
         inside = TimeWindow(part[0] + 1, part[1])
-        may_hold = any(_touches(span, inside, unknown=True) for span in unread)
+        may_hold = bool(lost_in(snapshot, inside, nothing=True, absent=absent))
         may_come = being_written(snapshot, inside)
         for by, start, end in _by_cause(part, interruptions, 0 if may_hold else _RESTART_NS):
             if (start, end) != part and not by and end - start <= snapshot.shortest_gap:
@@ -604,6 +603,16 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> Span | None:
     # Of whole recordings: where their bags end says nothing.
     faulty = [bag for bag in misdated if bag.recording in shown]
     return min(bag.start for bag in faulty), max(bag.end for bag in faulty)
+
+
+def shown_span(snapshot: Snapshot, window: TimeWindow) -> Span:
+    """Returns from when to when (inclusive) the memory can show a window, by `recorded_reach`.
+
+    It ends before it begins where the memory shows nothing of it.
+    """
+    start, end = window.asked()
+    first, last = recorded_reach(snapshot, window) or (start, end)
+    return max(start, first), min(end, last)
 
 
 def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
