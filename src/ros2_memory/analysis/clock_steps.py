@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.storage.base import IntArray
 
-SHORTEST_STEP_NS: Final[Ns] = 2 * NS_PER_S
-SHORTEST_BY_STAMPS_NS: Final[Ns] = NS_PER_S // 2
+SHORTEST_STEP_NS: Final = 2 * NS_PER_S
+SHORTEST_BY_STAMPS_NS: Final = NS_PER_S // 2
 """Header stamps show shorter steps than poses do."""
-STAMPS_BESIDE_NS: Final[Ns] = 5 * NS_PER_S
+STAMPS_BESIDE_NS: Final = 5 * NS_PER_S
 """Delays beside a hole are measured over this long: what stays is no queue that empties."""
 _FEWEST_STAMPS: Final = 5
-_LIVE_NS: Final[Ns] = NS_PER_S
+_LIVE_NS: Final = NS_PER_S
 """Messages must go on for so long after a hole: the first ones may have waited in a queue."""
-ALIKE_NS: Final[Ns] = NS_PER_S // 10
+ALIKE_NS: Final = NS_PER_S // 10
 """By how much the delays on one side, and the steps by several topics, may differ."""
 _AGREEING: Final = 2
 """Topics that must show a step: the clock of one sensor may be set as well."""
-BESIDE_NS: Final[Ns] = NS_PER_S
+BESIDE_NS: Final = NS_PER_S
 """How the robot drives beside a hole is measured over this long."""
 _DRIVING_MPS: Final = 0.1
 _MOVED: Final = 0.3

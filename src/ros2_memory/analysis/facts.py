@@ -15,14 +15,21 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import joined_codes, merged_times, numbered, places_among
+from ros2_memory.core.arrays import (
+    Flags,
+    Floats,
+    Ints,
+    joined_codes,
+    merged_times,
+    numbered,
+    places_among,
+)
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
-    from ros2_memory.core.arrays import Flags, Floats, Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.timebase import Ns

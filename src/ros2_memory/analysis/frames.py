@@ -51,17 +51,17 @@ TfClock: TypeAlias = Literal["stamp", "log"]
 ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
 """Which of the two is asked for; `auto`: as `agreeing_clock` finds."""
 
-TF_CACHE_NS: Final[Ns] = 10 * NS_PER_S
+TF_CACHE_NS: Final = 10 * NS_PER_S
 """tf2's default buffer length: messages farther apart are never interpolated."""
 
-AGREEMENT_NS: Final[Ns] = 2 * NS_PER_S
+AGREEMENT_NS: Final = 2 * NS_PER_S
 """How far stamps may be from log times and still be of the same clock.
 
 Localisers date their transforms up to a second ahead (`transform_tolerance`); transports add some
 tenths. Simulated and replayed clocks are off by far more.
 """
 
-HOLD_NS: Final[Ns] = 2 * NS_PER_S
+HOLD_NS: Final = 2 * NS_PER_S
 """How long tracks take a transform as valid beyond the times between which it is known.
 
 Localisers date transforms up to a second ahead, and a robot's last second is no secret.
@@ -348,21 +348,16 @@ class FrameTree:
 
     def _compose(self, name: str, times: Times) -> FramePoses:
         """Returns the poses by the chains of frames up to the common ancestor at each time."""
+        up, down = self._chain(name, times), self._chain(self.target, times)
+        common = next((frame for frame in up if frame in down), None)
+        if common is not None:
+            poses = self._pose_in_ancestor(common, up, times)
+            if common == self.target:
+                return poses
+            return _product(_inverted(self._pose_in_ancestor(common, down, times)), poses)
         poses = _identity(times, valid=False)
-        waiting = [np.arange(times.size).reshape(times.shape)]
-        while waiting:
-            rows = waiting.pop()
-            then = times.ravel()[rows]
-            up, down = self._chain(name, then), self._chain(self.target, then)
-            common = next((frame for frame in up if frame in down), None)
-            if common is None:
-                waiting += self._split_by_parent(rows, then, (*up, *down))
-                continue
-            part = self._pose_in_ancestor(common, up, then)
-            if common != self.target:
-                part = _product(_inverted(self._pose_in_ancestor(common, down, then)), part)
-            if rows.shape == times.shape:
-                return part
+        for rows in self._split_by_parent(times, (*up, *down)):
+            part = self._compose(name, times[rows])
             for whole, part_column in zip(
                 (*poses.translation, *poses.rotation, poses.valid),
                 (*part.translation, *part.rotation, part.valid),
@@ -379,12 +374,12 @@ class FrameTree:
             chain[frame] = None
         return chain
 
-    def _split_by_parent(self, rows: Times, times: Times, frames: Iterable[str]) -> list[Times]:
-        """Returns rows of times apart in which the first frame that has several parents has one."""
+    def _split_by_parent(self, times: Times, frames: Iterable[str]) -> list[Mask]:
+        """Returns times apart in which the first frame that has several parents has one."""
         for frame in frames:
             if len(self._parents_at(frame, times)) > 1:
                 numbers = self._histories[frame].parents_at(times)
-                return [rows[numbers == number] for number in np.unique(numbers)]
+                return [numbers == number for number in np.unique(numbers)]
         return []
 
     def _pose_in_ancestor(self, ancestor: str, chain: Iterable[str], times: Times) -> FramePoses:
@@ -418,7 +413,8 @@ class FrameTree:
                 lacking = self._missing_link(frame, time)
                 if lacking is not None:
                     return lacking
-        roots = self._root_of(self.target), self._root_of(name)
+        # In a loop, the frame where it closes.
+        roots = [[*self._newest_chain(frame)][-1] for frame in (self.target, name)]
         if name in tree:
             detail = (
                 f"frames '{self.target}' and '{name}' were not connected at {_unix(time)}, because"
@@ -443,10 +439,6 @@ class FrameTree:
             if history is not None and not history.at(at).valid:
                 return history.nothing_at(time)
         return None
-
-    def _root_of(self, frame: str) -> str:
-        """Returns the newest known root above a frame; in a loop, the frame where it closes."""
-        return [*self._newest_chain(frame)][-1]
 
     def _newest_chain(self, frame: str) -> dict[str, None]:
         """Returns the frames from one upwards to the newest known root, or once round a loop."""

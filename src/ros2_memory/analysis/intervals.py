@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import joined_codes
+from ros2_memory.core.arrays import Flags, Ints, joined_codes
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
@@ -24,17 +24,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.arrays import Flags, Ints
 
-SILENCE_NS: Final[Ns] = 10 * NS_PER_S
+SILENCE_NS: Final = 10 * NS_PER_S
 """After so long without a message an object counts as gone: many detectors publish only what
 they see."""
-THINNED_NS: Final[Ns] = 7 * NS_PER_S
+THINNED_NS: Final = 7 * NS_PER_S
 """In a day of which only some messages stayed, each topic has one in so long, or as it had them."""
-FLICKER_NS: Final[Ns] = 3 * NS_PER_S
+FLICKER_NS: Final = 3 * NS_PER_S
 """An object that is missed for less did not leave."""
 USUAL_PERIODS: Final = 3
-SHORT_NS: Final[Ns] = NS_PER_S
+SHORT_NS: Final = NS_PER_S
 
 ROW: Final = np.dtype(
     [

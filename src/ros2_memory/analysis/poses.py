@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.arrays import joined_codes
+from ros2_memory.core.arrays import Floats, Vectors, joined_codes
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.core.arrays import Floats, Vectors
     from ros2_memory.storage.base import IntArray
 
 

@@ -32,12 +32,12 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-SHORTEST_NS: Final[Ns] = SHORTEST_SILENCE_NS
+SHORTEST_NS: Final = SHORTEST_SILENCE_NS
 PERIODS: Final = SILENT_PERIODS
 SELDOM: Final = 2
-HABIT_NS: Final[Ns] = 3600 * NS_PER_S
+HABIT_NS: Final = 3600 * NS_PER_S
 UNUSUAL: Final = 10
-LONGEST_OFF_NS: Final[Ns] = 7 * 86_400 * NS_PER_S
+LONGEST_OFF_NS: Final = 7 * 86_400 * NS_PER_S
 _TOGETHER: Final = 3
 """The robot is on where one in so many of the topics is heard."""
 
@@ -182,13 +182,11 @@ def _silences_of(
     _, last_heard = runs[-1]
     end = max(last_heard, robot_on[-1][1] if robot_on else last_heard)
     nexts = [first for first, _ in runs[1:]]
-    past = 0
     for (_, start), stop in zip(runs, [*nexts, end], strict=True):
-        while past < len(robot_on) and robot_on[past][1] <= start:
-            past += 1
+        nth = bisect_right(robot_on, start, key=itemgetter(1))
         missed: list[Span] = []
         length, until, is_parted = 0, start, False
-        for on_from, on_to in robot_on[past:]:
+        for on_from, on_to in robot_on[nth:]:
             # What follows so long a time is another robot's, perhaps.
             is_parted = on_from - until > LONGEST_OFF_NS
             if on_from >= stop or is_parted:

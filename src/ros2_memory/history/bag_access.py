@@ -147,14 +147,12 @@ class BagAccess:
             return
         if not is_whole:
             self.notes.complete = False
-        name = short_name(bag.path)
+        kind, reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE, error.reason
         if isinstance(error, BagVanishedError):
-            self.notes.add(Note(_DELETED, name, since=first, until=until))
-        elif isinstance(error, BagContradictionError):
-            self.notes.add(Note(_CONTRADICTS_ITSELF, name, error.reason, first, until))
-        else:
-            kind = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE
-            self.notes.add(Note(kind, name, error.reason, first, until))
+            kind, reason = _DELETED, ""
+        elif is_whole:
+            kind = _CONTRADICTS_ITSELF
+        self.notes.add(Note(kind, short_name(bag.path), reason, first, until))
 
     def read(
         self,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from ros2_memory.analysis.frames import joined_edges
+from ros2_memory.analysis.frames import Edges, FrameTree, joined_edges
 from ros2_memory.analysis.motion.trajectory import (
     SLICE_NS,
     PathSlice,
@@ -23,7 +23,7 @@ from ros2_memory.analysis.poses import NO_POSES, FrameCodes, Poses, joined_poses
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
 from ros2_memory.columns.kinds import PATHS
 from ros2_memory.columns.poses import rounded
-from ros2_memory.columns.scan import STRETCH_NS
+from ros2_memory.columns.scan import STRETCH_NS, Stretch
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import (
@@ -46,7 +46,7 @@ from ros2_memory.history.no_data import (
 from ros2_memory.history.poses import PoseReader, PoseRows
 from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.scan import blocks, in_time, joined_back, open_scan, remembered, scan
-from ros2_memory.history.sessions import decoded_transforms
+from ros2_memory.history.sessions import Session, decoded_transforms
 from ros2_memory.history.transforms import (
     edges_of_rows,
     frames_of,
@@ -58,9 +58,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.frames import Edges, FrameTree
-    from ros2_memory.columns.scan import Stretch
-    from ros2_memory.history.sessions import Session
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
@@ -70,9 +67,9 @@ T = TypeVar("T", bound="Sized")
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _BODIES: Final = ("base_footprint", "base_link")
-_READ_NS: Final[Ns] = 3600 * NS_PER_S
+_READ_NS: Final = 3600 * NS_PER_S
 """Transforms are read an hour (log time) at once."""
-_STEP_NS: Final[Ns] = NS_PER_S // 20
+_STEP_NS: Final = NS_PER_S // 20
 """Poses by transforms are no closer than this."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""

@@ -49,9 +49,9 @@ _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|pl
 """Names of topics whose poses are not those of the robot."""
 MOST_TRIED: Final = 20
 """Topics of unknown content that are looked into for poses."""
-_NEAR_NS: Final[Ns] = 60 * NS_PER_S
+_NEAR_NS: Final = 60 * NS_PER_S
 """An older message may stand in for a missing one; farther back it says nothing about the time."""
-_CLOCKS_DIFFER_NS: Final[Ns] = 60 * NS_PER_S
+_CLOCKS_DIFFER_NS: Final = 60 * NS_PER_S
 """A time that is later than now by no more may be now by the clock of who asks."""
 ON_DISK_S: Final = 3
 """A message that the recorder received longer ago is on disk, as small as its chunks are."""
@@ -354,7 +354,7 @@ def _distances(
 
 def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bool:
     """Whether messages of each of these topics in a window were cut by `retention.topics`."""
-    losses = read_losses(view.memory.index.bag_dir, window.start, window.stop)
+    losses = read_losses(view.bag_dir, window.start, window.stop)
     return {loss.topic for loss in losses if loss.by == "expired"}.issuperset(topics)
 
 

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.stored_message import StoredMessage
 
-_NEAR_NS: Final[Ns] = 10 * NS_PER_S
+_NEAR_NS: Final = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""
-_SLOW_NS: Final[Ns] = 600 * NS_PER_S
+_SLOW_NS: Final = 600 * NS_PER_S
 """As far where recordings overlap at that time: some topics have a message in minutes."""
 _TRIED: Final = 7
 """How many messages are looked for in the other recording: a subscriber may miss some."""
@@ -64,7 +64,7 @@ SET_BACK: Final = "the clock was set back between recordings"
 """The begin of a sentence on recordings that one recorder made, and that overlap in time."""
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
-_RECENT_NS: Final[Ns] = 60 * NS_PER_S
+_RECENT_NS: Final = 60 * NS_PER_S
 _DESCRIBED: Final[Key[list[tuple[Ns, tuple[str, ...]]]]] = Key()
 """Of a memory: when it was last looked whether robots are mixed, and what was found."""
 

@@ -42,7 +42,7 @@ from ros2_memory.history.scan import (
     remembered,
     scan,
 )
-from ros2_memory.index.segment import wider
+from ros2_memory.index.segment import TopicExtent, wider
 from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
@@ -53,12 +53,11 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import TopicExtent
 
 Session: TypeAlias = frozenset[str]
 """The folders of its recordings, as they were named when they were recorded."""
 
-_AROUND_NS: Final[Ns] = 10 * NS_PER_S
+_AROUND_NS: Final = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
 _FEW_SESSIONS: Final = 4
 """Sessions of which static transforms are looked up one by one."""

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment moving transforms are read; the last is the length of tf2's cache."""
 
-_LONGER_NS: Final[Ns] = 3600 * NS_PER_S
+_LONGER_NS: Final = 3600 * NS_PER_S
 """How far around the moment frames are looked for that are unknown then."""
 _BORROWED: Final = Reason(
     "is placed by transforms of another recording of the same time; no handover proves that both "
@@ -224,8 +224,6 @@ def _explain_failure(
             return then
         advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
         return NoDataError(between(view, near), f"{then.detail}; {advice}")
-    if failure.reason not in {NoDataReason.OUTSIDE_RANGE, NoDataReason.GAP}:
-        return failure
     inside = (
         topics
         and view.stream.first(topics, TimeWindow.until(at), newest_first=True)

@@ -20,23 +20,22 @@ from ros2_memory.analysis.motion.path_length import (
     End,
     measured,
 )
-from ros2_memory.core.arrays import row_sums
+from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors, row_sums
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors
     from ros2_memory.core.model import Vector3
 
-ARRIVAL_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
+ARRIVAL_JITTER_NS: Final = 100 * NS_PER_MS
 """The jitter of arrivals: the shortest time that the distance of two poses is divided by.
 
 Log time is the time of arrival. Transports and a busy recorder deliver in bursts: public bags
 contain poses 3 ms apart in time and 0.2 m in space, which is GNSS noise and not 72 m/s.
 """
 
-GAP_NS: Final[Ns] = NS_PER_S
+GAP_NS: Final = NS_PER_S
 """Poses are consecutive up to this far apart, or up to `GAP_PERIODS` of their usual periods."""
 GAP_PERIODS: Final = 5
 _NEARBY: Final = 8
@@ -52,7 +51,7 @@ _AT_ORIGIN_M: Final = 0.05
 _LONGER: Final = 4.0
 _FASTER: Final = 2.0
 """A step to the origin is a reset if it is so many times longer, and faster, than those near it."""
-_DENSE_NS: Final[Ns] = 250 * NS_PER_MS
+_DENSE_NS: Final = 250 * NS_PER_MS
 _HARD_MPS2: Final = (2.0, 10.0)
 """Accelerations (m/s^2) that such a step would need at least, to be a reset.
 

@@ -34,10 +34,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ros2_memory.core.arrays import row_maxima, row_sums
+from ros2_memory.core.arrays import Flags, Floats, Vectors, row_maxima, row_sums
 
 if TYPE_CHECKING:
-    from ros2_memory.core.arrays import Flags, Floats, Vectors
     from ros2_memory.core.model import Vector3
 
 FEWEST: Final = 16

@@ -43,8 +43,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
-from ros2_memory.analysis.poses import headings
-from ros2_memory.core.arrays import narrowed, row_sums, rows_of, run_starts, stacked
+from ros2_memory.analysis.poses import Poses, headings
+from ros2_memory.core.arrays import (
+    Flags,
+    Floats,
+    Ints,
+    Vectors,
+    narrowed,
+    row_sums,
+    rows_of,
+    run_starts,
+    stacked,
+)
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -52,21 +62,19 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.poses import Poses
-    from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors
     from ros2_memory.core.model import Vector3
 
-SHORTEST_NS: Final[Ns] = 3 * NS_PER_S
+SHORTEST_NS: Final = 3 * NS_PER_S
 """A robot that is still for less is turning, or driving with care."""
-SILENCE_NS: Final[Ns] = 5 * NS_PER_S // 2
+SILENCE_NS: Final = 5 * NS_PER_S // 2
 """Between poses farther apart nothing is known: a standstill ends there."""
-SLOT_NS: Final[Ns] = 2 * NS_PER_S // 5
-BLOCK_NS: Final[Ns] = 5 * SLOT_NS
-BESIDE_NS: Final[Ns] = 6 * NS_PER_S
+SLOT_NS: Final = 2 * NS_PER_S // 5
+BLOCK_NS: Final = 5 * SLOT_NS
+BESIDE_NS: Final = 6 * NS_PER_S
 """Poses so far beside a stretch of time decide what its blocks are: those of the block beside."""
-CREEP_NS: Final[Ns] = 15 * BLOCK_NS
+CREEP_NS: Final = 15 * BLOCK_NS
 """A robot that moves farther than `LARGEST_M` in this time creeps; a slower one drifts."""
-CONTEXT_NS: Final[Ns] = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
+CONTEXT_NS: Final = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
 """Poses so far outside a window decide whether the robot stood still inside it."""
 DRIFT_MPS: Final = 0.008
 """The mean position of a still robot may move so fast: odometry drifts."""
@@ -85,7 +93,7 @@ _CLEARLY: Final = 2.0
 """Those that are so many nearer are clearly there."""
 _OWN_BENDS: Final = 4
 """Poses of a slot that give its noise by themselves."""
-_SPARSE_NS: Final[Ns] = 11 * NS_PER_S // 10
+_SPARSE_NS: Final = 11 * NS_PER_S // 10
 """Over longer a bend shows how the robot turned, rather than noise."""
 _PLACE_SLOTS: Final = 4
 """Slots that give the place at an end of a standstill."""
@@ -98,7 +106,7 @@ _BLOCKS_AT_ONCE: Final = 128
 _STILL_M: Final = DRIFT_MPS * unix_from_ns(BLOCK_NS)
 """How far the means of a block spread without noise."""
 
-DROP_SLOT_NS: Final[Ns] = NS_PER_S // 2
+DROP_SLOT_NS: Final = NS_PER_S // 2
 MOVING_MPS: Final = 0.15
 FRACTION: Final = 0.4
 TURNS_RAD: Final = 0.35
@@ -532,9 +540,9 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     if rows.size < _DROP_SLOTS:
         return ()
     times, places = poses.times[rows], poses.positions[rows]
-    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / (np.diff(times) / NS_PER_S)
+    speeds = _lengths(np.diff(places, axis=0)) / (np.diff(times) / NS_PER_S)
     # Of two slots: a robot whose position jumps, and is back, gets no farther.
-    ahead = np.linalg.norm(places[2:] - places[:-2], axis=1) / ((times[2:] - times[:-2]) / NS_PER_S)
+    ahead = _lengths(places[2:] - places[:-2]) / ((times[2:] - times[:-2]) / NS_PER_S)
     before = np.minimum(np.minimum(speeds[:-1], speeds[1:]), ahead)
     after = np.maximum(speeds[:-1], speeds[1:])
     falls = (before[:-3] >= MOVING_MPS) & (after[3:] <= FRACTION * before[:-3])
