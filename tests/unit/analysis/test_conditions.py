@@ -1,9 +1,8 @@
 from __future__ import annotations
 
 import math
-import unicodedata
 from itertools import count
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -58,12 +57,9 @@ asked_coordinates = st.floats(-10, 10)
         # A number is a whole value of a field, or an element of its list; its digits are a text.
         *((number, None, SCENE, False) for number in (3, 7.5, 8, "3", "7.5", "0.5", "20")),
         *((20, None, value, False) for value in ({"level": 20, "msg": "retry"}, [1, 20], 20)),
-        *((number, None, {"level": 10, "msg": "retry in 20 s"}, True) for number in (20, "20")),
         *((number, "ids", SCENE, True) for number in (3, "3", 7.5, True, 1)),
         *((number, "ids", SCENE, False) for number in (5, "7")),
-        *((score, "detections.score", SCENE, True) for score in (0.5, "0.9")),
         ("0.", "detections.score", SCENE, False),
-        (-1, "detections.point.y", SCENE, True),
         *((number, "detections", SCENE, False) for number in (0.5, 4)),
         (10**5000, None, ["", "1", "0"], False),
         (10**5000, "x", {"x": [10**5000]}, True),
@@ -71,7 +67,6 @@ asked_coordinates = st.floats(-10, 10)
         *((word, None, {"data": False}, False) for word in ("true", "True", True)),
         (True, None, [1, 1.0], False),
         (1, None, [True], False),
-        (False, None, [0, None], False),
     ],
     ids=count(),
 )
@@ -109,30 +104,20 @@ def test_what_a_value_contains_is_in_all_that_it_is_in(
         *((True, value, True) for value in (True, [False, True], {"a": {"b": [[True]]}})),
         *((one, {"data": True}, True) for one in (1, 1.0, "1")),
         *((one, {"data": False}, False) for one in (1, 1.0, "1")),
-        (0, {"data": False}, True),
-        (0, {"data": True}, False),
         *((yes, {"data": 1}, True) for yes in (True, "True")),
-        (False, {"data": 1}, False),
         *((number, [number], True) for number in (0.9, 1e300, -1e300, 10**400, 1e-320, math.inf)),
-        (0.9, 0.9000001, False),
         (2**53 + 1, 2**53 + 2, False),
         # What a float32 would hold of it is another number.
         *((1_795_000_001, {"order": other}, False) for other in (1_795_000_064, 1_795_000_064.0)),
-        *((2**53 + 1, other, False) for other in (2**53, 2**53 + 2)),
-        (9_999_999.6, 10_000_000, False),
-        (1e-50, 0.0, False),
         (1e300, math.inf, False),
         *(("docked", {"state": held}, True) for held in ("docked", "Docked", "DOCKED")),
-        ("DOCKED", {"state": "docked"}, True),
         ("docked", {"state": "undocked"}, False),
-        ("undocked", {"state": "docked"}, False),
         # In quotes, as the plain one, and as the same text.
         *((f"{leaf}", [leaf], True) for leaf in (True, False, 3, -2.5)),
         ("1e3", 1000, True),
         (" 7 ", 7, True),
         *((text, {"data": text}, True) for text in ("true", "3", "9" * 5000)),
         *((text, leaf, False) for text, leaf in (("yes", True), ("inf", math.inf))),
-        ("nan", math.nan, False),
     ],
     ids=count(),
 )
@@ -152,15 +137,6 @@ def test_a_number_equals_what_a_float32_field_stores_of_it(held: float, nudge: f
     stored = float(np.float32(asked))
     is_meant = stored != 0 and not 2**24 <= abs(asked) < 2**53
     assert Condition(Equals(asked)).matches(stored) is (is_meant or stored == asked)
-
-
-@pytest.mark.parametrize("form", ["NFC", "NFD"])
-def test_how_accents_are_written_makes_no_difference(form: Literal["NFC", "NFD"]) -> None:
-    held = unicodedata.normalize(form, "Päckchen")
-    for asked in ("päckchen", unicodedata.normalize("NFD", "PÄCKCHEN")):
-        for test in (Equals(asked), Contains(asked), Contains(asked, whole=True)):
-            assert Condition(test).matches([held])
-    assert not Condition(Contains("packchen")).matches([held])
 
 
 @given(asked_scalars)
@@ -189,25 +165,6 @@ def test_a_limit_is_not_part_of_either_side(limit: float, number: float) -> None
     assert not Condition(Beyond(limit, above=False)).matches({"a": limit})
 
 
-@pytest.mark.parametrize("limit", [0.1, 0.2, 0.7, 0.9, -0.8, 1.1, 36.6])
-def test_a_limit_as_a_float32_field_stores_it_is_not_part_of_either_side(limit: float) -> None:
-    stored = np.float32(limit)
-    for above in (True, False):
-        assert not Condition(Beyond(limit, above=above)).matches({"percentage": float(stored)})
-        farther = np.nextafter(stored, np.float32(math.inf if above else -math.inf))
-        assert Condition(Beyond(limit, above=above)).matches({"percentage": float(farther)})
-
-
-def test_an_integer_beside_a_limit_is_beyond_it() -> None:
-    assert Condition(Beyond(9_999_999.6, above=True)).matches(10_000_000)
-
-
-@pytest.mark.parametrize("value", [True, None, "9", [], {}])
-def test_what_is_no_number_is_on_no_side(value: JsonValue) -> None:
-    assert not Condition(Beyond(0, above=True)).matches(value)
-    assert not Condition(Beyond(2, above=False)).matches(value)
-
-
 # near_position
 
 
@@ -228,7 +185,6 @@ BAD = (None, math.nan, math.inf)
 @pytest.mark.parametrize(
     ("z", "field", "value", "is_met"),
     [
-        (None, None, {"position": ONE_TWO}, True),
         (None, None, {"pose": {"pose": {"position": {**ONE_TWO, "z": 0.0}}}}, True),
         (None, None, {"transforms": [{"transform": {"translation": ONE_TWO}}]}, True),
         (None, None, [OTHER, ONE_TWO], True),
@@ -236,13 +192,11 @@ BAD = (None, math.nan, math.inf)
         (None, None, {**OTHER, "point": ONE_TWO}, False),
         (None, None, {"position": [OTHER, ONE_TWO]}, True),
         (None, None, SCENE, True),
-        (None, "detections", SCENE, True),
         (None, "detections.1", SCENE, False),
         # A velocity is none, unless a field names it.
         (None, None, {"linear_velocity": ONE_TWO}, False),
         (None, None, {"twist": {"linear": {**ONE_TWO, "z": 0.0}}}, False),
         (None, "linear", {"linear": ONE_TWO, "position": OTHER}, True),
-        (None, "linear", {"linear": OTHER, "position": ONE_TWO}, False),
         *((None, None, {"position": each}, False) for each in ([1.0, 2.0], {"x": "1", "y": "2"})),
         *((None, None, each, False) for each in ({"position": {"x": True, "y": 2.0}}, "1 2", None)),
         # Without a coordinate that is asked it is near nothing.
@@ -266,11 +220,9 @@ def test_positions_are_found_under_the_keys_that_hold_places(
     ("value", "path", "found"),
     [
         (SCENE, "detections.label", ["Red Scissors", "mug"]),
-        (SCENE, "detections.point.z", [0.3]),
         # A whole number picks one element; in an object it is a key.
         (SCENE, "detections.0.label", ["Red Scissors"]),
         (SCENE, "detections.-1.label", ["mug"]),
-        (SCENE, "detections.-2.label", ["Red Scissors"]),
         ({"0": {"1": "a"}}, "0.1", ["a"]),
         *((SCENE, f"detections.{path}", []) for path in ("9", "-3.label", ".label")),
         *((SCENE, path, []) for path in ("nothing", "skill.x", "")),
@@ -284,12 +236,6 @@ def test_what_a_path_leads_to(value: JsonValue, path: str, found: list[JsonValue
 
 
 # parsing
-
-
-def test_a_limit_may_stand_in_quotes_and_a_height_be_left_out() -> None:
-    assert parse_condition("above", "0.5", 0.5, "x").test == Beyond(0.5, above=True)
-    near: JsonValue = {"x": 1, "y": -2, "z": None}
-    assert parse_condition("near_position", near, 0.5).test == NearPosition(1.0, -2.0, None, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -306,16 +252,11 @@ def test_a_limit_may_stand_in_quotes_and_a_height_be_left_out() -> None:
         ("equals", {"x": 1}, "not an object"),
         ("equals", math.nan, "NaN"),
         ("above", "high", "takes a number as value"),
-        ("above", True, "not true"),
         ("below", math.nan, "takes a number as value"),
-        ("below", {"x": 1}, "not an object"),
         ("above", 3, "needs field"),
         ("near_position", "1,2", 'not "1,2"'),
-        ("near_position", [1, 2], "not a list"),
         ("near_position", {"x": 1}, "'y' of 'near_position' must be a finite number"),
         ("near_position", {"x": "1", "y": 2}, "'x' of 'near_position'"),
-        ("near_position", {"x": True, "y": 2}, "not true"),
-        ("near_position", {"x": math.inf, "y": 2}, "'x' of 'near_position'"),
         ("near_position", {"x": 10**400, "y": 2}, "'x' of 'near_position'"),
         ("near_position", {"x": 1, "y": 2, "z": "up"}, "'z' of 'near_position'"),
         ("near_position", {"x": 1, "y": 2, "radius": 3}, 'not ["radius"]'),
@@ -327,12 +268,6 @@ def test_arguments_that_mean_nothing_are_refused_with_an_example(
     with pytest.raises(InvalidArgumentsError, match="for example condition_type") as refused:
         parse_condition(kind, value, 0.5)
     assert complaint in str(refused.value)
-
-
-@pytest.mark.parametrize("tolerance_m", [-0.1, math.nan, math.inf])
-def test_a_tolerance_that_is_no_distance_is_refused(tolerance_m: float) -> None:
-    with pytest.raises(InvalidArgumentsError, match="tolerance"):
-        parse_condition("near_position", {"x": 1, "y": 2}, tolerance_m)
 
 
 # what no value of a topic can meet

@@ -57,12 +57,6 @@ def test_statuses_and_goals_have_a_value_each() -> None:
     assert stated(None, DIAGNOSTICS) == stated(7, GOALS) == {}
 
 
-@pytest.mark.parametrize("charge", [math.nan, -1.0, 101.0, math.inf, None, "full", True])
-def test_a_charge_that_is_not_known_is_no_fact(charge: JsonValue) -> None:
-    assert charge_of({"percentage": charge}) is None
-    assert Word(CHARGE) not in stated({"percentage": charge}, BATTERY)
-
-
 @pytest.mark.parametrize(
     ("reported", "charge"), [(1.0, 1.0), (1.02, 1.0), (1.5, 0.015), (80.0, 0.8)]
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,6 @@ from ros2_memory.analysis.frames import (
     TF_CACHE_NS,
     ClockOfTransforms,
     FrameTree,
-    agreeing_clock,
     edges_of,
 )
 from ros2_memory.core.errors import NoDataError, NoDataReason
@@ -261,24 +260,6 @@ def test_every_time_that_a_refusal_offers_can_be_asked(first: int, width: int) -
 
 
 # Clocks
-
-
-def replayed(off: int, count: int = 5) -> list[StampedTransform]:
-    return [replace(held, log_time=held.stamp + off) for held in moving()[:count]]
-
-
-@pytest.mark.parametrize(
-    ("held", "clock"),
-    [
-        *((replayed(off), "stamp") for off in (0, 20_000_000, -S, 2 * S)),
-        *((replayed(off), "log") for off in (2 * S + 1, -3 * S, 515_219 * S)),
-        # A few odd stamps do not decide.
-        ([*replayed(0, 4), *replayed(99 * S, 2)], "stamp"),
-    ],
-    ids=count(),
-)
-def test_stamps_near_log_time_are_the_clock(held: list[StampedTransform], clock: str) -> None:
-    assert agreeing_clock(edges_of(held)) == clock
 
 
 # Many times at once

@@ -101,12 +101,6 @@ def test_a_topic_is_silent_while_others_are_heard(
     assert found(odom, seen) == ([] if expected is None else [Silence(SEEN, *expected)])
 
 
-def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:
-    days = tuple((at * 24 * HOUR, at * 24 * HOUR + 16 * HOUR) for at in range(5))
-    nights = found(heard((0, 112 * HOUR)), heard(*days))
-    assert [each.length for each in nights] == 4 * [8 * HOUR]
-
-
 RUNS = st.lists(st.tuples(st.integers(0, 400), st.integers(1, 60)), min_size=1, max_size=12)
 
 

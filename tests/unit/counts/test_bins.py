@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,13 +58,3 @@ def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> N
         # Twice it was off the dock from the beginning on: nobody saw it leave.
         assert (off["count"], off["seconds"], off["recorded_s"]) == (0, 2 * 50, 2 * 99)
         assert "usual_first" not in reply
-
-
-def test_by_refuses_what_it_does_not_take_and_ignores_how_much_is_shown(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [boolean(BEGIN + n * S, n % 2 == 0) for n in range(9)])
-    question = {"topic": "/bumper", "condition_type": "equals", "value": True, "by": "day"}
-    ask = partial(asked, memory_of(tmp_path), tmp_path, "find_matches", **question)
-    refused = ask(fields=["data"])
-    assert refused["error"] == "invalid_arguments"
-    assert "fields" in refused["detail"]
-    assert ask(limit=1, oldest_first=True) == ask()

@@ -6,7 +6,6 @@ import math
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from random import Random
 from typing import TYPE_CHECKING
 
 import pytest
@@ -16,11 +15,10 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.robot import count_visits
-from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
 from tests.support.bags import Msg, battery, make, odom, write_mcap, write_splits
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
 
 if TYPE_CHECKING:
@@ -32,17 +30,6 @@ S = 10**9
 BEGIN = 1_783_998_000 * S
 HOUR = 3600
 LATEST = QuerySettings(now="latest")
-
-
-def noisy(draw: Random, count: int = 900, every: int = 10 * S) -> list[Msg]:
-    """A robot that drives about and stands still, by odometry that no step of a column fits."""
-    messages, x, yaw = [], 0.0, 3.0
-    for number in range(count):
-        if number % 90 < 60:
-            x += draw.gauss(0.0, 0.3)
-            yaw += draw.gauss(0.0, 0.2)
-        messages.append(odom(BEGIN + number * every, x + draw.gauss(0, 1e-6), -x, yaw))
-    return messages
 
 
 def write(folder: Path, messages: list[Msg], split: int = 20) -> None:
@@ -58,25 +45,6 @@ def span(hours: float = 3) -> TimeRange:
 def cells(answer: Bins, name: str) -> list[float | None]:
     at = [column[0] for column in answer.columns].index(name)
     return [*(values[at] for _, values in answer.rows), answer.all[at]]
-
-
-def test_only_bags_that_may_hold_an_extreme_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write(tmp_path, noisy(Random(7)))
-    stored = with_store(memory_of(tmp_path, limits=LATEST), tmp_path, share=10.0)
-    read: list[str] = []
-    tables = BagAccess.tables
-
-    def counted(self: BagAccess, bag: object, *args: object, **more: object) -> object:
-        read.append(str(bag))
-        return tables(self, bag, *args, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(BagAccess, "tables", counted)
-    answer = count_range(stored, Call(), "/odom", span(), "hour", fields=["position.x"])
-    assert len(answer.rows) == 3
-    # Of 45 bags: two extremes of each of three hours.
-    assert len(read) <= 8
 
 
 def test_what_there_is_no_time_to_count_is_no_number_and_no_row(

@@ -5,24 +5,20 @@ from __future__ import annotations
 import json
 from itertools import pairwise
 from pathlib import Path
-from random import Random
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosbags.typesys import get_types_from_msg
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import (
     Msg,
     boolean,
     detections,
-    make,
     odom,
     text,
-    typestore,
     write_mcap,
     write_splits,
 )
@@ -96,18 +92,6 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
     assert counts == sorted(counts, reverse=True)
 
 
-def test_of_many_labels_those_seen_most_often_are_listed(tmp_path: Path) -> None:
-    labels = [f"thing{nth}" for nth in range(80)]
-    chance = Random(1)
-    messages = [
-        detections((BEGIN + 20 * at) * S, chance.sample(labels, 30)) for at in range(10)
-    ] + [detections((BEGIN + 300) * S, labels)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    reply = asked(memory_of(tmp_path), tmp_path, "find_matches", **ANY)
-    assert len(reply["rows"]) == 60
-    assert "the 60 of 80 labels that were seen most often" in reply["notes"]
-
-
 @pytest.mark.parametrize(
     "given",
     [
@@ -123,24 +107,6 @@ def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[s
     assert "by label takes labels of detections: give condition_type contains" in reply["detail"]
 
 
-@pytest.mark.parametrize(
-    ("said", "rows"),
-    [
-        ('[{"label": "cup"}]', 1),
-        ('{"seen": [{"label": "cup"}]}', 1),
-        ('{"seen": [{"in": {"label": "cup"}}]}', 1),
-        ('{"seen": [{"in": {"in": {"in": {"label": "cup"}}}}]}', 0),
-        ("a cup", 0),
-    ],
-)
-def test_texts_that_show_nothing_are_named(tmp_path: Path, said: str, rows: int) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(BEGIN * S, said)])
-    every = {"condition_type": "contains", "value": "", "by": "label"}
-    reply = asked(memory_of(tmp_path), tmp_path, "find_matches", topic="/chatter", **every)
-    assert len(reply["rows"]) == rows
-    assert any("/chatter has texts" in note for note in reply["notes"]) == (not rows)
-
-
 T: Final = 1_790_000_000
 
 
@@ -150,25 +116,6 @@ def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) 
     condition = {"topic": topic, "start": T, "end": T + 300, "by": "day", **given}
     reply = asked(memory_of(folder), folder, "find_matches", **condition)
     return table(reply)["all"]
-
-
-def test_a_boolean_in_a_list_counts_beside_one_that_is_in_none(tmp_path: Path) -> None:
-    store = typestore()
-    store.register(get_types_from_msg("bool pressed\n", "acme_msgs/msg/Button"))
-    panel = "bool enabled\nacme_msgs/Button[] buttons\n"
-    store.register(get_types_from_msg(panel, "acme_msgs/msg/Panel"))
-    button = store.types["acme_msgs/msg/Button"]
-    messages = [
-        Msg(
-            "/panel",
-            "acme_msgs/msg/Panel",
-            (T + nth) * NS_PER_S,
-            make("acme_msgs/msg/Panel", enabled=False, buttons=[button(pressed=20 <= nth < 40)]),
-        )
-        for nth in range(60)
-    ]
-    found = counted(tmp_path, messages, "/panel", condition_type="equals", value=True)
-    assert (found["count"], found["seconds"]) == (1, 20.0)
 
 
 @each_way

@@ -60,14 +60,6 @@ def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_windo
 
 
 @each_way
-def test_what_held_already_when_the_window_began_is_noted(bag_dir: Path, *, recalls: bool) -> None:
-    inside = matches(bag_dir, DOCKED, 750, 950, recalls=recalls)
-    assert inside["sightings"] == []
-    assert "/docked met this already when the window began" in " ".join(inside["notes"])
-    assert "notes" not in matches(bag_dir, DOCKED, 450, 650, recalls=recalls)
-
-
-@each_way
 def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     tmp_path: Path, *, recalls: bool
 ) -> None:
@@ -97,19 +89,6 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     place = {"x": [1.0, 3.0], "y": [-1, 1]}
     inside = asked(memory, tmp_path, "find_matches", **{**auto, "while": [bumped]}, where=place)
     assert [row["first_seen"] for row in inside["sightings"]] == [T0 / S + 20]
-
-
-@each_way
-def test_a_latched_boolean_in_a_scope_is_counted_by_when_it_held(
-    bag_dir: Path, *, recalls: bool
-) -> None:
-    """It is true from 100 to 400 s and from 700 s on; it bumped from 700 s on, too."""
-    for bumped, seconds in ((True, 250), (False, 300)):
-        during = {"while": {"topic": BUMPER, "condition_type": "equals", "value": bumped}}
-        answer = matches(bag_dir, DOCKED, 0, 950, recalls=recalls, by="day", **during)
-        whole = table(answer)["all"]
-        assert (whole["seconds"], whole["count"]) == (seconds, 1)
-        assert "notes" not in answer
 
 
 @each_way

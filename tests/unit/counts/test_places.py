@@ -47,12 +47,3 @@ def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(
     assert sum(row["count"] for name, row in rows.items() if name != "all") > 1500
     assert rows["all"]["count"] == 1500
     assert "places overlap: what is in two of them counts to both" in reply["notes"]
-
-
-def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path) -> None:
-    unnamed = asked(in_places(memory), world, "trajectory_summary", by="place", **DOOR)
-    assert "needs named places" in unnamed["detail"]
-    two = asked(memory, world, "visits", by="place", x=0.0, y=0.0)
-    assert "give where in place of x and y" in two["detail"]
-    none = asked(in_places(memory), world, "visits", by="day")
-    assert "no place is named" in none["detail"]

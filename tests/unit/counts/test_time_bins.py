@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -16,11 +16,8 @@ from ros2_memory.counts.bins import (
     ClockBin,
     Offset,
     TimeBins,
-    first_of_days,
     time_bins,
-    usual_time,
 )
-from ros2_memory.results import Usual
 
 S = 10**9
 H = 3600
@@ -123,22 +120,3 @@ def test_more_bins_than_a_reply_has_room_for_are_refused() -> None:
         time_bins(TimeWindow(begin, begin + (MOST_BINS + 2) * day), "day", zone("UTC"))
     with pytest.raises(InvalidArgumentsError, match="by hour takes at most 1000 days"):
         time_bins(TimeWindow(begin, begin + (MOST_DAYS + 1) * day), "hour", zone("UTC"))
-
-
-def test_the_usual_time_is_the_median_of_the_first_ones() -> None:
-    window = TimeWindow(at("2026-03-02"), at("2026-03-06"))
-    bins = time_bins(window, "weekday", zone("UTC"))
-    times = [
-        at(f"2026-03-{each}")
-        for each in ("02T08:10", "02T07:50", "03T08:30", "04T07:00", "04T23:00", "05T08:00")
-    ]
-    firsts = first_of_days(bins, times)
-    assert [datetime.fromtimestamp(at / S, UTC).strftime("%d %H:%M") for _, at in firsts] == [
-        "02 07:50",
-        "03 08:30",
-        "04 07:00",
-        "05 08:00",
-    ]
-    usual = usual_time([at for _, at in firsts], 5, zone("UTC"))
-    assert usual == Usual(7 * H + 55 * 60, 7 * H, 8 * H + 1800, days=4, of_days=5)
-    assert not first_of_days(bins, [])

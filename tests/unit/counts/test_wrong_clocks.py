@@ -75,12 +75,3 @@ def test_a_window_inside_of_a_bag_of_a_wrong_clock_counts_what_is_there(
     condition = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
     reply = asked(memory, tmp_path, "find_matches", **condition, **window)
     assert reply["searched_from"] == begin
-
-
-def test_things_of_a_clock_ahead_are_found_in_a_window_that_reaches_there_alone(
-    memory: Memory, tmp_path: Path
-) -> None:
-    for window, times in (({}, 8), ({"end": AHEAD + 9}, 9)):
-        notes = str(asked(memory, tmp_path, "find_things", **window)["notes"])
-        assert f"cup ({times} times" in notes
-        assert ("dated by a wrong clock" in notes) is (not window)

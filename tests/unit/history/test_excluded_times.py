@@ -58,15 +58,6 @@ def test_what_was_excluded_is_no_gap_and_no_event(bag_dir: Path) -> None:
     assert "excluded by the rules" in str(recap["notes"])
 
 
-def test_a_topic_did_not_fall_silent_while_it_was_excluded(tmp_path: Path) -> None:
-    bags = ScreenedBags(tmp_path)
-    late = text(T0 + 55 * S, "floor", "/map")
-    received_again = Msg(late.topic, late.type, late.log_time, late.body, T0 + 2 * S)
-    record(bags, 0, 60, [mode(1, value=False), mode(31, value=True), received_again])
-    status = ask(tmp_path, "memory_status")
-    assert (status["latest"] - T0_S, status["fell_silent"], status["gaps"]) == (55, [], [])
-
-
 def test_a_moment_that_was_excluded_has_no_value_not_even_an_older_one(bag_dir: Path) -> None:
     def reason(tool: str, **given: object) -> Any:
         reply = ask(bag_dir, tool, **given)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, pairwise, repeat
 from pathlib import Path
@@ -25,16 +24,13 @@ from ros2_memory.history import sessions
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import scan
 from ros2_memory.history.transforms import frames_over
-from ros2_memory.history.view import AtTime, TimeRange, View
-from ros2_memory.insights.recap import recap
-from ros2_memory.insights.sightings import find_matches
+from ros2_memory.history.view import AtTime, View
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames, value_when
 from ros2_memory.results import ValueWhen
 from tests.support.bags import (
     Msg,
     boolean,
-    detections,
     odom,
     tf,
     transform,
@@ -165,22 +161,6 @@ def test_static_transforms_of_many_recordings_are_read_together_beside_one_being
     assert len(scanned) < 6
 
 
-@each_way
-def test_transforms_that_cannot_be_decoded_are_named_each_time(
-    tmp_path: Path, recalls: bool
-) -> None:
-    moved = [
-        tf(T0 + n * S // 10, transform(T0 + n * S // 10, "odom", "base_link", (0.1 * n, 0.0, 0.0)))
-        for n in range(100)
-    ]
-    moved[50] = replace(moved[50], body=b"\0\1\0\0\1")
-    bag(tmp_path, 0, [*moved, *(odom(T0 + n * S // 10, 0.1 * n, 0.0) for n in range(100))])
-    memory = memory_of(tmp_path, recalls=recalls)
-    for _ in range(2):
-        notes = recap(memory, Call(), TimeRange(start_s=T0 / 1e9, end_s=T0 / 1e9 + 9)).notes
-        assert any("messages of /tf could not be decoded" in note for note in notes)
-
-
 DAY = 86_400 * S
 
 
@@ -248,22 +228,6 @@ def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(tmp_
     named = {100.0: first, 500.0: second}[found.transform.translation[0]]
     [note] = [note for note in found.notes if "2 sessions" in note]
     assert note.endswith(f"this is that of {named}")
-
-
-@each_way
-def test_a_static_transform_that_changes_holds_from_then_on(tmp_path: Path, recalls: bool) -> None:
-    """Also inside one bag: the robot is placed anew while it stands."""
-    poses = [odom(T0 + nth * S // 5, 0.0, 0.0, 0.0) for nth in range(100)]
-    changed = [fixed(T0, "map", "odom", 0.0), fixed(T0 + 8 * S, "map", "odom", 50.0)]
-    record(tmp_path / "one", [*changed, *poses], split_s=60)
-    memory = memory_of(tmp_path, recalls=recalls)
-    there, later = (visits(memory, Call(), x, 0.0, radius_m=1.0).visits for x in (0.0, 50.0))
-    assert [((each.arrived or 0) - T0, (each.departed or 0) - T0) for each in there] == [
-        (0, 39 * S // 5)
-    ]
-    assert [((each.arrived or 0) - T0, (each.departed or 0) - T0) for each in later] == [
-        (8 * S, 99 * S // 5)
-    ]
 
 
 @each_way
@@ -339,34 +303,6 @@ def test_a_robot_beside_it_that_has_poses_of_its_own_lends_nothing(
         assert [note for note in answer.notes if "boat has no transforms" in note]
 
 
-@each_way
-def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
-    tmp_path: Path, recalls: bool
-) -> None:
-    """Two robots of one time: the sighting is of the one that stands, though the other is newer."""
-    record(
-        tmp_path / "nav2",
-        [
-            fixed(T0, "map", "odom", 100.0),
-            *moving(T0, 20, "odom", "base_link", 2.0, 0.0),
-            *[odom(T0 + nth * S, 2.0, 0.0, 0.0) for nth in range(20)],
-            detections(T0 + 4 * S + S // 2, ["scissors"]),
-        ],
-    )
-    boat = moving(T0, 20, "map", "odom", 5.0, -0.5)
-    boat += moving(T0, 20, "odom", "base_link", 0.0, 0.5)
-    record(tmp_path / "boat", [*boat, *drive(T0, 20)])
-    memory = memory_of(tmp_path, recalls=recalls)
-    topic = detections(T0, []).topic
-    [found] = find_matches(memory, Call(), topic, "contains", "scissors").sightings
-    assert found.thing is not None
-    assert found.thing.frame_id == "map"
-    assert found.thing.position[0] == pytest.approx(103.0)
-    assert found.robot is not None
-    assert found.robot.frame_id == "map"
-    assert found.robot.position[0] == pytest.approx(102.0)
-
-
 def two_at_once(root: Path) -> None:
     """Two robots of one time on the same topics: r1 drives 20 m, r2 stands at 50 m and bumps."""
     ticks = [T0 + nth * S // 5 for nth in range(101)]
@@ -387,16 +323,6 @@ def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path) -> None:
     assert reply.value.sample.time == T0 + 49 * S // 5 + S // 10
     assert [note for note in reply.notes if "/bumper" in note and note.endswith(": r1, r2")]
     assert not [note for note in reply.notes if "the match is of" in note]
-
-
-def test_a_value_of_another_recording_than_the_match_is_noted(tmp_path: Path) -> None:
-    record(tmp_path / "r1", [boolean(T0 + 4 * S + 1, True)])
-    record(tmp_path / "r2", drive(T0, 20))
-    memory = memory_of(tmp_path)
-    reply = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
-    assert isinstance(reply, ValueWhen)
-    assert reply.value is not None
-    assert [note for note in reply.notes if "of recording r1" in note and "of r2" in note]
 
 
 def test_frames_are_those_of_the_newest_bags_where_there_is_no_time_for_all(

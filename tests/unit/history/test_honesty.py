@@ -23,7 +23,7 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock
 from tests.support.column_worlds import World
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -203,20 +203,6 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_pa
     assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
 
 
-def test_a_chunk_that_is_lost_of_a_closed_bag_is_reported_in_windows_that_touch_the_bag(
-    tmp_path: Path,
-) -> None:
-    paths = write_splits(tmp_path, 3)
-    spoil_chunk(paths[1], 3)
-    os.utime(paths[1], ns=(T0 + 20 * S,) * 2)
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    window = {"topic": "/odom", "start": at(2), "end": at(25)}
-    told = notes_of(asked(memory, tmp_path, "get_topic_in_range", **window))
-    assert any(note.startswith("rec/rec_1.mcap could not be read whole: ") for note in told)
-    recalled = with_store(memory, tmp_path)
-    assert told == notes_of(asked(recalled, tmp_path, "get_topic_in_range", **window))
-
-
 @pytest.mark.parametrize("last", [9, 30], ids=["other topics go on", "the topic goes on"])
 def test_a_chunk_that_is_lost_is_not_reported_in_windows_behind_it_whatever_is_stored(
     last: int, tmp_path: Path
@@ -240,45 +226,3 @@ def test_a_chunk_that_is_lost_is_not_reported_in_windows_behind_it_whatever_is_s
         )
         assert stored == plain
         assert any("could not be read whole" in note for note in notes_of(plain)) is is_lost
-
-
-def test_what_does_not_answer_is_listed_with_reasons(tmp_path: Path) -> None:
-    tear(write_splits(tmp_path, 3)[1])
-    write_mcap(tmp_path / "boot" / "boot_0.mcap", [odom(0, 0, 0), odom(5 * S, 1, 0)])
-    foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", T0 + 5 * S, b"\x00\x01\x00\x00abc")
-    write_mcap(tmp_path / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    told = asked(memory, tmp_path, "data_time_range")
-    assert (told["earliest"], told["latest"]) == (at(0), at(29))
-    assert [each["file"] for each in told["damaged"]] == ["rec/rec_1.mcap"]
-    assert [each["file"] for each in told["clock_faults"]] == ["boot/boot_0.mcap"]
-    [undecodable] = told["undecodable"]
-    assert (undecodable["topic"], undecodable["type"]) == ("/foreign", "nobody_msgs/msg/Unknown")
-    assert undecodable["reason"]
-    assert all(gap["start"] >= at(0) for gap in told["gaps"])
-    rows = queries.list_recorded_topics(memory, Call())
-    [odometry] = [row for row in rows if row.topic == "/odom"]
-    assert odometry.first == 0
-    assert odometry.notes[0].startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
-
-
-def test_a_match_from_the_future_has_no_age(tmp_path: Path) -> None:
-    write_splits(tmp_path, 2)
-    write_mcap(tmp_path / "ahead" / "ahead_0.mcap", [boolean(T0 + 9 * HOUR, True, "/late")])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    found = asked(
-        memory, tmp_path, "find_last_match", topic="/late", condition_type="equals", value=True
-    )
-    assert "age_s" not in found
-    assert "dated 28800 s after now: when it was is unknown" in found["notes"]
-
-
-def test_a_clock_set_back_in_a_recording_is_listed(tmp_path: Path) -> None:
-    for number, start_s in enumerate([100, 110, 40, 50]):
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages(start_s))
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    [fault] = asked(memory, tmp_path, "data_time_range")["clock_faults"]
-    assert fault == {
-        "file": "rec/rec_2.mcap",
-        "reason": "the clock was set back by 79 s after rec_1.mcap was begun",
-    }

@@ -41,18 +41,6 @@ def frames_that_part(bag_dir: Path) -> None:
     write_mcap(bag_dir / "run" / "run_0.mcap", messages)
 
 
-def test_a_frame_that_is_not_reported_around_a_time_is_not_reported_to_be_unknown_at_all_times(
-    tmp_path: Path,
-) -> None:
-    frames_that_part(tmp_path)
-    with pytest.raises(NoDataError) as caught:
-        queries.transform(memory_of(tmp_path), Call(), "map", "base_link", after(50))
-    assert f"within 10 s of {T0_S + 50}" in caught.value.detail
-    assert "list_frames" in caught.value.detail
-    assert caught.value.reason is NoDataReason.GAP
-    assert "within 3600 s the two were connected" in caught.value.detail
-
-
 @pytest.mark.parametrize(
     ("parent", "child", "later", "reason"),
     [

@@ -198,17 +198,6 @@ def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found
     ]
 
 
-def test_many_files_are_counted_and_the_last_ones_named() -> None:
-    lost = tuple(torn(number) for number in range(1, 9))
-    snapshot = Snapshot(Timeline.of((split(0), split(9))), damaged=lost, scanned_at=T0 + DAY)
-    assert sentences(snapshot, 0, 100) == [
-        (
-            "8 bag files could not be read and may hold more: rec/rec_6.mcap (torn), "
-            "rec/rec_7.mcap (torn), rec/rec_8.mcap (torn) and 5 more"
-        )
-    ]
-
-
 def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold_it() -> None:
     active = SetAside(Path("/b/copied/copied_0.db3"), "still being written")
     timeline = Timeline.of((split(0), split(1)))
@@ -216,17 +205,6 @@ def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold
     assert sentences(snapshot, 0, 9) == []
     named = ["still being written and not included: copied/copied_0.db3"]
     assert sentences(snapshot, 0, 9, nothing=True) == named
-
-
-def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_reported() -> None:
-    odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
-    snapshot = Snapshot(Timeline.of(tuple(odd)), scanned_at=T0 + DAY)
-    assert sentences(snapshot, 0, 60) == [
-        "rec/rec_2.mcap: way 2",
-        "rec/rec_3.mcap: way 3",
-        "rec/rec_4.mcap: way 4",
-        "2 older bags are odd too",
-    ]
 
 
 @given(

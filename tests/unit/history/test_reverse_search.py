@@ -21,7 +21,6 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     Msg,
     battery,
@@ -87,12 +86,6 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
         newest("POWER_SUPPLY_STATUS_EMPTY")
 
 
-def test_a_topic_whose_name_looks_like_a_glob_is_searched(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [text(T0, "cup", topic="/[b]")])
-    given = {"topic": "/[b]", "condition_type": "contains", "value": "cup"}
-    assert asked(memory_of(tmp_path), tmp_path, "find_last_match", **given)["timestamp"] == T0_S
-
-
 @pytest.mark.parametrize("recalls", [False, True])
 def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recalls: bool) -> None:
     level = make("std_msgs/msg/Float32", data=45.5)
@@ -139,14 +132,6 @@ def test_percent_of_a_battery_that_states_no_charge_is_not_refused_as_if_it_stat
     question = (memory_of(tmp_path), Call(), "/battery_state")
     found = queries.find_last_match(*question, "above", 20, field="percentage").found
     assert found is None
-
-
-def test_never_within_a_least_score_above_one_says_what_scores_are(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [detections(T0, ["cup"])])
-    question = (memory_of(tmp_path), Call(), SCENE, "contains", "cup")
-    for search in (queries.find_last_match, find_matches):
-        (note,) = search(*question, min_score=80).notes
-        assert note.endswith("a score below 80 do not count here, and most scores are from 0 to 1")
 
 
 @pytest.mark.parametrize("kind", ["contains", "contains_word", "equals"])
@@ -241,14 +226,6 @@ def test_what_never_was_is_answered_without_reading_a_message(
     assert not any(topics for _, topics in reader.asked)  # but the definitions of types
 
 
-def test_a_search_that_got_nowhere_in_its_time_does_not_say_how_far(bag_dir: Path) -> None:
-    call = Call(Deadline.after(0.0))
-    with pytest.raises(QueryTimeoutError) as caught:
-        last(memory_of(bag_dir), "contains", "scissors", call=call)
-    assert caught.value.searched_back_to is None
-    assert "searched_back_to" not in Replies(bag_dir, 4000).error(caught.value).text
-
-
 def test_a_search_that_runs_out_of_time_has_searched_what_it_says(bag_dir: Path) -> None:
     reached: set[int | None] = set()
     for memory in (memory_of(bag_dir), filled(bag_dir)[0]):
@@ -267,7 +244,6 @@ HOUR = 3600
 NEWEST = BEGIN + 3 * HOUR
 SPAN = {"start": BEGIN, "end": BEGIN + 4 * HOUR}
 BUMPS = {"topic": "/bumper", "condition_type": "equals", "value": True}
-CUPS = {"topic": "/vision/scene/scene_objects", "condition_type": "contains", "value": "cup"}
 
 
 @pytest.fixture
@@ -314,17 +290,6 @@ def test_of_a_day_that_is_counted_in_part_the_first_time_is_not_known(
     assert "out of time" in reply["notes"][0]
 
 
-def test_what_is_counted_by_label_begins_where_it_is_counted_from(ask: Callable[..., Any]) -> None:
-    reply = ask("find_matches", 0, **CUPS, by="label", **SPAN)
-    assert (reply["start"], reply["end"]) == pytest.approx((NEWEST, NEWEST + 19), abs=1e-6)
-
-
-def test_changes_that_were_not_all_read_have_no_total(ask: Callable[..., Any]) -> None:
-    reply = ask("get_topic_in_range", 2, topic="/bumper", changes=True, **SPAN)
-    assert reply["at_least"] == len(reply["changes"]) == 2
-    assert "only what is after" in reply["notes"][0]
-
-
 def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
     ask: Callable[..., Any],
 ) -> None:
@@ -332,9 +297,3 @@ def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
     reply = ask("find_matches", 0, **found, **SPAN)
     assert len(reply["sightings"]) == 4
     assert any("may have held for longer" in note for note in reply["notes"])
-
-
-def test_a_question_without_time_for_any_of_it_says_what_to_ask(ask: Callable[..., Any]) -> None:
-    reply = ask("get_topic_in_range", 0, topic="/task", by="value", **SPAN)
-    assert reply["error"] == "timeout"
-    assert "ask about a shorter window" in reply["detail"]

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import asked, each_way, memory_of, replied
+from tests.support.memories import asked, memory_of, replied
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -100,21 +100,6 @@ def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
     bag_dir: Path, recalls: bool, now: Now
 ) -> None:
     hold(memory_at(bag_dir, recalls, now), bag_dir, "/odom")
-
-
-@each_way
-def test_a_window_that_begins_below_zero_is_clamped(bag_dir: Path, recalls: bool) -> None:
-    memory = memory_at(bag_dir, recalls)
-    whole = asked(memory, bag_dir, "get_topic_in_range", topic="/odom", start=0.0, end=9.0)
-    assert asked(memory, bag_dir, "get_topic_in_range", topic="/odom", start=-5, end=9.0) == whole
-    assert whole["total"] == 10
-    lately = asked(memory, bag_dir, "get_topic_in_last", topic="/odom", seconds=1e12)
-    assert lately["total"] == 10
-    told = asked(memory, bag_dir, "recap", start=-100.0, end=9.0)
-    assert (told["start"], told["duration_s"]) == (0.0, 9.0)
-    nothing = asked(memory, bag_dir, "get_position_at", timestamp=-5.0)
-    assert (nothing["error"], nothing["reason"]) == ("no_data", "outside_range")
-    assert "-5.000000" in nothing["detail"]
 
 
 @pytest.mark.parametrize("begin_s", [0, 1_784_000_000])

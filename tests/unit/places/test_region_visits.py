@@ -72,20 +72,6 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
     assert any("yard is left out" in note for note in found.notes)
 
 
-def test_places_in_the_poses_own_frame_are_counted_with_those_of_the_map(moving: Memory) -> None:
-    own = Place("dock", "odom", Rectangle(-0.6, 0.6, -0.6, 0.6))
-    memory = replace(moving, limits=replace(moving.limits, places=(*PLACES, own)))
-    found = visits(memory, Call())
-    assert found.places is not None
-    [dock] = [each for each in found.places if each.place == "dock"]
-    alone = visits(memory, Call(), where="dock", limit=100)
-    assert alone.duration > 0
-    assert (dock.entries, dock.duration) == (alone.entries, alone.duration)
-    window = {"start": BEGIN / S, "end": BEGIN / S + 300}
-    for by in ("place", "day"):
-        assert "dock" in str(asked(memory, memory.index.bag_dir, "visits", by=by, **window))
-
-
 def spots(memory: Memory, **where: Circle) -> Memory:
     places = tuple(Place(name, "odom", region) for name, region in where.items())
     return replace(memory, limits=replace(memory.limits, places=places))
@@ -108,7 +94,6 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         write_mcap(tmp_path / name / f"{name}_0.mcap", messages, layout)
     memory = memory_of(tmp_path, recalls=recalls)
     memory = spots(memory, here=Circle(0.0, 0.0, 1.0), there=Circle(30.0, 0.0, 1.0))
-    span = {"start": BEGIN / S, "end": BEGIN / S + 90}
     hello = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
 
     def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
@@ -123,15 +108,9 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         seen = asked(memory, tmp_path, "visits", where=name)
         assert (seen["total"], seen["exits"], seen["minutes"]) == (1, 1, 0.5)
         assert cells("visits", "all", where=name, by="hour")["minutes"] == 0.5
-        assert cells("visits", name, by="place")["minutes"] == 0.5
-        assert cells("visits", "all", by="hour")[f"{name}.minutes"] == 0.5
         [found] = asked(memory, tmp_path, "find_matches", where=name, **hello)["sightings"]
         assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
         assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
-        assert asked(memory, tmp_path, "recap", where=name, **span)["visits"] == 1
-        later = {"with_start": BEGIN / S + 45, "with_end": BEGIN / S + 90}
-        compared = asked(memory, tmp_path, "compare", **span | {"end": BEGIN / S + 45}, **later)
-        assert compared["minutes"][name] == {"this": 0.5, "with": 0.0}
 
 
 @pytest.mark.parametrize("laps", [6, 130])

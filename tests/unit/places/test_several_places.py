@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,23 +16,20 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.places.where import WhileCondition
 from tests.support.bags import (
     boolean,
     octets,
     odom,
     text,
     write_mcap,
-    write_splits,
 )
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S, write_moving_map
-from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, runs_of, write
+from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, write
 from tests.support.tables import table
 
 SECONDS = 400
@@ -121,38 +117,6 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
         assert rows["(elsewhere)"]["seconds"] > 0
 
 
-def test_a_place_may_be_given_with_its_name_alone(
-    memory: Memory, folder: Path, world: World
-) -> None:
-    where = {"corner": {"x": 1.25, "y": 0.0, "radius_m": 0.6}}
-    reply = asked(memory, folder, "visits", where=where, limit=100)
-    inside = [nth for nth in range(SECONDS) if abs(world.x[nth] - 1.25) <= 0.6]
-    assert (reply["where"], reply["total"]) == ("corner", len(runs_of(inside)))
-    assert all(row["closest_m"] == 0 for row in reply["visits"])
-
-
-def test_metres_in_places_by_hour_add_up_to_those_in_them(
-    memory: Memory, folder: Path, world: World
-) -> None:
-    hours = table(asked(memory, folder, "trajectory_summary", where="hall, den", by="hour", **SPAN))
-    whole = asked(memory, folder, "trajectory_summary", where="hall, den", **SPAN)
-    assert hours["all"]["metres"] == pytest.approx(whole["distance_m"], abs=0.01)
-    assert hours.pop("all")["metres"] == pytest.approx(
-        sum(row["metres"] for row in hours.values()), abs=0.02
-    )
-    assert whole["distance_m"] == pytest.approx(world.metres_in("hall", "den"), abs=0.3)
-
-
-def test_things_in_any_of_several_places_say_in_which(memory: Memory, folder: Path) -> None:
-    where = {"stove": {"x": [1, 2], "y": [0, 1]}, "corner": {"x": 4.5, "y": 0.5, "radius_m": 0.4}}
-    found = asked(memory, folder, "find_things", where=where)
-    assert {row["label"]: (row["in"], row["also_in"]) for row in found["things"]} == {
-        "cup": ("stove", ["kitchen"]),
-        "cat": ("corner", ["hall"]),
-    }
-    assert found["labels"] == {"cat": 2, "cup": 2} or found["total"] >= 2
-
-
 @pytest.mark.parametrize(
     ("where", "said"),
     [
@@ -197,13 +161,6 @@ def test_a_place_is_named_once_and_in_a_frame_of_the_robot(
     assert said is None or said in reply["detail"]
 
 
-def test_places_of_two_frames_are_refused(memory: Memory, folder: Path) -> None:
-    attic = Place("attic", "map", Rectangle(0, 1, 0, 1))
-    limits = replace(memory.limits, places=(*memory.limits.places, attic))
-    reply = asked(replace(memory, limits=limits), folder, "visits", where="hall, attic")
-    assert "hall is in odom, attic is in map: ask about places of one frame" in reply["detail"]
-
-
 @pytest.mark.parametrize("by", [None, "label", "hour"])
 def test_of_several_conditions_on_other_topics_all_must_hold(
     memory: Memory, folder: Path, world: World, by: str | None
@@ -232,46 +189,6 @@ def test_of_several_conditions_on_other_topics_all_must_hold(
     else:
         within = asked(memory, folder, "find_matches", **given, where="hall")
         assert found["rows"] == within["rows"]
-
-
-@pytest.mark.parametrize(
-    ("conditions", "said"),
-    [
-        ([], "which is an empty list: leave it out"),
-        ([5], "which is not an object"),
-        ([{"topic": "/odom"}], "needs a valid condition_type and value"),
-        ([{"topic": "/odom", "wheree": 1}], 'has no "wheree"; it has topic, condition_type'),
-        ([{**HELLO}] * 9, "has 9 conditions, more than 8"),
-        ([{**HELLO}, {**HELLO, "topic": "/never"}], "/never"),
-    ],
-)
-def test_conditions_that_are_none_are_named(
-    memory: Memory, folder: Path, conditions: Any, said: str
-) -> None:
-    reply = asked(memory, folder, "find_matches", **HELLO, **{"while": conditions})
-    assert said in reply["detail"]
-
-
-@pytest.mark.parametrize("changes", [False, True], ids=["each second", "on change"])
-@each_way
-def test_matches_count_while_another_topic_meets_a_condition(
-    tmp_path: Path, changes: bool, recalls: bool
-) -> None:
-    """Words each second for a minute; docked but from 20 s to 40 s."""
-    messages = [odom(MAP_BEGIN, 0.0, 0.0)]
-    for second in range(60):
-        at = MAP_BEGIN + second * S
-        messages.append(text(at + S // 2, "hello"))
-        if not changes or second in {0, 20, 40}:
-            messages.append(boolean(at, not 20 <= second < 40, topic="/is_docked"))
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, recalls=recalls)
-    for docked, spans in ((False, [(20.5, 39.5)]), (True, [(40.5, 59.5), (0.5, 19.5)])):
-        other = WhileCondition("/is_docked", "equals", docked)
-        found = find_matches(memory, Call(), "/chatter", "contains", "hello", during=(other,))
-        assert [
-            ((each.first - MAP_BEGIN) / S, (each.last - MAP_BEGIN) / S) for each in found.sightings
-        ] == spans
 
 
 @each_way

@@ -18,7 +18,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.places.visits import visits
-from tests.support.bags import Msg, boolean, odom, tf, transform, write_mcap, write_splits
+from tests.support.bags import Msg, odom, tf, transform, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.examples import LONG
 from tests.support.memories import asked, each_way, memory_of, with_store
@@ -82,15 +82,6 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     assert elsewhere.visits
     assert elsewhere.there_now is None
     assert elsewhere.notes == ()
-
-
-def test_a_robot_without_poses_of_late_may_have_left(tmp_path: Path) -> None:
-    later = [boolean(BEGIN + (50 + n) * S, n % 2 > 0) for n in range(30)]
-    memory = remembering(tmp_path, [*line((20, 0.5), (30, 0.0)), *later])
-    for place in (THERE, {**THERE, "x": 5.0}):
-        shown = asked(at(memory, BEGIN + 79 * S), tmp_path, "visits", **place)
-        assert shown["total"] == 1
-        assert "there_now" not in shown
 
 
 @pytest.mark.parametrize("in_map", [False, True])
@@ -280,9 +271,3 @@ def test_by_transforms_alone_the_robot_is_what_moves_in_odometry(tmp_path: Path,
     for asks in ({"where": "dock"}, {"x": 10.0, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"}):
         seen = asked(memory, tmp_path, "visits", **asks)
         assert (seen["frame_id"], seen["total"]) == ("odom", 1)
-
-
-def test_hours_of_the_day_are_local(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec/rec_0.mcap", [odom(BEGIN, 0.0, 0.0)])
-    reply = asked(memory_of(tmp_path), tmp_path, "visits", x=0, y=0, between="04:00Z-05:00Z")
-    assert "these hours are local, so leave it out" in reply["detail"]

@@ -102,12 +102,3 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
     middle = len(parts) // 2
     stretches = [*settled_tracks(parts[:middle]), *settled_tracks(parts[middle:])]
     assert same(track_by(*joined_tracks([stretches])), whole)
-
-
-def test_turns_on_the_spot_add_up() -> None:
-    seconds = np.arange(0, 60, 0.1)
-    times = START + (seconds * S).astype(np.int64)
-    heading, still = np.remainder(seconds, math.tau), np.zeros(seconds.size)
-    track = track_of(times, still, still, heading)
-    assert track.heading[-1] - track.heading[0] == pytest.approx(59.9, abs=1e-5)
-    assert len(track.times) < 20

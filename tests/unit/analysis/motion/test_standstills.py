@@ -115,26 +115,6 @@ def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     assert len(long) <= len(found) <= len(possible)
 
 
-@pytest.mark.parametrize("hz", [2, 4, 5])
-@pytest.mark.parametrize(("radius", "speed"), [(0.1, 0.06), (0.3, 0.1), (1.0, 0.4)])
-def test_a_robot_that_turns_in_circles_with_few_poses_does_not_stand(
-    hz: int, radius: float, speed: float
-) -> None:
-    angles = [speed * n / hz / radius for n in range(60 * hz)]
-    at = [(radius * math.cos(angle), radius * math.sin(angle), 0.0) for angle in angles]
-    assert standstills_of([(n * S // hz, place) for n, place in enumerate(at)]) == ()
-
-
-def test_how_often_poses_come_at_another_time_changes_nothing() -> None:
-    legs = [(25.0, 0.4), (120.0, 0.0), (25.0, 0.4)]
-    rare = world(legs, hz=4, begin=100, noise=0.003)
-    often = world([(300.0, 0.4)], hz=50, begin=271, noise=0.003)
-    alone = standstills_of(rare.poses)
-    assert len(alone) == 1
-    assert standstills_of(rare.poses + often.poses) == alone
-    assert standstills_of(rare.poses + often.poses, blocks=20) == alone
-
-
 @pytest.mark.parametrize("speed", [0.004, 0.005, 0.008])
 @pytest.mark.parametrize("noise", [0.0, 0.001])
 def test_a_creep_between_two_stops_is_parted_from_both(speed: float, noise: float) -> None:

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.odometry import MotionTotals
 from ros2_memory.analysis.motion.trajectory import Trajectory
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.strategies import points
@@ -68,15 +67,6 @@ def test_of_few_poses_the_distance_is_the_plain_length(positions: list[Vector3])
     assert found.totals.distance_m == pytest.approx(path_length(positions), rel=1e-12)
     assert found.totals.jumps == 0
     assert (found.max_speed or 0) >= (found.avg_speed or 0) >= 0
-
-
-def test_no_pose_makes_an_empty_trajectory_and_one_a_place_without_a_way() -> None:
-    assert summarise(driven([])) == Trajectory(
-        MotionTotals(), None, None, "positions", (), 0.0, 0, 0
-    )
-    found = summarise(driven(along_x(2.0)))
-    assert (found.totals.distance_m, found.totals.duration_s, found.avg_speed) == (0.0, 0.0, None)
-    assert [waypoint.position for waypoint in found.waypoints] == [(2.0, 0.0, 0.0)]
 
 
 # Jumps and invalid poses
