@@ -160,12 +160,11 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
     if not parts:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = [IntervalPart(part.first, part.last, part.visible) for part in parts]
-    visible = (seen[0] if len(seen) == 1 else joined(seen)).visible
     states, changes, more = _joined_states(parts)
     whole = TopicEvents(
         parts[0].first,
         parts[-1].last,
-        visible,
+        joined(seen).visible,
         states,
         changes,
         _merge_errors(error for part in parts for error in part.errors),

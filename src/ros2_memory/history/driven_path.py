@@ -195,10 +195,8 @@ def slices_by_poses(
             for pair in twice
             if around.overlaps(pair.span.start, pair.span.stop - 1)
         ]
-        if not near:
-            return stretch.key(settings)
-        left_out = repr(near)
-        return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
+        left_out = sha256(repr(near).encode()).hexdigest()
+        return stretch.key(f"{settings} {left_out}" if near else settings)
 
     yield from joined_back(view, opened, kind, made_in, key_of, beside=beside)
 

@@ -335,10 +335,8 @@ def count_messages(
     """
     size = len(edges) + 1
     counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
-    if view.stream.may_be_repeated([topic]):
-        for rows in scan(view, topic, window, columns=proves):
-            counted.add_times(rows.times, edges)
-        return counted
+    # Which of repeated messages count, no bag shows alone.
+    is_repeated = view.stream.may_be_repeated([topic])
     shared = open_scan(view, topic, window).shared
     shared_ends = np.array([*shared, (MAX_NS, MAX_NS)], np.int64).T
     to_read: set[str] = set()
@@ -350,7 +348,7 @@ def count_messages(
         bags, firsts, lasts, messages = column
         pieces = np.searchsorted(edges, firsts, side="right")
         is_here = (firsts < window.stop) & (lasts >= window.start)
-        is_cut = _are_cut(column, window, edges, shared_ends)
+        is_cut = _are_cut(column, window, edges, shared_ends) | is_repeated
         is_in = is_here & ~is_cut
         counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
         for row in np.flatnonzero(is_here & is_cut).tolist():

@@ -142,7 +142,9 @@ class Line:
 
     def metres_at(self, times: IntArray) -> Floats:
         """Returns the metres driven up to some log times (ns); there must be a vertex."""
-        return self._at(times, self.metres)
+        since = self.times[0]
+        metres: Floats = np.interp(times - since, self.times - since, self.metres)
+        return metres
 
     def at(self, times: IntArray) -> Line:
         """Returns where the robot was at some log times (ns); beside a jump at the nearer vertex.
@@ -162,11 +164,6 @@ class Line:
             self.headings[before] + turn * share,
             np.zeros(len(times), np.bool_),
         )
-
-    def _at(self, times: IntArray, values: Floats) -> Floats:
-        since = self.times[0]
-        interpolated: Floats = np.interp(times - since, self.times - since, values)
-        return interpolated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
