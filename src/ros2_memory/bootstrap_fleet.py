@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import gc
 import os
 from contextlib import ExitStack
 from dataclasses import replace
@@ -101,13 +100,8 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     require_extra("lake: duckdb", "lake", "duckdb")
     opened = ExitStack()
     atexit.register(opened.close)
-    # DuckDB complains at the end about objects that the garbage collector may not look at.
-    opened.callback(gc.unfreeze)
     catalog = opened.enter_context(location.opened())
-    engine = instantiated(node, catalog=catalog, translated=location.translated)
-    lake = cast("Lake", engine)
-    opened.callback(lake.close)
-    return lake
+    return cast("Lake", instantiated(node, catalog=catalog, translated=location.translated))
 
 
 # ruff: noqa: PLC0415 - a server of one robot loads nothing of this
@@ -169,7 +163,7 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     Raises:
         ConfigError: the file of its places is refused.
     """
-    from ros2_memory.fleet.joined import JoinedIndex, JoinedReader
+    from ros2_memory.fleet.joined import JoinedIndex
     from ros2_memory.fleet.robots import Robot
 
     own = robot_settings(settings, name)
@@ -183,11 +177,7 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     shipped = _shipped(memory, lake, own, name, shared)
     if name not in settings.fleet.robots:
         return Robot(name, Path(name), shipped, in_lake=True)
-    both = replace(
-        shipped,
-        index=JoinedIndex(shipped.index, memory.index),
-        reader=JoinedReader(shipped.reader, memory.reader),
-    )
+    both = replace(shipped, index=JoinedIndex(shipped.index, memory.index))
     return Robot(name, own.recording.bag_dir, both, memory, in_lake=True)
 
 
@@ -197,7 +187,7 @@ def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: Share
     from ros2_memory.lake.memory import LakeIndex, LakeReader
 
     index = LakeIndex(lake, name, memory.index.bag_dir, memory.clock)
-    reader = LakeReader(index, shared.reader, shared.large)
+    reader = LakeReader(index, memory.reader, shared.large)
     store, reading = build_columns(own, shared.reader, name), reading_of(own, shared.schemas)
     scanner = Scanner(store, index.bag_dir, reading, shared.large, shared.caches)
     return replace(memory, index=index, reader=reader, scanner=scanner, memo=Memo())

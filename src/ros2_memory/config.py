@@ -464,7 +464,7 @@ class NullRecorderNode(AdapterNode):
 
 @section
 class DuckdbNode(AdapterNode):
-    """`lake=duckdb`: DuckDB inside of this process."""
+    """`lake=duckdb`: DuckDB, in a process of its own for each statement."""
 
     target: Literal["ros2_memory.lake.engine.Lake"] = Field(alias="_target_")
     memory_mb: Count

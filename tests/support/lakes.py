@@ -131,10 +131,9 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
     with where.opened() as catalog:
         lake = Lake(catalog, where.translated)
         assert [*lake.days("bags")] == ["hall"]
-        sql = "SELECT bag_id, label FROM sightings ORDER BY bag_id"
         files = chain.from_iterable(lake.days("sightings")["hall"].values())
-        found = lake.select(sql, "sightings", files).to_pylist()
-        lake.close()
+        found = lake.rows("sightings", files, ("bag_id", "label")).to_pylist()
+        assert lake.query("SELECT count(*) FROM sightings").rows == [[2]]
     assert [row["label"] for row in found] == ["cup", "cup"]
     assert len({row["bag_id"] for row in found}) == 2
 

@@ -10,15 +10,12 @@ import numpy as np
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import SetAside
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
@@ -118,71 +115,3 @@ def _made(shipped: Snapshot, own: Timeline, until: Ns) -> tuple[Timeline, tuple[
     unnamed = (SetAside(bag.path, _NAME_IN_USE) for bag in bags if bag.file in names_in_use)
     named = (bag for bag in bags if bag.file not in names_in_use)
     return shipped.timeline.changed((), named), tuple(unnamed)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JoinedReader(BagReader):
-    """An adapter of `BagReader`: reads the bags of a `JoinedIndex`.
-
-    Attributes:
-        shipped: reads those of the lake.
-        own: reads all others, and decodes.
-    """
-
-    shipped: BagReader
-    own: BagReader
-
-    def _of(self, path: Path) -> BagReader:
-        return self.shipped if self.shipped.reads(path) else self.own
-
-    def reads(self, path: Path) -> bool:
-        """Returns whether one of them reads such a file."""
-        return self._of(path).reads(path)
-
-    def closing(self, path: Path) -> Closing:
-        """Returns whether the writer has finished the file."""
-        return self._of(path).closing(path)
-
-    def summarize(self, path: Path) -> BagSummary:
-        """Returns the summary of a bag."""
-        return self._of(path).summarize(path)
-
-    def records(
-        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
-    ) -> Iterator[Record]:
-        """Yields the messages of a bag."""
-        return self._of(path).records(path, topics, window, newest_first=newest_first)
-
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """Returns the newest message of a bag in a window."""
-        return self._of(path).newest(path, topic, window)
-
-    def batches(
-        self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
-    ) -> Iterator[Batch]:
-        """Yields the messages of a bag, many at once."""
-        return self._of(path).batches(path, topics, window, bare=bare)
-
-    def times_alone(self, path: Path) -> Collection[str]:
-        """Returns the topics of which a bag has times, and no payloads."""
-        return self._of(path).times_alone(path)
-
-    def is_file(self, path: Path) -> bool:
-        """Returns whether a bag is a file: whether it is the robot's own."""
-        return self._of(path).is_file(path)
-
-    def channels(self, path: Path) -> Sequence[Channel]:
-        """Returns the channels of a bag."""
-        return self._of(path).channels(path)
-
-    def undecodable(self, channel: Channel) -> str | None:
-        """Returns why no message of this channel can be decoded; None if its type is known."""
-        return self.own.undecodable(channel)
-
-    def decode(self, record: Record) -> object:
-        """Decodes a message."""
-        return self.own.decode(record)
-
-    def definition(self, channel: Channel) -> Definition | None:
-        """Returns the fields of a channel's messages."""
-        return self.own.definition(channel)

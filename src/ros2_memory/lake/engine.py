@@ -1,7 +1,7 @@
-"""Reads a lake: DuckDB, inside of this process, over the files that its tables have now.
+"""Reads a lake: the files that its tables have now.
 
-DuckDB is given the data files that hold what a question is about, and never looks at the lake's
-catalogue itself. It loads no extension.
+Arrow reads the files that hold what a question is about, for itself and for DuckDB, which answers
+statements in a process of its own and never looks at the lake's catalogue.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import time
 from collections import defaultdict
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import chain
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final
 
-import duckdb
 import pyarrow as pa
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
@@ -23,7 +22,7 @@ from pyiceberg.io.pyarrow import PyArrowFileIO
 from ros2_memory.core.errors import BusyError, RefusedError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.lake.select import SETTINGS, Select, TableFiles
+from ros2_memory.lake.select import Select, TableFiles
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.lake.warehouse import Partitions
 from ros2_memory.storage.cache import ByteLru
@@ -31,6 +30,7 @@ from ros2_memory.storage.cache import ByteLru
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
+    import pyarrow.compute as pc
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
@@ -40,22 +40,21 @@ if TYPE_CHECKING:
 
 _AT_ONCE: Final = 2
 """Statements that are answered at once: each may take `memory_mb`."""
+_BIT_BY_BIT: Final = {"batch_size": 128, "batch_readahead": 1, "fragment_readahead": 1}
+"""How Arrow reads rows that may be large."""
 _MESSAGE_BYTES: Final = 16 << 20
 _CHANNEL_BYTES: Final = 8 << 20
 
 log = get_logger(__name__)
 
 
-Parameters: TypeAlias = "Mapping[str, str | int | float | Sequence[str]]"
-
-
 class Lake:
-    """The tables of a lake as they are now, and DuckDB, which reads them. Thread-safe.
+    """The tables of a lake as they are now. Thread-safe.
 
     Args:
         catalog: of the tables.
         translated: turns the errors of catalogues and stores into those of this program.
-        memory_mb: how much memory DuckDB may use.
+        memory_mb: how much memory DuckDB may use for a statement.
         threads: how many threads; None for one for each core.
 
     Attributes:
@@ -70,10 +69,6 @@ class Lake:
         memory_mb: int = 1024,
         threads: int | None = None,
     ) -> None:
-        settings = {**SETTINGS, "memory_limit": f"{memory_mb}MiB"}
-        if threads:
-            settings["threads"] = str(threads)
-        self._database = duckdb.connect(config={**settings})
         self._memory_mb, self._threads = memory_mb, threads
         self._turns = threading.BoundedSemaphore(_AT_ONCE)
         self._catalog, self._translated = catalog, translated
@@ -82,12 +77,7 @@ class Lake:
         self._lock = threading.Lock()
         self._looked_at = -math.inf
         self._tables: dict[str, IcebergTable] = {}
-        self._types: dict[str, Mapping[str, str]] = {}
         self._partitions: defaultdict[str, Partitions] = defaultdict(Partitions)
-
-    def close(self) -> None:
-        """Closes DuckDB's database, which is in memory."""
-        self._database.close()
 
     def refresh(self, within_s: float = 0.0) -> None:
         """Looks for what was committed since, unless that was done within so many seconds.
@@ -113,22 +103,29 @@ class Lake:
             table = self._loaded_table(name)
             return {} if table is None else self._partitions[name].look(table)
 
-    def select(
-        self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
+    def rows(
+        self,
+        name: str,
+        files: Iterable[LakeFile],
+        columns: Sequence[str],
+        condition: pc.Expression | None = None,
     ) -> pa.Table:
-        """Returns the rows of one select `FROM` a table, in no order without `ORDER BY`.
+        """Returns the rows of a table in some of its files, if any, in no order.
 
-        It is over some files of the table, if any; a column that a file lacks is null there.
-        `$name` is the parameter of that name, whose text is never SQL; a list is for `IN $name`.
+        A column that a file lacks is null there. `condition`: of which rows; None: of all.
 
         Raises:
             RefusedError: a file cannot be read; the log has why.
         """
-        # A cursor of its own, which alone knows the table.
-        with _reported(), self._database.cursor() as cursor:
-            rows = self._files_of(name, files).rows(name, cursor)
-            bound = {**(parameters or {})}
-            return cursor.sql(f"WITH {name} AS ({rows}) {sql}", params=bound).to_arrow_table()
+        try:
+            rows = self._files_of(name, files).dataset()
+            return rows.to_table([*columns], filter=condition, **_BIT_BY_BIT)
+        except (OSError, pa.ArrowException) as error:
+            # The error leaves out its sentence, as it may have a path or a key.
+            kind = type(error).__name__
+            log.warning("lake_engine_failed", reason=f"{kind}: {error}")
+            text = f"the lake cannot be read ({kind}); the server's log has the reason"
+            raise RefusedError(text) from error
 
     def query(
         self,
@@ -155,7 +152,7 @@ class Lake:
         for name in TABLES:
             is_named = re.search(rf"\b{name}\b", sql, re.IGNORECASE)
             files = self._files_for(robots, name) if is_named else ()
-            tables[name] = self._files_of(name, files, by_arrow=True)
+            tables[name] = self._files_of(name, files)
         select = Select(sql, self._memory_mb, self._threads, most_rows, most_chars)
         left_s = max(0.0, min(deadline.left_s(), threading.TIMEOUT_MAX))
         if not self._turns.acquire(timeout=left_s):
@@ -175,9 +172,9 @@ class Lake:
         Raises:
             RefusedError: the lake cannot be read.
         """
-        sql = "SELECT robot, max(end_ns) AS newest FROM bags GROUP BY robot ORDER BY robot"
-        rows = self.select(sql, "bags", self._files_for(robots, "bags")).to_pylist()
-        return {row["robot"]: row["newest"] for row in rows}
+        rows = self.rows("bags", self._files_for(robots, "bags"), ("robot", "end_ns"))
+        newest = rows.group_by("robot").aggregate([("end_ns", "max")]).sort_by("robot")
+        return dict(zip(newest["robot"].to_pylist(), newest["end_ns_max"].to_pylist(), strict=True))
 
     def _files_for(self, robots: Collection[str] | None, name: str) -> Iterator[LakeFile]:
         """Yields the files of a table that have rows of some robots; None: of any."""
@@ -185,30 +182,16 @@ class Lake:
             if robots is None or robot in robots:
                 yield from chain.from_iterable(days.values())
 
-    def _files_of(
-        self, name: str, files: Iterable[LakeFile], *, by_arrow: bool = False
-    ) -> TableFiles:
-        """Returns some files of a table. DuckDB reads local ones itself, within its limits.
-
-        `by_arrow`: Arrow reads them, so that DuckDB needs to open none.
-        """
+    def _files_of(self, name: str, files: Iterable[LakeFile]) -> TableFiles:
+        """Returns some files of a table, and what reads them."""
         places = [PyArrowFileIO.parse_location(file.location) for file in files]
-        paths = [path for *_, path in places]
+        paths, schema = [path for *_, path in places], TABLES[name].arrow_schema
         if {scheme for scheme, *_ in places} <= {"file"}:
-            return TableFiles(self._types_of(name), paths, ("file", "", {}) if by_arrow else None)
+            return TableFiles(schema, paths)
         with self._looking():
             table = self._loaded_table(name)
         properties = {} if table is None else dict(table.io.properties)
-        return TableFiles(self._types_of(name), paths, (*places[0][:2], properties))
-
-    def _types_of(self, name: str) -> Mapping[str, str]:
-        """Returns the type that DuckDB has for each column of a table."""
-        if name not in self._types:
-            with self._database.cursor() as cursor:
-                cursor.register("rows", TABLES[name].arrow_schema.empty_table())
-                described = cursor.execute("DESCRIBE rows").fetchall()
-            self._types[name] = {column: kind for column, kind, *_ in described}
-        return self._types[name]
+        return TableFiles(schema, paths, *places[0][:2], properties)
 
     @contextmanager
     def _looking(self) -> Iterator[None]:
@@ -222,16 +205,3 @@ class Lake:
             except NoSuchTableError:
                 return None
         return self._tables[name]
-
-
-@contextmanager
-def _reported() -> Iterator[None]:
-    """Logs why files cannot be read; the error leaves it out, as it may have a path or a key."""
-    try:
-        yield
-    except (duckdb.Error, OSError, pa.ArrowException) as error:
-        # Its sentence alone: a traceback with variables would show the keys of a store.
-        kind = type(error).__name__
-        log.warning("lake_engine_failed", reason=f"{kind}: {error}")
-        text = f"the lake cannot be read ({kind}); the server's log has the reason"
-        raise RefusedError(text) from error

@@ -13,6 +13,8 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, cast
 from zlib import crc32
 
+import pyarrow.compute as pc
+
 from ros2_memory.columns.pack import is_large
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
@@ -50,19 +52,11 @@ _LOOKS: Final = 4
 _GONE: Final = "it is not in the lake any more"
 _HEAD_BYTES: Final = 200
 
-_BAGS: Final = (
-    f"SELECT {', '.join(ShippedBag._fields)}, summary, counts, joined FROM bags"  # noqa: S608 - constants
-    " ORDER BY start_ns, end_ns, bag_id"
-)
-_HEADS: Final = (
-    "SELECT bag_id, channel, has_payloads, metadata, type, schema_encoding, schema, topic,"
-    " encoding, latched FROM channels"
-    " WHERE bag_id IN $bags AND bag_id >= $first AND bag_id <= $last ORDER BY bag_id, channel"
-)
-_PACKED: Final = (
-    "SELECT bag_id, channel, packed FROM channels WHERE topic IN $topics"
-    " AND bag_id IN $bags AND bag_id >= $first AND bag_id <= $last"
-)
+_BAGS: Final = (*ShippedBag._fields, "summary", "counts", "joined")
+_IN_ORDER: Final = [(column, "ascending") for column in ("start_ns", "end_ns", "bag_id")]
+_CHANNEL: Final = ("topic", "encoding", "latched", "metadata", "type", "schema_encoding", "schema")
+_HEADS: Final = ("bag_id", "channel", "has_payloads", *_CHANNEL)
+_PACKED: Final = ("bag_id", "channel", "packed")
 
 
 class LakeBag(NamedTuple):
@@ -195,21 +189,8 @@ class LakeIndex:
         joined = (window.joined.get(recording) for window in self._windows.values())
         return next(filter(None, joined), ())
 
-    def bag(self, path: Path) -> LakeBag:
-        """Returns the bag of a snapshot that has a path there.
-
-        Raises:
-            BagVanishedError: it is not in the lake any more.
-        """
-        if bag := self._known(path):
-            return bag
-        raise BagVanishedError(str(path), _GONE)
-
-    def has(self, path: Path) -> bool:
-        """Returns whether a bag of a snapshot has a path."""
-        return self._known(path) is not None
-
-    def _known(self, path: Path) -> LakeBag | None:
+    def bag(self, path: Path) -> LakeBag | None:
+        """Returns the bag of a snapshot that has a path there; None if there is none."""
         bags = (window.bags.get(str(path)) for window in self._windows.values())
         return next(filter(None, bags), None)
 
@@ -238,7 +219,8 @@ class LakeIndex:
 
     def _read(self, made_of: Days, known: Mapping[str, LakeBag]) -> dict[str, LakeBag]:
         """Returns the bags of some days by path; those that are known keep path and object."""
-        rows = self.lake.select(_BAGS, "bags", chain.from_iterable(made_of.values()))
+        files = chain.from_iterable(made_of.values())
+        rows = self.lake.rows("bags", files, _BAGS).sort_by(_IN_ORDER)
         owners = {path: bag.bag_id for path, bag in known.items()}
         schemas: dict[str, SummarySchema] = {}
         together, day = dict[str, int](), date.min
@@ -284,33 +266,33 @@ class _Head(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class LakeReader(BagReader):
-    """An adapter of `BagReader`: the bags of one robot in a lake.
+    """An adapter of `BagReader`: the bags of one robot in a lake, and all others as its own reader.
 
     Of images, clouds, scans and the like a lake has the times alone: to read their payloads is
     refused.
 
     Attributes:
-        index: its bags.
-        decoder: decodes messages, as it does those of files.
+        index: the bags of the lake.
+        own: reads others, and decodes.
         large: the turn to hold much of a bag.
     """
 
     index: LakeIndex
-    decoder: BagReader
+    own: BagReader
     large: LargeReads
 
     def reads(self, path: Path) -> bool:
-        """Returns whether a bag of the index has this path."""
-        return self.index.has(path)
+        """Returns whether it is a bag of the index, or one that the robot's own reader reads."""
+        return self.index.bag(path) is not None or self.own.reads(path)
 
     def closing(self, path: Path) -> Closing:
-        """Returns that the bag is closed: others are not shipped."""
-        del path
-        return Closing.CLOSED
+        """Returns whether the writer has finished a bag: none is shipped before."""
+        return Closing.CLOSED if self.index.bag(path) else self.own.closing(path)
 
     def summarize(self, path: Path) -> BagSummary:
-        """Returns the summary of a bag of the index."""
-        return self.index.bag(path).file.summary
+        """Returns the summary of a bag."""
+        bag = self.index.bag(path)
+        return bag.file.summary if bag else self.own.summarize(path)
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
@@ -320,13 +302,10 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone.
         """
-        step = -1 if newest_first else 1
-        merged = heapq.merge(
-            *(_in_order(batch, step) for batch in self.batches(path, topics, window)),
-            key=itemgetter(0, 1),
-            reverse=newest_first,
-        )
-        yield from (record for *_, record in merged)
+        bag = self.index.bag(path)
+        if bag is None:
+            return self.own.records(path, topics, window, newest_first=newest_first)
+        return self._records(bag, topics, window, -1 if newest_first else 1)
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
@@ -336,8 +315,53 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
         """
-        lake_bag = self.index.bag(path)
-        wanted = [head for head in self._heads_of(lake_bag) if head.channel.topic in topics]
+        bag = self.index.bag(path)
+        if bag is None:
+            return self.own.batches(path, topics, window, bare=bare)
+        return self._batches(bag, topics, window, bare)
+
+    def times_alone(self, path: Path) -> Collection[str]:
+        """Returns the topics whose payloads were not shipped: their messages are large."""
+        if (bag := self.index.bag(path)) is None:
+            return self.own.times_alone(path)
+        return {head.channel.topic for head in self._heads_of(bag) if not head.has_payloads}
+
+    def is_file(self, path: Path) -> bool:
+        """Returns whether a bag is a file: whether it is the robot's own."""
+        return self.index.bag(path) is None
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Returns the channels of a bag; of one in the lake those that have messages."""
+        if (bag := self.index.bag(path)) is None:
+            return self.own.channels(path)
+        return [head.channel for head in self._heads_of(bag)]
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Returns why no message of this channel can be decoded; None if its type is known."""
+        return self.own.undecodable(channel)
+
+    def decode(self, record: Record) -> object:
+        """Decodes a message as that of a file."""
+        return self.own.decode(record)
+
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns the fields of a channel's messages, as of that of a file."""
+        return self.own.definition(channel)
+
+    def _records(
+        self, bag: LakeBag, topics: Collection[str], window: TimeWindow, step: int
+    ) -> Iterator[Record]:
+        merged = heapq.merge(
+            *(_in_order(batch, step) for batch in self._batches(bag, topics, window)),
+            key=itemgetter(0, 1),
+            reverse=step < 0,
+        )
+        yield from (record for *_, record in merged)
+
+    def _batches(
+        self, bag: LakeBag, topics: Collection[str], window: TimeWindow, bare: Collection[str] = ()
+    ) -> Iterator[Batch]:
+        wanted = [head for head in self._heads_of(bag) if head.channel.topic in topics]
         names = sorted({head.channel.topic for head in wanted})
         for head in wanted:
             topic = head.channel.topic
@@ -345,44 +369,18 @@ class LakeReader(BagReader):
                 do = "name it in lake.messages of ros2-memory ship, ask about other topics"
                 why = f"the lake has only the times of {topic}, whose messages are large"
                 raise NotInLakeError(f"{why}: {do}, or ask the robot's own memory")
-            data = self._packed_of(lake_bag, head.number, names)
+            data = self._packed_of(bag, head.number, names)
             if data is None:
-                raise BagError(str(path), f"the lake has no messages of {topic} any more")
+                raise BagError(bag.file.file, f"the lake has no messages of {topic} any more")
             if is_large(data):
                 self.large.acquire()
             try:
                 batch = unpacked_messages(data, head.channel)
             except ValueError as error:
-                raise BagError(str(path), f"{topic} in the lake: {error}") from error
+                raise BagError(bag.file.file, f"{topic} in the lake: {error}") from error
             inside = (batch.log_times >= window.start) & (batch.log_times < window.stop)
             if inside.any():
                 yield batch if inside.all() else batch.taken(inside)
-
-    def times_alone(self, path: Path) -> Collection[str]:
-        """Returns the topics whose payloads were not shipped: their messages are large."""
-        heads = self._heads_of(self.index.bag(path))
-        return {head.channel.topic for head in heads if not head.has_payloads}
-
-    def is_file(self, path: Path) -> bool:
-        """Returns False."""
-        del path
-        return False
-
-    def channels(self, path: Path) -> Sequence[Channel]:
-        """Returns the channels of which the bag has messages."""
-        return [head.channel for head in self._heads_of(self.index.bag(path))]
-
-    def undecodable(self, channel: Channel) -> str | None:
-        """Returns why no message of this channel can be decoded; None if its type is known."""
-        return self.decoder.undecodable(channel)
-
-    def decode(self, record: Record) -> object:
-        """Decodes a message as that of a file."""
-        return self.decoder.decode(record)
-
-    def definition(self, channel: Channel) -> Definition | None:
-        """Returns the fields of a channel's messages, as of that of a file."""
-        return self.decoder.definition(channel)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
         """Returns the channels of a bag; those of the bags beside it are read with it, and cached.
@@ -406,7 +404,8 @@ class LakeReader(BagReader):
     def _read_heads(self, bag: LakeBag) -> dict[str, list[_Head]]:
         """Returns the channels of a bag and of those that are read with it, by the ids of bags."""
         heads_by_bag: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
-        for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
+        rows = self._rows(bag, [*bag.together], _HEADS).to_pylist()
+        for row in sorted(rows, key=itemgetter("channel")):
             schema = Schema(row["type"], row["schema_encoding"], row["schema"])
             metadata = tuple((key, value) for key, value in json.loads(row["metadata"]))
             channel = Channel(row["topic"], row["encoding"], schema, row["latched"], metadata)
@@ -428,21 +427,26 @@ class LakeReader(BagReader):
             near, ids = _NEAR_BYTES // (largest * len(topics)), [*bag.together]
             at = ids.index(bag.bag_id)
             bags = ids[max(at - near, 0) : at + near + 1]
-            for row in self._select(_PACKED, bag, bags, topics=topics).to_pylist():
+            for row in self._rows(bag, bags, _PACKED, topics).to_pylist():
                 key = (row["bag_id"], bag.together[row["bag_id"]], row["channel"])
                 messages.put(key, row["packed"], len(row["packed"]))
                 if key == (bag.bag_id, bag.file.sidecar_ns, number):
                     packed = row["packed"]
         return packed
 
-    def _select(self, sql: str, bag: LakeBag, bags: list[str], **more: Sequence[str]) -> pa.Table:
-        """Returns the rows of a select over the channels of some bags of a day."""
+    def _rows(
+        self, bag: LakeBag, bags: list[str], columns: Sequence[str], topics: Sequence[str] = ()
+    ) -> pa.Table:
+        """Returns the channels of some bags of a day, of some topics or of all, in no order."""
         first, last = min(bags), max(bags)
-        lake = self.index.lake
-        of_day = lake.days("channels").get(self.index.robot, {}).get(bag.day, ())
+        of_day = self.index.lake.days("channels").get(self.index.robot, {}).get(bag.day, ())
         files = [file for file in of_day if file.first <= last and first <= file.last]
-        asked = {"bags": bags, "first": first, "last": last, **more}
-        return lake.select(sql, "channels", files, asked)
+        bag_id = pc.field("bag_id")
+        # The bounds let Arrow pass over groups of rows.
+        wanted = (bag_id >= first) & (bag_id <= last) & bag_id.isin(bags)
+        if topics:
+            wanted &= pc.field("topic").isin(topics)
+        return self.index.lake.rows("channels", files, columns, wanted)
 
 
 def _in_order(batch: Batch, step: int) -> Iterator[tuple[Ns, int, Record]]:

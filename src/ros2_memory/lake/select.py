@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import resource
 import signal
 import subprocess
@@ -20,9 +21,10 @@ import sys
 from dataclasses import asdict, dataclass
 from decimal import Decimal
 from itertools import chain
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import duckdb
+from pyarrow import dataset, fs
 
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -38,12 +40,11 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
 
     import pyarrow as pa
-    import pyarrow.dataset as ds
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Deadline
 
-SETTINGS: Final = {
+_SETTINGS: Final = {
     "autoinstall_known_extensions": "false",
     "autoload_known_extensions": "false",
     "python_enable_replacements": "false",
@@ -51,7 +52,8 @@ SETTINGS: Final = {
 """DuckDB loads no extension, and takes no variable of Python for a table."""
 _PROGRAM_MB: Final = 1024
 """Address space that Python, Arrow and the stacks of threads take beside DuckDB's memory."""
-_ALLOCATORS: Final = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2"}
+_PROGRAM: Final = f"from {__name__} import main; main()"
+ALLOCATORS: Final = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2"}
 """By default those of Arrow and of C reserve 2 GB of addresses for its threads."""
 _LOOKED_AGAIN_S: Final = 0.1
 _LONGEST_S: Final = 86_400.0
@@ -95,49 +97,33 @@ Node: TypeAlias = "dict[str, JsonValue]"
 log = get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class TableFiles:
-    """The rows of a table that a statement may read.
+class TableFiles(NamedTuple):
+    """The rows of a table that are read: all of some Parquet files.
 
     Attributes:
-        columns: the type that DuckDB has for each; a file that lacks one has nulls there.
+        schema: the columns; a file that lacks one has nulls there.
         paths: of the files.
-        store: by what Arrow reads them (scheme, host, and settings of the store); DuckDB itself
-            where it is None.
+        scheme: of the store that has them.
+        host: of that store, or its bucket.
+        properties: its settings, as pyiceberg names them.
     """
 
-    columns: Mapping[str, str]
+    schema: pa.Schema
     paths: Sequence[str]
-    store: tuple[str, str, Mapping[str, str]] | None = None
+    scheme: str = "file"
+    host: str = ""
+    properties: Mapping[str, str] | None = None
 
-    def rows(self, name: str, connection: duckdb.DuckDBPyConnection) -> str:
-        """Returns the select of these rows, for one connection."""
-        typed = (f'CAST(NULL AS {kind}) AS "{column}"' for column, kind in self.columns.items())
-        select = f"SELECT {', '.join(typed)} WHERE false"
-        if not self.paths:
-            return select
-        if self.store is None:
-            quoted = ", ".join("'{}'".format(path.replace("'", "''")) for path in self.paths)
-            of_files = f"read_parquet([{quoted}], union_by_name = true, hive_partitioning = false)"
-        else:
-            of_files = f"{name}_by_arrow"
-            schema = connection.sql(select).to_arrow_table().schema
-            connection.register(of_files, _dataset(self.paths, schema, *self.store))
-        return f"{select} UNION ALL BY NAME SELECT * FROM {of_files}"  # noqa: S608 - texts of ours
+    def dataset(self) -> dataset.Dataset:
+        """Returns the rows, which Arrow reads when it is asked for some."""
+        store: fs.FileSystem = fs.LocalFileSystem()
+        if self.scheme != "file":
+            # A server with a lake has imported all of this; the process of a statement has not.
+            from pyiceberg.io.pyarrow import PyArrowFileIO  # noqa: PLC0415
 
-
-def _dataset(
-    paths: Sequence[str], schema: pa.Schema, scheme: str, host: str, properties: Mapping[str, str]
-) -> ds.Dataset:
-    # A server with a lake has imported all of this; this process mostly needs half of it.
-    from pyarrow import dataset, fs  # noqa: PLC0415
-
-    store = fs.LocalFileSystem()
-    if scheme != "file":
-        from pyiceberg.io.pyarrow import PyArrowFileIO  # noqa: PLC0415
-
-        store = PyArrowFileIO({**properties}).fs_by_scheme(scheme, host)
-    return dataset.dataset([*paths], schema, format="parquet", filesystem=store)
+            properties = {**(self.properties or {})}
+            store = PyArrowFileIO(properties).fs_by_scheme(self.scheme, self.host)
+        return dataset.dataset([*self.paths], self.schema, format="parquet", filesystem=store)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,15 +153,13 @@ class Select:
             RefusedError: a file cannot be read, or it needs more memory.
         """
         left_s = min(deadline.left_s(), _LONGEST_S)
-        parts = {"select": asdict(self), "tables": _as_dicts(tables), "left_s": left_s}
-        request = json.dumps(parts)
-        command = [sys.executable, "-P", "-m", __name__]
+        request = pickle.dumps((self, tables, left_s))
+        command = [sys.executable, "-P", "-c", _PROGRAM]
         process = subprocess.Popen(  # noqa: S603 - this program
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **_ALLOCATORS},
+            env={**os.environ, **ALLOCATORS},
         )
         with process:
             try:
@@ -196,14 +180,14 @@ class Select:
 
     def rows(self, tables: Mapping[str, TableFiles]) -> Selected:
         """Returns the rows, as found in this process; raises as `run`."""
-        settings = {**SETTINGS, "memory_limit": f"{self.memory_mb}MiB", "temp_directory": ""}
+        settings = {**_SETTINGS, "memory_limit": f"{self.memory_mb}MiB", "temp_directory": ""}
         if self.threads:
             settings["threads"] = str(self.threads)
         with duckdb.connect(config={**settings}) as connection:
             try:
                 check_select(self.sql, tables, connection)
                 for name, files in tables.items():
-                    connection.execute(f"CREATE TEMP VIEW {name} AS {files.rows(name, connection)}")
+                    connection.register(name, files.dataset())
                 connection.execute("SET enable_external_access = false")
                 connection.execute("SET lock_configuration = true")
                 return self._taken(connection.sql(self.sql))
@@ -244,9 +228,9 @@ class Select:
         return Selected(reader.schema.names, rows)
 
 
-def _printed(process: subprocess.Popen[str], request: str, deadline: Deadline) -> str:
+def _printed(process: subprocess.Popen[bytes], request: bytes, deadline: Deadline) -> bytes:
     """Returns what a process prints about a request; raises QueryTimeoutError."""
-    given: str | None = request
+    given: bytes | None = request
     while not deadline.expired():
         try:
             text, _ = process.communicate(given, timeout=_LOOKED_AGAIN_S)
@@ -335,10 +319,6 @@ def _too_much(memory_mb: int) -> str:
     )
 
 
-def _as_dicts(tables: Mapping[str, TableFiles]) -> dict[str, JsonValue]:
-    return {name: asdict(files) for name, files in tables.items()}
-
-
 def _short(reason: str) -> str:
     return shortened(reason, _MOST_REASON_CHARS)
 
@@ -353,9 +333,7 @@ def _as_json(value: object) -> float | str:
 
 def main() -> None:
     """Answers the request on standard input, as JSON on standard output."""
-    request = json.load(sys.stdin)
-    select = Select(**request["select"])
-    tables = {name: TableFiles(**files) for name, files in request["tables"].items()}
+    select, tables, left_s = pickle.load(sys.stdin.buffer)  # noqa: S301 - of `Select.run`
     space = (select.memory_mb + _PROGRAM_MB) << 20
     for limit, most in (
         (resource.RLIMIT_AS, space),
@@ -364,7 +342,7 @@ def main() -> None:
     ):
         resource.setrlimit(limit, (most, most))
     # Should the one who asks be killed.
-    signal.setitimer(signal.ITIMER_REAL, max(request["left_s"], 0.0) + 1.0)
+    signal.setitimer(signal.ITIMER_REAL, max(left_s, 0.0) + 1.0)
     try:
         answer = asdict(select.rows(tables))
     except EpisodicError as error:
@@ -373,7 +351,3 @@ def main() -> None:
         cause = _short(cause)
         answer = {"error": error.code, "reason": str(error), "cause": cause}
     json.dump(answer, sys.stdout)
-
-
-if __name__ == "__main__":
-    main()

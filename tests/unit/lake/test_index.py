@@ -19,7 +19,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.lake.engine import Lake, Parameters
+from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.memory import newest
 from ros2_memory.lake.tables import day_of
 from ros2_memory.lake.warehouse import Days, LakeFile
@@ -40,12 +40,10 @@ class WatchedLake(Lake):
         super().__init__(lake_in(folder), memory_mb=256, threads=1)
         self.read: set[str] = set()
 
-    def select(
-        self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
-    ) -> pa.Table:
+    def rows(self, name: str, files: Iterable[LakeFile], *how: Any) -> pa.Table:
         files = [*files]
         self.read.update(file.location for file in files)
-        return super().select(sql, name, files, parameters)
+        return super().rows(name, files, *how)
 
     def days_read(self) -> set[date]:
         """The days of the files that were read since it was last asked."""
@@ -130,13 +128,13 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     shipping.ship([older + 60], label="fork")
     index.refresh()
     found: list[BagSummary] = []
-    select = shipping.lake.select
+    rows = shipping.lake.rows
 
-    def selected(*asked: Any) -> pa.Table:
+    def read(*asked: Any) -> pa.Table:
         found.append(robot.reader.summarize(bag.path))
-        return select(*asked)
+        return rows(*asked)
 
-    monkeypatch.setattr(shipping.lake, "select", selected)
+    monkeypatch.setattr(shipping.lake, "rows", read)
     assert len(index.snapshot(older * NS_PER_S).bags) == 3
     assert set(found) == {bag.summary}
 

@@ -11,10 +11,11 @@ import pytest
 
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.memo import Memo
-from ros2_memory.fleet.joined import JoinedIndex, JoinedReader
+from ros2_memory.fleet.joined import JoinedIndex
 from ros2_memory.fleet.robots import Fleet
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.engine import Lake
+from ros2_memory.lake.memory import LakeReader
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply
 from tests.support.lake_questions import every_question
@@ -42,7 +43,9 @@ class Fleets(NamedTuple):
 
 def joined_memory(of_lake: Memory, own: Memory) -> Memory:
     index = JoinedIndex(of_lake.index, own.index)
-    reader, scanner = JoinedReader(of_lake.reader, own.reader), Scanner(None, index.bag_dir)
+    assert isinstance(of_lake.reader, LakeReader)
+    reader = replace(of_lake.reader, own=own.reader)
+    scanner = Scanner(None, index.bag_dir)
     return replace(own, index=index, reader=reader, scanner=scanner, memo=Memo())
 
 
@@ -69,7 +72,6 @@ def fleets(
         joined = {name: joined_memory(of_lake[name], own[name]) for name in NAMES}
         whole = {name: memory_of(folder / name, clock=clock) for name in NAMES}
         yield Fleets(*(fleet_of(some, shared_map=True, now=NOW) for some in (whole, joined)))
-        lake.close()
 
 
 @pytest.mark.parametrize("name", NAMES)

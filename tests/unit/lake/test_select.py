@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.select import QUERY_LAKE, select_tools
 from ros2_memory.history.context import Call
 from ros2_memory.lake.engine import Lake
-from ros2_memory.lake.select import Select, TableFiles, check_select
+from ros2_memory.lake.select import ALLOCATORS, Select, check_select
 from ros2_memory.lake.tables import TABLES
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, START_S, reply_of
@@ -46,13 +45,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def fleet(folder: Path) -> Iterator[Fleet]:
+def fleet(folder: Path) -> Fleet:
     lake = Lake(lake_in(folder / "lake"), memory_mb=256, threads=1)
     shipped = lake_robots(lake, [HALL, ATTIC])
     robots = [Robot(name, folder / name, memory) for name, memory in shipped.items()]
     robots.append(Robot(UNSHIPPED, folder / UNSHIPPED, memory_of(folder / UNSHIPPED)))
-    yield Fleet(robots, FixedClock(NOW), tables=lake)
-    lake.close()
+    return Fleet(robots, FixedClock(NOW), tables=lake)
 
 
 def asked(fleet: Fleet, select: str, call: Call | None = None, **given: object) -> Any:
@@ -122,20 +120,6 @@ def test_values_that_json_has_not_are_texts_and_longer_texts_are_marked(fleet: F
     assert len(asked(fleet, "SELECT error(repeat('x', 9999))")["detail"]) < 999
     named = asked(fleet, f"SELECT 1 AS {'n' * 9_500}, 2 AS {'m' * 9_900}")
     assert named["detail"] == "the names of the columns are longer than a reply may be"
-
-
-def test_files_that_lack_a_column_have_nulls_and_others_are_not_opened(folder: Path) -> None:
-    columns = {
-        "robot": "VARCHAR",
-        "time": "TIMESTAMP WITH TIME ZONE",
-        "new": "MAP(VARCHAR, DOUBLE)",
-    }
-    paths = [*map(str, (folder / "lake" / "ros2_memory" / "sightings").rglob("*.parquet"))]
-    select = Select("SELECT robot, new, time IS NULL FROM sightings ORDER BY robot", 256)
-    found = select.rows({"sightings": TableFiles(columns, paths, ("file", "", {}))})
-    assert found.rows == [[ATTIC, None, False]] * 2 + [[HALL, None, False]] * 3
-    with pytest.raises(RefusedError, match="cannot be read"):
-        select.rows({"sightings": TableFiles(columns, paths)})  # as DuckDB itself would read them
 
 
 REFUSED = [
@@ -224,11 +208,10 @@ def test_memory_that_duckdb_does_not_count_and_time_without_end_are_bounded(flee
 
 
 def test_its_process_ends_by_itself_should_the_server_be_killed() -> None:
-    request = {"select": asdict(Select(ENDLESS, 256, 1)), "tables": {}, "left_s": 0.0}
     left_alone = subprocess.run(
-        [sys.executable, "-P", "-m", "ros2_memory.lake.select"],
-        input=json.dumps(request),
-        text=True,
+        [sys.executable, "-c", "from ros2_memory.lake.select import main; main()"],
+        input=pickle.dumps((Select(ENDLESS, 256, 1), {}, 0.0)),
+        env={**os.environ, **ALLOCATORS},
         capture_output=True,
         timeout=60,
         check=False,
@@ -246,7 +229,6 @@ def test_a_file_that_is_damaged_is_reported_without_its_path(tmp_path: Path) -> 
     answer = asked(fleet, "SELECT * FROM sightings")
     assert answer["error"] == "refused"
     assert str(tmp_path) not in str(answer)
-    lake.close()
 
 
 SOURCES = (

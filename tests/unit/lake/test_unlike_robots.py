@@ -139,9 +139,7 @@ def answers_of_the_page(folder: Path) -> list[list[tuple[Any, ...]]]:
     page = (ROOT / "docs" / "how-to" / "lake.md").read_text(encoding="utf-8")
     lake = Lake(lake_in(folder))
     found = map(lake.query, re.findall(r"```sql\n(.*?);\n```", page, re.DOTALL))
-    answers = [[tuple(row) for row in selected.rows] for selected in found]
-    lake.close()
-    return answers
+    return [[tuple(row) for row in selected.rows] for selected in found]
 
 
 def test_statements_of_the_page_find_nothing_in_tables_without_rows(tmp_path: Path) -> None:
