@@ -8,7 +8,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
     BusyError,
@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import Selected
-    from ros2_memory.core.timebase import Deadline
+    from ros2_memory.lake.engine import Lake
 
 T = TypeVar("T")
 
@@ -141,20 +140,15 @@ class Robot:
 
     def _from_lake(self, call: Call) -> FromLake:
         """Returns what to report of an answer that a call got."""
-        published = self.memory.index.published
-        latest = None if published is None else published.latest
         own = None if self.own is None else self.own.index.published
         is_alone = own is None or own.problem is not None or not own.bags
-        return FromLake(latest, None if call.older == MAX_NS else call.older, is_alone)
+        return FromLake(self.latest, None if call.older == MAX_NS else call.older, is_alone)
 
-    def latest_known(self) -> Ns:
-        """Returns the log time of its newest data as of the last scan; the least before the first.
-
-        Nothing is scanned for it.
-        """
+    @property
+    def latest(self) -> Ns | None:
+        """The log time of its newest data as of the last scan, if there is one."""
         published = self.memory.index.published
-        latest = None if published is None else published.latest
-        return MIN_NS if latest is None else latest
+        return None if published is None else published.latest
 
 
 def _reaches_back(own: Memory, since: Callable[[Ns], Ns | None]) -> bool:
@@ -162,27 +156,6 @@ def _reaches_back(own: Memory, since: Callable[[Ns], Ns | None]) -> bool:
     snapshot = own.index.snapshot()
     begin = since(own.now(own.clock.now(), snapshot.latest))
     return begin is None or (snapshot.earliest is not None and begin >= snapshot.earliest)
-
-
-class LakeTables(Protocol):
-    """The tables of a lake, over which a statement is answered; see `lake.engine.Lake`."""
-
-    def columns(self) -> Mapping[str, Collection[str]]:
-        """Returns the columns of each table."""
-
-    def shipped_until(self, robots: Collection[str] | None) -> Mapping[str, Ns]:
-        """Returns the log time of the newest message that is there, of each robot, or of some."""
-
-    def query(
-        self,
-        sql: str,
-        robots: Collection[str] | None,
-        *,
-        most_rows: int | None,
-        most_chars: int | None,
-        deadline: Deadline | None,
-    ) -> Selected:
-        """Returns the rows of a SELECT."""
 
 
 class Fleet:
@@ -194,7 +167,7 @@ class Fleet:
         shared_map: whether coordinates mean the same place for all of them.
         join: returns the robots that a lake has besides those of some names, where there is one.
             It looks there, unless it did so a moment ago.
-        tables: those of the lake, where there is one.
+        tables: the lake, where there is one.
 
     Attributes:
         robots: all of them, by their names.
@@ -207,7 +180,7 @@ class Fleet:
         *,
         shared_map: bool = False,
         join: Callable[[Collection[str]], Iterable[Robot]] | None = None,
-        tables: LakeTables | None = None,
+        tables: Lake | None = None,
     ) -> None:
         self.robots: Mapping[str, Robot] = {robot.name: robot for robot in robots}
         self.clock, self.shared_map, self.join = clock, shared_map, join

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.fleet.robots import Fleet, LakeTables
+    from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.lake.engine import Lake
     from ros2_memory.tools.declaration import Tool
 
 QUERY_LAKE: Final = "query_lake"
@@ -33,16 +34,16 @@ _ROOM: Final = 0.8
 
 def select_tools(fleet: Fleet, max_chars: int) -> Iterator[Tool]:
     """Yields the tool, if the fleet has a lake. `max_chars`: how long a reply may be."""
-    if (tables := fleet.tables) is None:
+    if (lake := fleet.tables) is None:
         return
-    columns = "; ".join(f"{name}({', '.join(of)})" for name, of in tables.columns().items())
+    columns = "; ".join(f"{name}({', '.join(of)})" for name, of in lake.columns().items())
     declared = ToolDeclaration(
         (ToolName(QUERY_LAKE, "SELECT about robots"),),
         "Sums, counts and comparisons of many robots: one SELECT of DuckDB over what was shipped "
         "to the lake. *_ns are log times in ns; m, rad, s. poses are the track, events: stop, "
         f"drop, flip, error, thing. Tables: {columns}. Reply: {{{{fields, rows: [[...]], more}}}}.",
         SelectArguments,
-        partial(_answer, fleet, tables, max_chars),
+        partial(_answer, fleet, lake, max_chars),
         blocking=True,
         shows_example=True,
     )
@@ -51,7 +52,7 @@ def select_tools(fleet: Fleet, max_chars: int) -> Iterator[Tool]:
 
 def _answer(
     fleet: Fleet,
-    tables: LakeTables,
+    lake: Lake,
     max_chars: int,
     memory: Memory,
     call: Call,
@@ -63,15 +64,15 @@ def _answer(
     """Returns the rows, with up to when each robot was shipped.
 
     Raises:
-        EpisodicError: there is none; see `LakeTables.query`.
+        EpisodicError: there is none; see `Lake.query`.
     """
     del memory
     fleet.add_shipped()
     names = {chosen.name for chosen in fleet.chosen(robot, call)}
-    latest = tables.shipped_until(names)
+    latest = lake.shipped_until(names)
     if not latest:
         raise NoDataError(NoDataReason.EMPTY_MEMORY, "nothing was shipped to the lake", ())
-    found = tables.query(
+    found = lake.query(
         select,
         names,
         most_rows=limit,

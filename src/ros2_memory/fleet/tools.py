@@ -236,7 +236,7 @@ class _FleetQuestion:
                 f"{name} has coordinates, which each robot has in a map of its own: pass robot, or "
                 "where with the name of a place (fleet.shared_map is set where all share one map)"
             )
-        robots.sort(key=Robot.latest_known, reverse=True)
+        robots.sort(key=lambda robot: robot.latest or MIN_NS, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
         wanted = given.get("limit")
         if wanted is None:
