@@ -16,6 +16,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import pyarrow as pa
+from pyarrow.dataset import ParquetFragmentScanOptions
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
 
@@ -40,8 +41,11 @@ if TYPE_CHECKING:
 
 _AT_ONCE: Final = 2
 """Statements that are answered at once: each may take `memory_mb`."""
-_BIT_BY_BIT: Final = {"batch_size": 128, "batch_readahead": 1, "fragment_readahead": 1}
-"""How Arrow reads rows that may be large."""
+_FEW_ROWS: Final = 16
+_PAGE_BY_PAGE: Final = ParquetFragmentScanOptions(
+    use_buffered_stream=True, buffer_size=4 << 20, pre_buffer=False
+)
+"""How a column is read of which a group of rows may be larger than memory."""
 _MESSAGE_BYTES: Final = 16 << 20
 _CHANNEL_BYTES: Final = 8 << 20
 
@@ -118,8 +122,17 @@ class Lake:
             RefusedError: a file cannot be read; the log has why.
         """
         try:
-            rows = self._files_of(name, files).dataset()
-            return rows.to_table([*columns], filter=condition, **_BIT_BY_BIT)
+            rows, wanted = self._files_of(name, files).dataset(), [*columns]
+            if "packed" not in columns:
+                return rows.to_table(wanted, filter=condition)
+            return rows.to_table(
+                wanted,
+                filter=condition,
+                batch_size=_FEW_ROWS,
+                batch_readahead=1,
+                fragment_readahead=1,
+                fragment_scan_options=_PAGE_BY_PAGE,
+            )
         except (OSError, pa.ArrowException) as error:
             # The error leaves out its sentence, as it may have a path or a key.
             kind = type(error).__name__
