@@ -15,7 +15,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.closed_form import (
@@ -129,3 +129,13 @@ def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -
     for waypoint in answer.trajectory.waypoints:
         x, y = position(session.since(unix_from_ns(waypoint.time)))
         assert math.dist(waypoint.position[:2], (x, y)) < 0.005
+
+
+def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Session) -> None:
+    begin, end = spanned(memory, session)
+    span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
+    for sample in queries.topic_range(memory, Call(), "/odom", span, max_samples=60).samples:
+        again = queries.topic_value(
+            memory, Call(), "/odom", AtTime(at_s=unix_rounded_up(sample.time)), tolerance_s=0.0
+        )
+        assert again.sample.time == sample.time
