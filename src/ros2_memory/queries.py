@@ -55,6 +55,7 @@ from ros2_memory.history.driven_path import (
     Body,
     body_of,
     driven_path,
+    length_notes,
     newest_of_body,
     resolve_path_topic,
 )
@@ -114,8 +115,9 @@ from ros2_memory.places.pose_frames import (
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.extract import Extracted
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
@@ -125,6 +127,8 @@ A = TypeVar("A", results.Match, results.ValueWhen)
 
 _MAX_ODD_BAGS: Final = 5
 _FEWEST_OF_A_LINE: Final = 2
+_FINE_PATH_M: Final = 0.05 + 1e-9
+"""The deviation that a simplified path is expected to have; a larger one is noted."""
 _REACH_M: Final = 0.05
 """How far a robot may have got before the next pose without a note."""
 _THINNED_POSES_NS: Final = 3 * NS_PER_S
@@ -400,7 +404,7 @@ def find_last_match(
             after = seconds(match.time - counted_from)
             view.notes.add(f"dated {after} after now: when it was is unknown")
         value_found = _as_value(view, match, fields, None if is_future else counted_from)
-        return results.Match(value_found, notes=view.notes.sentences())
+        return results.Match(value_found, notes=value_found.notes)
 
     reach = min(now, until)
     sought = _Sought(topic, condition_type, value, field, min_score, until)
@@ -439,13 +443,15 @@ def value_when(
         note_unread(view, read, nothing=not held)
         if held is None:
             view.notes.add(f"{name} held no message yet at {unix_text(match.time)}")
-            return results.ValueWhen(matched, notes=view.notes.sentences())
+            notes = (*matched.notes, *view.notes.sentences())
+            return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
         distance = match.time - held.time
         latched = still_holds(view, held, match.time)
         if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
             view.notes.add(f"the value is {seconds(distance)} older than the match")
         held_value = _with_latched_age(view, _as_value(view, held, fields, None), held, match.time)
-        return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
+        notes = (*matched.notes, *held_value.notes)
+        return results.ValueWhen(matched, held_value, notes=tuple(dict.fromkeys(notes)))
 
     sought = _Sought(condition_topic, condition_type, value, field, min_score, until)
     return _last_match(view, now, sought, found)
@@ -621,8 +627,32 @@ def trajectory_summary(
         elapsed.skipped_between(path.first, path.last),
         driven.totals.gap_ns,
         away,
-        notes=view.notes.sentences(),
+        notes=(*view.notes.sentences(), *_path_notes(drawn)),
     )
+
+
+def _path_notes(path: Trajectory) -> Iterator[str]:
+    """Yields what a path leaves out, and how it was measured."""
+    yield from length_notes(path)
+    if path.totals.jumps:
+        drawn = sum(point.jump for point in path.waypoints)
+        if drawn:
+            longest = "the longest lead" if drawn < path.totals.jumps else "each leads"
+            yield (
+                f"of the jumps {longest} to a waypoint with jump: true; "
+                "that distance was not driven"
+            )
+    mean, fastest = path.avg_speed, path.max_speed
+    if path.poses and fastest is not None and path.max_speed_from == "positions":
+        yield "max_speed is measured from positions: the messages have no speed"
+    # By more than the rounding of both.
+    if mean is not None and fastest is not None and mean > fastest + 0.01:
+        yield (
+            "avg_speed, by the positions, is above max_speed of the messages: "
+            "one of the two is wrong"
+        )
+    if path.waypoint_error_m > _FINE_PATH_M:
+        yield f"the path is within {path.waypoint_error_m:.2f} m of the waypoints' line"
 
 
 def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> TimeWindow:

@@ -32,23 +32,19 @@ from ros2_memory.core.reply import (
 )
 from ros2_memory.core.text import quoted_keys
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_rounded_up
-from ros2_memory.history.driven_path import length_notes
 from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
 from ros2_memory.tools.reply_size import HEADERS, QUOTED, fit_reply, largest, to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import JsonValue
 
 _LONGEST_LAST_ROW_CHARS: Final = 200
 """Characters of the row that sums up those left out, whatever its numbers."""
 ROBOT_NAME: Final = "robot_name"
 """The key of the robot that an answer or a row is of, in a fleet; `robot` is where one was."""
-FINE_PATH_M: Final = 0.05 + 1e-9
-"""The deviation that a simplified path is expected to have; a larger one is noted."""
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
 _OF_WINDOW: Final = ("start", "end", "local", "at", "now")
@@ -216,24 +212,8 @@ def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
         case results.Things():
             reply = _things(answer, bag_dir)
         case _:
-            reply = render(_with_all_notes(answer), bag_dir)
+            reply = render(answer, bag_dir)
     return reply
-
-
-def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
-    """Returns an answer with the notes of its parts, without repetitions."""
-    match answer:
-        case results.Match(found=found) if found is not None:
-            return replace(answer, notes=tuple(dict.fromkeys((*found.notes, *answer.notes))))
-        case results.ValueWhen(matched=matched, value=value):
-            value_notes = () if value is None else value.notes
-            return replace(
-                answer, notes=tuple(dict.fromkeys((*matched.notes, *value_notes, *answer.notes)))
-            )
-        case results.TrajectorySummary():
-            return replace(answer, notes=(*answer.notes, *_path_notes(answer.trajectory)))
-        case _:
-            return answer
 
 
 def _at_each(answer: results.AtEach, bag_dir: Path) -> JsonObject:
@@ -347,26 +327,3 @@ def _things(answer: results.Things, bag_dir: Path) -> JsonObject:
         return render(few, bag_dir, _SHORT_THINGS)
 
     return first(largest(1, len(answer.things), lambda count: _is_short(first(count))) or 1)
-
-
-def _path_notes(path: Trajectory) -> Iterator[str]:
-    yield from length_notes(path)
-    if path.totals.jumps:
-        drawn = sum(point.jump for point in path.waypoints)
-        if drawn:
-            longest = "the longest lead" if drawn < path.totals.jumps else "each leads"
-            yield (
-                f"of the jumps {longest} to a waypoint with jump: true; "
-                "that distance was not driven"
-            )
-    mean, fastest = path.avg_speed, path.max_speed
-    if path.poses and fastest is not None and path.max_speed_from == "positions":
-        yield "max_speed is measured from positions: the messages have no speed"
-    # By more than the rounding of both.
-    if mean is not None and fastest is not None and mean > fastest + 0.01:
-        yield (
-            "avg_speed, by the positions, is above max_speed of the messages: "
-            "one of the two is wrong"
-        )
-    if path.waypoint_error_m > FINE_PATH_M:
-        yield f"the path is within {path.waypoint_error_m:.2f} m of the waypoints' line"
