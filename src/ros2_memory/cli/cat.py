@@ -1,17 +1,22 @@
 """`ros2-memory cat`: the messages of one topic, as lines for people, CSV, or JSON lines."""
 
-import csv
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from io import StringIO
 from itertools import islice
 from typing import Annotated, TypeAlias
 
 import typer
 
 from ros2_memory.cli.options import Bags, Times
-from ros2_memory.cli.output import escape, format_time, format_value, leaves, print_notes
+from ros2_memory.cli.output import (
+    csv_line,
+    format_time,
+    format_value,
+    leaves,
+    print_exactly,
+    print_notes,
+)
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted, listed
@@ -75,11 +80,7 @@ def cat(
         lines = (
             f"{format_time(unix_from_ns(time))}  {format_value(value)}" for time, value in rows
         )
-    count, is_screen = 0, sys.stdout.isatty()
-    for line in lines:
-        count += 1
-        print(escape(line) if is_screen else line)
-    sys.stdout.flush()
+    count = print_exactly(lines)
     note_unread(view, window)
     print_notes(view.notes.sentences())
     if not count:
@@ -136,16 +137,10 @@ def _csv(rows: Iterable[Row]) -> Iterator[str]:
             cells[name or "value"] = inner if isinstance(inner, str | None) else text
         if columns is None:
             columns = [*cells]
-            yield _csv_line(["time", *columns])
+            yield csv_line(["time", *columns])
         beside.update(cells.keys() - columns)
         seconds, nanoseconds = divmod(time, NS_PER_S)
-        yield _csv_line([f"{seconds}.{nanoseconds:09d}", *map(cells.get, columns)])
+        yield csv_line([f"{seconds}.{nanoseconds:09d}", *map(cells.get, columns)])
     if beside:
         names = listed(sorted(beside))
         print_notes([f"no column, as the first message has no such field: {names}"])
-
-
-def _csv_line(cells: Sequence[object]) -> str:
-    line = StringIO()
-    csv.writer(line, lineterminator="").writerow(cells)
-    return line.getvalue()

@@ -6,12 +6,14 @@ it never reach the terminal.
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 import re
 import sys
 from contextlib import contextmanager, suppress
+from io import StringIO
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -77,6 +79,23 @@ def print_line(line: str) -> None:
 def print_json(value: object) -> None:
     """Prints a value for programs, as a line on stdout."""
     print_line(json.dumps(value))
+
+
+def print_exactly(lines: Iterable[str]) -> int:
+    """Prints lines for programs, on a terminal without control characters; returns how many."""
+    count, is_screen = 0, sys.stdout.isatty()
+    for line in lines:
+        count += 1
+        print(escape(line) if is_screen else line)
+    sys.stdout.flush()
+    return count
+
+
+def csv_line(cells: Iterable[object]) -> str:
+    """Returns a row of CSV, without the line's end."""
+    line = StringIO()
+    csv.writer(line, lineterminator="").writerow(cells)
+    return line.getvalue()
 
 
 @contextmanager

@@ -1,14 +1,12 @@
 """`ros2-memory sql`: a select over the tables of a lake."""
 
-import csv
-import sys
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from ros2_memory.bootstrap_fleet import open_lake
 from ros2_memory.cli.options import AsJson, Overrides, load_for
-from ros2_memory.cli.output import print_line, print_reply
+from ros2_memory.cli.output import csv_line, print_exactly, print_line, print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.tools.reply_size import to_json_text
 
@@ -40,9 +38,7 @@ def sql(
         raise InvalidArgumentsError(f"{settings.lake.warehouse}: there is no lake, or no bag in it")
     found = lake.query(select)
     if as_csv:
-        writer = csv.writer(sys.stdout, lineterminator="\n")
-        writer.writerow(found.columns)
-        writer.writerows(found.rows)
+        print_exactly([csv_line(found.columns), *map(csv_line, found.rows)])
         return
     if len(set(found.columns)) < len(found.columns):
         raise InvalidArgumentsError("two columns have one name: give one another with AS, or --csv")

@@ -199,7 +199,7 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
 
 
 def test_a_select_is_answered_over_the_tables_as_they_are_now(
-    ship: Ship, tmp_path: Path, exits: Program
+    ship: Ship, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ship(0)
     counted, of_lake = (
@@ -217,6 +217,9 @@ def test_a_select_is_answered_over_the_tables_as_they_are_now(
     assert row == {"a": 0.5, "b": None, "c": {"x": 1}, "d": "01", "e": "2026-11-20"}
     assert "two columns have one name" in exits(2, "sql 'SELECT 1 AS a, 2 AS a'", *of_lake).err
     assert exits(0, "sql --csv 'SELECT 1 AS a, 2 AS a'", *of_lake).out == "a,a\n1,2\n"
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.stdout, "isatty", lambda: True)
+        assert exits(0, "sql --csv 'SELECT chr(27) AS a'", *of_lake).out == "a\n\\x1b\n"
     refused = exits(2, "sql 'SELECT * FROM chanels'", *of_lake).err
     assert 'there is no table "chanels"' in refused
     assert "the tables are channels, poses" in refused
