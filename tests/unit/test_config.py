@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.bootstrap import query_settings_of
 from ros2_memory.config import (
     Settings,
     load_labels,
@@ -350,6 +351,14 @@ class TestLabels:
             "mug": ("coffee mug", "Mug"),
             "remote control": ("tv-remote",),
         }
+
+    def test_reach_the_queries(self, tmp_path: Path) -> None:
+        path = tmp_path / "labels.yaml"
+        path.write_text("labels: {mug: [coffee mug]}")
+        settings = load_settings([f"data.labels_file='{path}'", "data.min_score=0.3"], {})
+        limits = query_settings_of(settings)
+        assert limits.labels == {"mug": ("coffee mug",)}
+        assert limits.min_score == 0.3
 
     @pytest.mark.parametrize(
         ("text", "fragment"),

@@ -310,6 +310,15 @@ def test_a_time_that_is_printed_is_read_back_to_the_microsecond(us: int) -> None
 
 
 @pytest.mark.usefixtures("folder")
+def test_times_and_durations_of_tools_may_be_words(exits: Program) -> None:
+    told = exits(0, "ask get_position_at b --json", 'timestamps=["1s","3 seconds ago"]').json
+    times = [row["timestamp"] for row in told["results"]]
+    assert times == [1_700_000_102.0, 1_700_000_100.0]
+    assert exits(0, "ask get_position_seconds_ago b --json seconds_ago=2s").json["y"] == 1.0
+    assert "'soon' is not a time" in exits(2, "ask recap b start=soon").err
+
+
+@pytest.mark.usefixtures("folder")
 def test_a_path_may_come_before_a_tool(exits: Program) -> None:
     asked = exits(0, "ask data_time_range a").out
     assert exits(0, "ask a data_time_range").out == asked

@@ -3,12 +3,15 @@ from __future__ import annotations
 import io
 import os
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 from mcap.reader import make_reader
+from rich.console import Console
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from ros2_memory.cli import output
 from ros2_memory.cli.maintenance.recover import RecoveryOutcome, recover_files
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
@@ -167,6 +170,20 @@ def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     outcome, printed = recovered(tmp_path)
     assert outcome == RecoveryOutcome()
     assert printed[0].startswith("1 bag file of another kind was left alone")
+
+
+def test_a_terminal_sees_which_file_is_repaired_and_then_a_clean_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left_open(tmp_path / "a/a_0.mcap")
+    terminal = io.StringIO()
+    monkeypatch.setattr(
+        output, "Console", partial(Console, file=terminal, force_terminal=True, width=100)
+    )
+    recovered(tmp_path)
+    shown = terminal.getvalue()
+    assert "repairing a/a_0.mcap (1 of 1)" in shown
+    assert "\x1b[2K" in shown.rpartition("repairing")[2]
 
 
 class TestTheProgram:

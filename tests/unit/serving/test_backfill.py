@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import sys
 from contextlib import closing
@@ -151,6 +152,21 @@ async def test_what_is_stored_of_many_deleted_bags_goes_with_the_next_round(tmp_
     memory.index.refresh()
     await backfill.fill()
     assert stored(memory) == ["rec/rec_4.mcap", "rec/rec_5.mcap"]
+
+
+def test_that_a_stored_bag_has_changed_is_no_reason_to_look_for_deleted_ones_again(
+    tmp_path: Path,
+) -> None:
+    path, _ = bag(tmp_path, 0), bag(tmp_path, 1)
+    memory, backfill = storing(tmp_path)
+    fill_store(backfill)
+    assert not backfill.has_many_gone()
+    os.utime(path, (1, 1))
+    memory.index.refresh()
+    assert backfill.has_many_gone()
+    backfill.prune()
+    assert len(stored(memory)) == 2
+    assert not backfill.has_many_gone()
 
 
 @pytest.mark.parametrize("helper", [["/no/such/program"], [sys.executable, "-c", "exit(3)"]])

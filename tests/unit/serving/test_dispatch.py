@@ -304,6 +304,27 @@ async def test_more_calls_than_may_wait_are_told_so() -> None:
     assert len(sent) == MOST_WAITING + BLOCKING_AT_ONCE + 5
 
 
+async def test_stopping_has_running_queries_give_up() -> None:
+    started = threading.Event()
+
+    def ask(call: Call) -> Answer:
+        started.set()
+        return until_given_up(call)
+
+    server = served(tool("slow", ask))
+    results: list[CallToolResult] = []
+
+    async def call(client: Client) -> None:
+        results.append(await client.call_tool("slow", {}))
+
+    async with Client(server) as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(call, client)
+        await anyio.to_thread.run_sync(started.wait)
+        server.dispatcher.stop()
+    told = sent(results[0])
+    assert (told["error"], "the server is stopping" in told["detail"]) == ("busy", True)
+
+
 async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: LogCapture) -> None:
     silent = served(tool("ask", lambda _: value(1)), log_arguments=False).dispatcher
     await silent.answer("ask", {"s3cret": "s3cret"})

@@ -68,6 +68,14 @@ async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_nam
     assert [len(each) for each in lists if isinstance(each, list)] == [1, 1, NAMED]
 
 
+async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    reply = await Health(memory_at(tmp_path, seconds=-3600), "1")()
+    assert reply["problems"] == [
+        "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
+    ]
+
+
 async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
     beat(tmp_path, T0, RecorderState.RECORDING, restarts=2, silent=("/b",), missing=("/c",))
     reply = await Health(memory_at(tmp_path, seconds=3), "1")()

@@ -90,6 +90,11 @@ def test_it_keeps_the_token_for_its_tab_alone() -> None:
     assert "token" not in OWN["main.js"].partition("function remember")[2].partition("\n}\n")[0]
 
 
+def test_every_field_of_it_has_a_label() -> None:
+    for name in re.findall(r"<(?:input|select|progress)[^>]* id=\"([\w-]+)\"", HTML):
+        assert re.search(rf"<label for=\"{name}\"", HTML), name
+
+
 def test_the_library_it_carries_is_named_with_its_licence() -> None:
     assert "MIT License" in FOLDER.joinpath("vendor/LICENSE").read_text("utf-8")
     assert "uPlot 1.6.32" in FOLDER.joinpath("vendor/README.md").read_text("utf-8")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -26,9 +27,10 @@ from ros2_memory.cli.plot import asked_in
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
 from ros2_memory.serving.page import drawn_path, span
 from ros2_memory.serving.page.drawn_path import Box, Line, path_in_box
 from ros2_memory.serving.page.recordings import Recordings
@@ -44,7 +46,7 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import detections, odom, write_mcap
+from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
 
@@ -273,6 +275,30 @@ def test_points_of_a_long_path_are_bounded_and_reach_from_its_first_to_its_last(
     assert {0, count - 1} <= {*kept}
 
 
+def test_a_path_of_many_corners_is_drawn_by_a_bounded_number_of_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zigzag = [odom(BEGIN + n * S, n / 10, n % 2) for n in range(60)]
+    write_mcap(tmp_path / "rec" / "0.mcap", zigzag)
+    monkeypatch.setattr(span, "MOST_POINTS", 10)
+    path = shown(memory_of(tmp_path))["path"]
+    assert len(path["t"]) == 10
+    assert (path["x"][0], path["x"][-1]) == (0.0, 5.9)
+
+
+def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
+    log, now_s = QuestionLog(3), time.time()
+    for number in range(5):
+        tool = f"tool_{number}"
+        log.add(tool, {"n": number}, Answered(tool, "ok", 0.25, 2, "id"), "x" * 10_000)
+    kept = log.newest(2)
+    assert [each["tool"] for each in kept] == ["tool_4", "tool_3"]
+    assert kept[0]["asked"] == pytest.approx(now_s - 0.25, abs=5)
+    assert kept[0]["arguments"] == '{"n": 4}'
+    assert len(str(kept[0]["answer"])) <= 2_000
+    assert log.count == 5
+
+
 def test_one_recording_answers_alone_and_all_are_listed(memory: Memory) -> None:
     recordings = Recordings(memory)
     one = recordings.alone("rec_1")
@@ -339,6 +365,34 @@ def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
     assert paths(0, 30) == {"robin": (10, 20), "wren": (20, 40)}
     assert paths(-1000, 30) == {"jay": (0, 10), "robin": (10, 20), "wren": (20, 40)}
     assert paths(-1000, -800) == {}
+
+
+def test_robots_within_one_folder_have_a_path_each_beside_another_folder(tmp_path: Path) -> None:
+    for name, x in (("hall/robin", 0), ("hall/wren", 100), ("yard/jay", 200)):
+        messages = [odom(BEGIN + n * S // 10, x + n / 10, 0.0) for n in range(101)]
+        write_mcap(tmp_path / name / "0.mcap", messages)
+    found = paths_in(memory_of(tmp_path), 0, 30)
+    ends = {path["name"]: (path["x"][0], path["x"][-1]) for path in found}
+    assert ends == {"hall/robin": (0, 10), "hall/wren": (100, 110), "yard": (200, 210)}
+
+
+def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
+    tmp_path: Path,
+) -> None:
+    for name, begins, parent in (("robin", 0, "base"), ("wren", 500, "map"), ("jay", 900, "base")):
+        poses = [odom(BEGIN + (begins + n) * S, float(n), 0.0) for n in range(10)]
+        at = poses[0].log_time
+        mount = transform(at, parent, "laser", (0.1, 0.0, 0.0))
+        mounted = tf(at, mount, topic="/tf_static")
+        write_mcap(tmp_path / name / "0.mcap", [mounted, *poses])
+    memory = memory_of(tmp_path)
+
+    def robots(start_s: int, stop_s: int) -> list[str]:
+        return [each["name"] for each in paths_in(memory, start_s, stop_s)]
+
+    assert robots(0, 600) == ["robin", "wren"]
+    assert robots(0, 1000) == ["jay", "robin", "wren"]
+    assert robots(0, 400) == []
 
 
 def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:
