@@ -18,7 +18,6 @@ from ros2_memory.core.errors import (
     BagError,
     BagVanishedError,
     EpisodicError,
-    UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import BagReader, Batch, Closing, Record
@@ -205,18 +204,6 @@ def test_publish_times_are_kept_where_the_format_keeps_them(shelf: Shelf, tmp_pa
     assert [(r.log_time, r.publish_time) for r in records] == list(
         zip([7, 9], published, strict=True)
     )
-
-
-@on_every_shelf
-def test_a_payload_that_does_not_fit_is_undecodable_and_is_reported(
-    shelf: Shelf, tmp_path: Path
-) -> None:
-    broken = Msg("/odom", "nav_msgs/msg/Odometry", 1, b"\x00\x01\x00\x00short")
-    reader, path = shelf.stocked(tmp_path, [broken, text(2, "whole")])
-    first, second = reader.records(path, ["/odom", "/chatter"], EVERYTHING)
-    with pytest.raises(UndecodableError, match=r"^/odom \(nav_msgs/msg/Odometry\): "):
-        reader.decode(first)
-    assert getattr(reader.decode(second), "data", None) == "whole"
 
 
 @on_every_shelf

@@ -180,19 +180,6 @@ def test_stamps_days_off_are_recognised_and_log_time_counts_instead() -> None:
         queries.transform(asked, Call(), "enu", "coug2.robot", AtTime(at_s=1743805390.0))
 
 
-def test_positions_that_are_not_numbers_are_reported() -> None:
-    asked = memory("cougars_auv_mcap")
-    answer = queries.position(
-        asked, Call(), AtTime(at_s=1744320618.5), topic="/coug2/odom", tolerance_s=60.0
-    )
-    assert all(math.isnan(each) for each in answer.pose.position)
-    assert "not a number" in answer.notes[0]
-    summary = queries.trajectory_summary(
-        asked, Call(), TimeRange(start_s=0.0, end_s=4e9), topic="/coug2/odom"
-    )
-    assert (summary.trajectory.invalid, summary.trajectory.totals.distance_m) == (3, 0.0)
-
-
 @pytest.mark.parametrize(
     ("name", "cut"),
     [(name, cut) for name, truth in expected().items() for cut in truth.get("truncate", [])],

@@ -109,20 +109,6 @@ def test_only_what_may_be_refused_is_refused_and_with_its_reason(name: str) -> N
 
 
 @needs_real
-def test_service_events_decode_as_do_the_topics_beside_them() -> None:
-    (path,) = files_of("rosbag2_service_events_mcap")
-    found = [(r.channel.type, mcap().decode(r)) for r in all_records(mcap(), path)]
-    kinds = Counter(kind for kind, _ in found)
-    assert kinds == {"test_msgs/msg/Strings": 2, "test_msgs/srv/BasicTypes_Event": 8}
-    events: list[Any] = [message for kind, message in found if kind.endswith("_Event")]
-    assert {each.info.event_type for each in events} <= {0, 1, 2, 3}
-    # 0 and 1 are of requests, 2 and 3 of responses; without contents there is neither.
-    for each in events:
-        assert len(each.request) <= (each.info.event_type < 2)
-        assert len(each.response) <= (each.info.event_type >= 2)
-
-
-@needs_real
 def test_every_legal_layout_of_the_summary_section_is_read() -> None:
     per_file = expectations()["mcap_conformance_2022"]["expected"]["per_file"]
     paths = files_of("mcap_conformance_2022")
@@ -157,15 +143,3 @@ def test_every_recorded_file_is_read_or_reports_why_not(path: Path) -> None:
             else:
                 assert path.parent.name == "nodef"
                 assert record.channel.topic == "/desc"
-
-
-@needs_recorded
-def test_a_definition_that_the_recorder_lacked_comes_from_the_folders() -> None:
-    path = RECORDED / "extra" / "nodef" / "nodef_0.mcap"
-    reader = McapReader([BAGS.parent / "interfaces"])
-    records = [r for r in all_records(reader, path) if r.channel.topic == "/desc"]
-    assert len(records) == 45
-    assert all(getattr(reader.decode(record), "data", "") for record in records)
-    without = mcap().undecodable(records[0].channel)
-    assert without is not None
-    assert "reader.custom_msg_paths" in without

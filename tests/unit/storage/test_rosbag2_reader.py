@@ -18,7 +18,6 @@ import zstandard
 from ros2_memory.core.errors import (
     BagContradictionError,
     BagError,
-    UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
@@ -27,8 +26,6 @@ from ros2_memory.storage.scratch import Scratch
 from tests.support.bags import (
     McapLayout,
     Msg,
-    detections,
-    odom,
     text,
     write_db3,
     write_mcap,
@@ -108,19 +105,6 @@ class TestSqliteSchemas:
         (record,) = read(reader, path)
         assert getattr(reader.decode(record), "data", "") == "hello"
 
-    def test_without_definitions_standard_types_decode_and_others_say_what_is_missing(
-        self, tmp_path: Path
-    ) -> None:
-        path = write_db3(
-            tmp_path / "a.db3", [odom(1, 2.0, 3.0), detections(2, ["cup"])], definitions=False
-        )
-        reader = Rosbag2Reader()
-        first, second = read(reader, path, "/odom", "/vision/scene/scene_objects")
-        assert reader.undecodable(first.channel) is None
-        assert reader.decode(first)
-        with pytest.raises(UndecodableError, match=r"reader\.custom_msg_paths"):
-            reader.decode(second)
-
     def test_a_missing_index_by_time_changes_no_answer(self, tmp_path: Path) -> None:
         messages = [text(time, "x") for time in (3, 1, 2, 1)]
         path = write_db3(tmp_path / "a.db3", messages)
@@ -186,15 +170,6 @@ def live(tmp_path: Path) -> Iterator[tuple[Path, sqlite3.Connection]]:
 
 
 class TestJournals:
-    def test_a_database_with_a_wal_is_open_until_that_is_gone(
-        self, live: tuple[Path, sqlite3.Connection]
-    ) -> None:
-        path, base = live
-        reader = Rosbag2Reader()
-        assert reader.closing(path) is Closing.OPEN
-        base.close()
-        assert reader.closing(path) is Closing.CLOSED
-
     def test_what_is_in_the_wal_is_read_and_the_folder_left_as_it_was(
         self, live: tuple[Path, sqlite3.Connection], tmp_path: Path
     ) -> None:

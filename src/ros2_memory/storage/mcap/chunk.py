@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 import zlib
 from array import array
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -51,7 +50,6 @@ if TYPE_CHECKING:
 
 
 _INDEX_OPCODE: Final = int(Opcode.MESSAGE_INDEX)
-_MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
 OUTSIDE: Final = "damaged: a chunk states other times than its messages have"
 INDEX_OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
@@ -63,8 +61,6 @@ _INDEX: Final = np.dtype(
 _INDEX_SIZE: Final = struct.Struct("<I")
 _INDEX_PLACE: Final = struct.Struct("<HQ")
 _PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
-NOT_THERE: Final = "damaged: a message is not where its index says"
-_MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
 
 
 class Chunk(NamedTuple):
@@ -233,8 +229,7 @@ def index_groups(
             begin, size = nth + 1, 0
 
 
-@dataclass(slots=True)
-class ChunkContent:
+class ChunkContent(NamedTuple):
     """The content of a decompressed chunk.
 
     Attributes:
@@ -247,7 +242,7 @@ class ChunkContent:
     pairs: Pairs
     usable: int
     messages: int
-    declarations: list[tuple[int, bytes]] = field(default_factory=list)
+    declarations: list[tuple[int, bytes]]
 
 
 def walk_chunk(data: bytes) -> ChunkContent:
@@ -277,7 +272,7 @@ def walk_chunk(data: bytes) -> ChunkContent:
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             declarations.append((opcode, data[position + RECORD.size : following]))
             if len(declarations) > MAX_CHUNK_DECLARATIONS:
-                raise UnreadableError(_MANY_DECLARED)
+                raise UnreadableError(f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things")
         position = following
     pairs = Pairs.of(channels, times, places)
     return ChunkContent(pairs, position, len(times), declarations)
