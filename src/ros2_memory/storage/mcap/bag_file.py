@@ -72,7 +72,7 @@ from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
 
@@ -400,17 +400,16 @@ class _Reading:
                     return None
                 at = lost.last if newest_first else lost.first
                 return RunRows([at], [0], lambda _place, _time: lost)
-            pairs, data = self._pairs(content, wanted), content.buffer
-            if len(data) <= _LARGE_BYTES:
-                return rows(pairs, partial(self._record, data, wanted))
-            return rows(pairs, lambda *at: self._record(last_used(chunk).buffer, wanted, *at))
-
-        def rows(
-            pairs: Pairs, fetch: Callable[[int, Ns], Record]
-        ) -> RunRows[Record | LostError] | None:
-            step = -1 if newest_first else 1
-            times, places = (column[::step].tolist() for column in self._inside(pairs, wanted))
-            return RunRows(times, places, fetch) if times else None
+            column = self._inside(self._pairs(content, wanted), wanted)
+            times, places = (part[:: -1 if newest_first else 1].tolist() for part in column)
+            if not times:
+                return None
+            if len(content.buffer) <= _LARGE_BYTES:
+                return RunRows(times, places, partial(self._record, content.buffer, wanted))
+            del content
+            return RunRows(
+                times, places, lambda *at: self._record(last_used(chunk).buffer, wanted, *at)
+            )
 
         if wanted:
             self._require_beside()

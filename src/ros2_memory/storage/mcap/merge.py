@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
@@ -65,13 +66,9 @@ def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
         if not heap:
             continue
         _, rank, position, rows, keys = heappop(heap)
-        stop = len(keys)
-        if heap:
-            stop = bisect_left(keys, heap[0][0], position, stop)
-        if waiting:
-            stop = bisect_left(keys, waiting[-1][0], position, stop)
+        following = min([other[0] for other in (*heap[:1], *waiting[-1:])], default=math.inf)
         # At a tie with another run, the lower rank goes first, one message at a time.
-        stop = max(stop, position + 1)
+        stop = max(bisect_left(keys, following, position), position + 1)
         fetch = rows.fetch
         for place, time in zip(rows.places[position:stop], rows.times[position:stop], strict=True):
             yield fetch(place, time)
