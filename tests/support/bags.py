@@ -71,6 +71,10 @@ OTHER_ROBOTS: Final = {
     "apriltag_msgs/msg/AprilTagDetectionArray": (
         "std_msgs/Header header\nAprilTagDetection[] detections\n"
     ),
+    "darknet_ros_msgs/msg/BoundingBox": "string Class\nfloat64 probability\nint64 xmin\n",
+    "darknet_ros_msgs/msg/BoundingBoxes": (
+        "std_msgs/Header header\nBoundingBox[] bounding_boxes\n"
+    ),
     "aruco_opencv_msgs/msg/MarkerPose": "uint16 marker_id\ngeometry_msgs/Pose pose\n",
     "aruco_opencv_msgs/msg/ArucoDetection": "std_msgs/Header header\nMarkerPose[] markers\n",
     "radar_msgs/msg/RadarReturn": "float32 range\nfloat32 azimuth\nfloat32 amplitude\n",

@@ -37,7 +37,10 @@ LABELS: Final = ("label", "class_id", "class_name", "class", "object")
 """Fields with the label of a detection, the first that is there."""
 LISTS_OF_LABELS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
 _FRAMES: Final = ("frame_id", "child_frame_id", "parent", "child")
-_OTHER_NAMES: Final = ("name", "names", "id", "hardware_id", "type", "encoding", "format", "skill")
+_OTHER_NAMES: Final = (
+    *("name", "names", "id", "hardware_id", "type", "encoding", "format", "skill"),
+    *("Class", "family"),  # of darknet_ros_msgs and AprilTags
+)
 NAMES_IN_MESSAGES: Final = LISTS_OF_LABELS.union(LABELS, _FRAMES, _OTHER_NAMES)
 """Fields of messages that hold names."""
 _NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")

@@ -97,7 +97,7 @@ _PEOPLE: Final = frozenset(_WORDS_FOR_PEOPLE.split())
 _WORD: Final = re.compile(r"[A-Z]*[^\W\d_A-Z]+|[A-Z]+")
 """Words also begin at capitals: `TrackedPersons`."""
 _OF_DETECTIONS: Final = LISTS_OF_LABELS.union(LABELS)
-_NAMES: Final = _OF_DETECTIONS.union(("child_frame_id", "frame_id", "name", "names"))
+_NAMES: Final = _OF_DETECTIONS.union(("Class", "child_frame_id", "frame_id", "name", "names"))
 """Fields that may name people."""
 _FIRST_DAY: Final = "2014"
 """Days before it have a wrong date: there was no ROS 2."""

@@ -907,6 +907,21 @@ def test_without_hidden_joints_others_keep_their_own_values(
     assert labels_in(bag_dir / DAY_FILE) == {"mug"}
 
 
+def test_boxes_of_darknet_stay_without_people(bag_dir: Path) -> None:
+    kind = "darknet_ros_msgs/msg/BoundingBoxes"
+    boxes = [
+        make("darknet_ros_msgs/msg/BoundingBox", Class=name, probability=0.9, xmin=4)
+        for name in ("cup", "person")
+    ]
+    at = [T0 + nth * S for nth in range(3)]
+    seen = [make(kind, header=header(each, "camera"), bounding_boxes=boxes) for each in at]
+    record(bag_dir, [Msg("/boxes", kind, *each) for each in zip(at, seen, strict=True)])
+    keep_all(bag_dir)
+    [found, *_] = of_topic(bag_dir, "/boxes")
+    message: Any = McapReader().decode(found)
+    assert [box.Class for box in message.bounding_boxes] == ["cup"]
+
+
 def test_of_a_latched_message_only_the_hidden_frame_goes(bag_dir: Path) -> None:
     """All that many robots say of their static frames is one message."""
     at = [T0 + n * S for n in range(10)]
