@@ -16,6 +16,7 @@ import time
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, replace
+from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, SHIPPED_FILE
@@ -146,19 +147,20 @@ class TopicCutter:
         until_s = self.monotonic() + SLICE_S
         receipts = read_receipts(self.bag_dir) if (self.bag_dir / SHIPPED_FILE).exists() else {}
         gone, bags = Counter[str](), 0
-        recordings: dict[Path, None] = {}
-        for cut in waiting:
+        for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
+            bags_before = bags
+            for cut in of_recording:
+                free = self.measure_free(self.bag_dir)
+                if self.monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
+                    break
+                gone_here = self._cut_if_held(cut, receipts)
+                gone += gone_here
+                bags += bool(gone_here)
+            # Before the next recording: a kill leaves one metadata.yaml behind its bags at most.
+            if bags > bags_before and (reason := why_not_corrected(recording, self.reader)):
+                _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
             if self.monotonic() >= until_s:
                 break
-            if self.measure_free(self.bag_dir) - cut.bag.size < limits.min_free_bytes:
-                continue
-            if gone_here := self._cut_if_held(cut, receipts):
-                gone += gone_here
-                bags += 1
-                recordings[cut.bag.recording] = None
-        for recording in recordings:
-            if reason := why_not_corrected(recording, self.reader):
-                _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
         if bags:
             ms = ms_since(begun)
             _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)
