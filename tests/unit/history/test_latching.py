@@ -9,18 +9,23 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory, QuerySettings
 from ros2_memory.history.view import AtTime
-from ros2_memory.queries import topic_value
+from ros2_memory.queries import position, topic_value, value_when
+from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     McapLayout,
     Msg,
+    boolean,
+    log_entry,
     odom,
     text,
     write_splits,
 )
+from tests.support.housekeepers import keeper_of
 from tests.support.memories import each_way, memory_of
 
 if TYPE_CHECKING:
@@ -104,3 +109,45 @@ def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) 
     assert set(reply(memory, MAP, T0 + 59 * S)) == {"error"}
     both = remembered(tmp_path, latching=Latching(include=("/odom",), exclude=("/odom",)))
     assert set(reply(both, "/odom", T0 + 99 * S)) == {"error"}
+
+
+def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None:
+    bump = boolean(T0 + 20 * S, True)
+    record(tmp_path, [text(T0, "office", MAP), bump, *drive(T0, T0 + 60 * S)])
+    memory = remembered(tmp_path)
+    found = value_when(memory, Call(), MAP, "/bumper", condition_type="equals", value=True)
+    shown = json.loads(Replies(tmp_path, 24_000).answer(found).text)
+    assert (shown["value_latched"], shown["value_age_s"]) == (True, 20.0)
+
+
+def test_a_pose_that_is_latched_says_so(tmp_path: Path) -> None:
+    record(tmp_path, [odom(T0, 1.0, 2.0), text(T0 + 60 * S, "later", "/words")])
+    memory = remembered(tmp_path, latching=Latching(include=("/odom",)))
+    found = position(memory, Call(), AtTime(unix_from_ns(T0 + 30 * S)))
+    assert [note for note in found.notes if "/odom is latched" in note and "30" in note]
+
+
+def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
+    tmp_path: Path,
+) -> None:
+    """However often it is published; and then it is no more latched than before."""
+    telemetry = every(0.01, 7, TELEMETRY)
+    messages = [
+        text(T0, "office", MAP),
+        log_entry(T0 + S, 20, "nav", "hello"),
+        *telemetry,
+        *drive(T0, T0 + 30 * S),
+    ]
+    record(tmp_path, messages)
+    keeper_of(tmp_path, max_bytes=1).apply()
+    carried = tmp_path / "latched/carried.mcap"
+    topics = [TELEMETRY, MAP, ROSOUT]
+    found = {
+        each.channel.topic: each.log_time
+        for each in McapReader().records(carried, topics, TimeWindow.everything())
+    }
+    assert found == {TELEMETRY: telemetry[-1].log_time, MAP: T0}
+    memory = remembered(tmp_path)
+    assert set(reply(memory, TELEMETRY, T0 + 29 * S)) == {"error"}
+    assert reply(memory, TELEMETRY, telemetry[-1].log_time)["value"] == {"value": "699"}
+    assert reply(memory, MAP, T0 + 29 * S)["age_s"] == 29.0
