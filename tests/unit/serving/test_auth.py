@@ -208,6 +208,12 @@ def revealed(env: dict[str, str]) -> str | None:
     return token.get_secret_value() if token else None
 
 
+def test_there_is_none_where_nothing_gives_one(tmp_path: Path) -> None:
+    assert api_token({}) is None
+    assert api_token({"MEMORY_API_TOKEN": "", "MEMORY_API_TOKEN_FILE": ""}) is None
+    assert api_token({"CREDENTIALS_DIRECTORY": str(tmp_path)}) is None
+
+
 @pytest.mark.parametrize("ending", ["", "\n", "\r\n"])
 def test_it_comes_from_a_file_whose_last_line_may_end(tmp_path: Path, ending: str) -> None:
     file = tmp_path / "token"
@@ -241,6 +247,15 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     reply = refused({"MEMORY_API_TOKEN_FILE": str(tmp_path / "none")})
     assert "No such file" in reply
     assert "none" in reply
+
+
+def test_a_server_that_others_can_reach_needs_one() -> None:
+    with pytest.raises(ConfigError, match=r"^MEMORY_API_TOKEN: missing") as caught:
+        take_token({}, host="robot.lan", loopback=False)
+    for reply in ("'robot.lan'", "MEMORY_API_TOKEN_FILE", "LoadCredential", "127.0.0.1"):
+        assert reply in str(caught.value)
+    token = take_token({"MEMORY_API_TOKEN": GOOD}, host="robot.lan", loopback=False)
+    assert token is not None
 
 
 def test_a_server_on_the_loopback_address_may_have_one_which_what_it_starts_has_not() -> None:

@@ -454,3 +454,21 @@ async def test_a_body_too_large_is_refused_by_its_stated_length_or_by_what_is_co
     assert refused.status_code == 413
     assert refused.text == f"The request is larger than {MAX_BODY_BYTES} bytes.\n"
     assert 1000 - len([*parts]) == taken
+
+
+async def test_a_client_that_leaves_before_its_body_is_whole_reaches_no_application() -> None:
+    async def never(_scope: Any, _receive: Any, _send: Any) -> None:
+        pytest.fail("there is no whole request")
+
+    half = {"type": "http.request", "body": b"half", "more_body": True}
+    came, sent = iter([half, {"type": "http.disconnect"}]), list[Any]()
+
+    async def receive() -> Any:
+        return next(came)
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    scope = {"type": "http", "method": "POST", "path": "/mcp", "headers": []}
+    await RequestLimits(never)(scope, receive, send)
+    assert sent == []

@@ -33,6 +33,20 @@ def memory_at(bag_dir: Path, *, seconds: int = 0) -> Memory:
     return memory_of(bag_dir, clock=SettableClock(T0 + seconds * NS_PER_S))
 
 
+async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
+    (tmp_path / "torn.mcap").write_bytes(b"no bag at all, but not empty")
+    reply = await Health(memory_at(tmp_path, seconds=3600), "1")()
+    assert reply["status"] == "degraded"
+    assert reply["damaged"] == 1
+    assert reply["problems"] == ["1 damaged bag file; data_time_range lists them"]
+    assert reply["damaged_files"] == [
+        {
+            "file": f"{tmp_path.name}/torn.mcap",
+            "reason": "not an MCAP file: it does not begin as one",
+        }
+    ]
+
+
 async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
     assert await Health(memory_at(tmp_path), "1.2.3")() == {
         "status": "ok",

@@ -152,6 +152,12 @@ async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path
         assert "remember_moment is not offered here: it needs a recorder" in str(refused.content)
 
 
+MOST_BYTES = 300_000
+LOADS = re.compile(
+    r"\b(src|href)\s*=|@import|url\(|\bfetch\(|XMLHttpRequest|WebSocket|importScripts"
+)
+
+
 async def test_six_tools_name_the_view_which_is_read_and_not_listed(tmp_path: Path) -> None:
     async with Client(server(tmp_path)) as client:
         tools = (await client.list_tools()).tools
@@ -166,3 +172,11 @@ async def test_six_tools_name_the_view_which_is_read_and_not_listed(tmp_path: Pa
     assert (content.uri, content.mime_type) == (VIEW_URI, APP_MIME_TYPE)
     assert content.meta == {"ui": {"prefersBorder": True}}
     assert content.text == view().content
+
+
+def test_the_document_is_one_file_that_loads_nothing() -> None:
+    html = view().content
+    assert isinstance(html, str)
+    assert len(html.encode()) < MOST_BYTES
+    assert html.count("<script>") == html.count("</script>") == html.count("<style>") == 1
+    assert LOADS.findall(html) == []

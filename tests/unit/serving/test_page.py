@@ -51,6 +51,11 @@ async def test_a_browser_that_has_a_file_is_not_sent_it_again() -> None:
     assert again.content == b""
 
 
+def test_it_has_no_inline_script_or_style() -> None:
+    assert re.findall(r"<script[^>]*>(?!</script>)", HTML) == []
+    assert not re.search(r"<style|\sstyle=|\son\w+=", HTML)
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", EVERYWHERE, "192.168.7.20", "robot.lan"])
 async def test_it_is_shown_without_the_token_which_it_asks_for(host: str) -> None:
     base = "http://127.0.0.1:9203" if host == "127.0.0.1" else "http://192.168.7.20:9203"
