@@ -97,14 +97,11 @@ def draw(seed: int, seconds: int) -> World:
     return World(tuple(places), tuple(seen))
 
 
-def write(world: World, folder: Path, *, begin: int = BEGIN, every_s: int = 1) -> None:
-    """Writes a pose, a text and a message of the detector for each second, in splits of 20.
-
-    `every_s`: how long each second of the world takes in the log.
-    """
+def write(world: World, folder: Path, *, begin: int = BEGIN) -> None:
+    """Writes a pose, a text and a message of the detector for each second, in splits of 20."""
     splits: dict[int, list[Msg]] = {}
     for nth, x in enumerate(world.x):
-        at = (begin + nth * every_s) * S
+        at = (begin + nth) * S
         messages = [odom(at, x, 0.0), text(at, "hello")]
         messages.append(_detected(at, world.seen[nth]))
         splits.setdefault(nth // 20, []).extend(messages)
