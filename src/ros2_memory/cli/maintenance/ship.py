@@ -1,7 +1,6 @@
 """`ros2-memory ship`: ships the closed bags of many robots into a lake, for as long as it runs."""
 
 import math
-import os
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -55,9 +54,6 @@ def ship(
     """
     settings, _ = load_for(None, overrides)
     window = _window_of(forget, times)
-    # Has what a batch took go back before the next: Arrow's own heap kept as much of each. It is
-    # read by Arrow when it is loaded, which nothing has done yet.
-    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     share_one_arena()
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
