@@ -13,9 +13,8 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.columns.database import is_busy
+from ros2_memory.columns.database import PRAGMAS, is_busy
 from ros2_memory.columns.pack import FORMAT
-from ros2_memory.columns.schema import PRAGMAS
 from ros2_memory.columns.writing import delete_bags
 from ros2_memory.core.errors import BagError
 

@@ -16,9 +16,8 @@ import numpy as np
 from ros2_memory.columns.coverage import Coverage, Covering
 from ros2_memory.columns.database import row_id
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, Sized
-from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
-from ros2_memory.columns.stored import StoredTable, lazy_columns
+from ros2_memory.columns.stored import OUTLINE, StoredTable, lazy_columns, outline_of
 from ros2_memory.columns.table import Column, Table, Texts, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
 from ros2_memory.columns.writing import BAG, LOG_TIME
@@ -45,6 +44,8 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes, besides the numbers of its bags."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
+_FEW_DELETED: Final = 256
+"""So many deleted parts are remembered of each topic."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 DECODED_BYTES: Final = 8 << 20
 """The tables of a bag that is not stored are remembered if they take no more memory than this."""
@@ -92,19 +93,25 @@ class _Known(NamedTuple):
 
     Attributes:
         newest: the newest of these parts; it need not have the column.
-        packed: by part, how the column is packed.
+        packed: by part, how the column is packed; also of parts that were deleted since.
         zones: those of the parts.
+        many: of more parts than this it is read anew, as many may have been deleted.
     """
 
     newest: int
     packed: Mapping[int, Packed]
     zones: Zones
+    many: int
 
     def joined(self, newest: int, packed: Mapping[int, Packed]) -> _Known:
         """Returns it with what is known of newer parts."""
         zones = Zones.of([*packed], [of_part.zone for of_part in packed.values()])
-        newest = max([newest, *packed])
-        return _Known(newest, {**self.packed, **packed}, self.zones.joined(zones))
+        return _Known(
+            max([newest, *packed]),
+            {**self.packed, **packed},
+            self.zones.joined(zones),
+            self.many or _FEW_DELETED + 2 * len(packed),
+        )
 
     @property
     def memory_bytes(self) -> int:
@@ -114,7 +121,7 @@ class _Known(NamedTuple):
         return _COLUMN_BYTES * len(self.packed) + texts + self.zones.memory_bytes
 
 
-_UNKNOWN: Final = _Known(0, {}, Zones.of([], []))
+_UNKNOWN: Final = _Known(0, {}, Zones.of([], []), 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +132,7 @@ class Caches:
 
     Attributes:
         read: by part and path, unpacked columns; by kind and key, fragments.
-        known: by topic, path and state of the store, what is known of a column in its parts.
+        known: by topic and path, what is known of a column in its parts.
         heads: by topic, its parts.
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
         pairs: by part, the parents and children of its transforms.
@@ -186,7 +193,6 @@ class Scanner:
         self.caches = Caches.of() if caches is None else caches.namespace()
         self._reading = reading
         self._damaged: dict[tuple[str | Ns, ...], str] = {}
-        self._deletion = 0
         # They follow from columns alone, and are of use where these were dropped.
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
@@ -243,11 +249,7 @@ class Scanner:
 
     def coverage(self, timeline: Timeline) -> Coverage | None:
         """Returns which bags of a timeline are stored; None without a store."""
-        if self._covering is None:
-            return None
-        coverage = self._covering.of(timeline)
-        self._deletion = coverage.state.deletion
-        return coverage
+        return None if self._covering is None else self._covering.of(timeline)
 
     def channels(self, timeline: Timeline, bag: BagFile) -> list[Channel]:
         """Returns the channels of all that was ever stored; none where a bag is not stored."""
@@ -321,10 +323,11 @@ class Scanner:
     def _known(self, topic: int, path: str, part: int) -> _Known:
         """Returns what is known of a column of a topic, in a part and in all that are older."""
         store = self._store_of_parts
-        key = (topic, path, self._deletion)
+        key = (topic, path)
         known = self.caches.known.get(key) or _UNKNOWN
         if part > known.newest:
             failures = store.failures
+            known = known if len(known.packed) <= known.many else _UNKNOWN
             known = known.joined(part, store.zones(topic, path, known.newest))
             if store.failures == failures:
                 self.caches.known.put(key, known, known.memory_bytes)
@@ -342,23 +345,18 @@ class Scanner:
             raise GoneError
         packed = partial(self.packed, head, {LOG_TIME, BAG} | topic.layout.slots.keys())
 
-        def column_at(path: str) -> Column | None:
-            column = packed(path)
-            return None if column is None else self._column(head.number, path, column)
-
         def load(path: str) -> Column:
-            column = column_at(path)
+            column = packed(path)
             if column is None:
                 raise KeyError(path)
-            return column
+            return self._column(head.number, path, column)
 
         counting = coverage.of_part(head.number, head.bags)
         if not counting.size:
             return None
 
         def integers(path: str) -> IntArray | None:
-            column = column_at(path)
-            return None if column is None else np.asarray(column, np.int64)
+            return None if packed(path) is None else np.asarray(load(path), np.int64)
 
         def bag_of(number: int) -> BagFile:
             bag = coverage.bag(number + offset)

@@ -35,11 +35,9 @@ from ros2_memory.analysis.facts import (
     joined_facts,
     state_of,
 )
-from ros2_memory.columns.detections import found_in
-from ros2_memory.columns.limits import placed
+from ros2_memory.columns.detections import Source, found_in, sources_in
 from ros2_memory.columns.shown import UNKNOWN, ByType, Node, Shape, at_field, leaves_of
-from ros2_memory.columns.sources import Source, sources_in
-from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values
+from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, placed
 from ros2_memory.columns.walk import entries_of_codes
 from ros2_memory.core.text import dotted
 

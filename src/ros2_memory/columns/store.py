@@ -25,9 +25,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from ros2_memory.columns.database import Database
-from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import Packed
-from ros2_memory.columns.stored import Topic
+from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.writing import (
     BELOW,
     Layouts,

@@ -1,23 +1,153 @@
-"""Tables whose columns are unpacked when they are first asked for, and that know what was lost."""
+"""The columns of a topic's tables, and tables that unpack them when they are first asked for.
+
+The columns are the same from bag to bag, so that they are written down once.
+
+What is known of the columns of a part besides their zones, without unpacking them again, is its
+outline. Of numbers how many there are, their sum, and when the least and the greatest was; of texts
+that are too many to be listed (JSON, lines of a log) which rows of letters are in which row. It is
+made while filling, and is there also where a column was dropped.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.columns.table import Column, Elements, Table, Zone
+from ros2_memory.columns.fragments import FragmentKind
+from ros2_memory.columns.steps import EXACT, Step, step_of
+from ros2_memory.columns.table import (
+    IN_PART,
+    Column,
+    Elements,
+    Numbers,
+    Table,
+    Texts,
+    Zone,
+    letters_of,
+    words_of,
+)
+from ros2_memory.core.arrays import Flags, Ints, numbered
+from ros2_memory.core.text import caseless
 
 if TYPE_CHECKING:
-    from ros2_memory.columns.layout import Layout
-    from ros2_memory.columns.outline import Outline
-    from ros2_memory.columns.pack import Packed
-    from ros2_memory.storage.base import Channel, Definition
+    from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.pack import Packed
+    from ros2_memory.core.timebase import Span
+    from ros2_memory.storage.base import Channel, Definition, IntArray
+
+    Floats = NDArray[np.float64]
+
+
+_BYTES: Final = 500
+"""About how much memory an entry takes."""
+_MOST_LETTERS: Final = 1_024
+"""Different rows of letters in the texts of a part; of more nothing is known."""
 V = TypeVar("V")
+
+
+class ColumnKind(NamedTuple):
+    """What a column is: `text` or numpy's name of its dtype, and how exactly it is stored."""
+
+    dtype: str
+    step: Step = EXACT
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The columns of the tables of one topic, type and definition.
+
+    Attributes:
+        slots: all columns in the order in which they are packed, by their path from the table:
+            those of the messages, then of each sequence the owners of its elements, by its path and
+            `#`, and the columns of these (`detections.label`).
+        left_out: what is no column, and why.
+    """
+
+    slots: Mapping[str, ColumnKind]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, table: Table, definition: Definition | None) -> Layout:
+        """Returns that of a table; the definition names the steps."""
+        kinds = {path: _kind_of(column, path, definition) for path, column in columns_in(table)}
+        return cls(kinds, table.left_out)
+
+    @cached_property
+    def levels(self) -> dict[str, LevelPaths]:
+        """The columns of the messages (""), and of the elements of each sequence by its path."""
+        levels = {"": LevelPaths({}, {})}
+        sequence = ""
+        for path in self.slots:
+            if path.endswith("#"):
+                sequence = path[:-1]
+                parent = max(
+                    (outer for outer in levels if sequence.startswith(f"{outer}.")), default=""
+                )
+                levels[parent].sequences[sequence.removeprefix(f"{parent}.")] = sequence
+                levels[sequence] = LevelPaths({}, {})
+            else:
+                name = path.removeprefix(sequence).removeprefix(".") if sequence else path
+                levels[sequence].columns[name] = path
+        return levels
+
+    def fits(self, table: Table) -> bool:
+        """Whether the table has these columns, and no others, and leaves the same out."""
+        paths = [path for path, _ in columns_in(table)]
+        return self.left_out == table.left_out and paths == [*self.slots]
+
+    def to_json(self) -> str:
+        """Returns it as a person can read it; equal layouts give equal texts."""
+        columns = {
+            path: kind.dtype if kind.step == EXACT else f"{kind.dtype} {kind.step}"
+            for path, kind in self.slots.items()
+        }
+        described = {"columns": columns, "left_out": dict(self.left_out)}
+        return json.dumps(described, ensure_ascii=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> Layout:
+        """Returns the layout that was written so.
+
+        Raises:
+            ValueError, LookupError, TypeError: it is not one.
+        """
+        described = json.loads(text)
+        slots = {}
+        for path, words in dict(described["columns"]).items():
+            dtype, _, step = str(words).partition(" ")
+            slots[path] = ColumnKind(dtype, Step.parse(step) if step else EXACT)
+        return cls(slots, described["left_out"])
+
+
+class LevelPaths(NamedTuple):
+    """The columns of messages or elements, and the sequences in them: by their names, the paths."""
+
+    columns: dict[str, str]
+    sequences: dict[str, str]
+
+
+def columns_in(rows: Table | Elements, around: str = "") -> Iterator[tuple[str, Column]]:
+    """Yields all columns of a table with their paths, in the order of `Layout.slots`."""
+    for name, column in rows.columns.items():
+        yield f"{around}{name}".rstrip("."), column
+    for name, inner in rows.elements.items():
+        yield f"{around}{name}#", inner.owners
+        yield from columns_in(inner, f"{around}{name}.")
+
+
+def _kind_of(column: Column, path: str, definition: Definition | None) -> ColumnKind:
+    if isinstance(column, Texts):
+        return ColumnKind("text")
+    name = column.dtype.name
+    return ColumnKind(name, step_of(path, definition) if column.dtype.kind == "f" else EXACT)
 
 
 class Remembered(Protocol):
@@ -150,3 +280,132 @@ def lazy_columns(
         kept = [name for name, path in columns.items() if path not in dropped]
         lists = [name for name, path in sequences.items() if f"{path}#" not in dropped]
     return Lazily(kept, lambda name: column(columns[name])), Lazily(lists, elements)
+
+
+class Totals(NamedTuple):
+    """The finite numbers of a column.
+
+    Attributes:
+        size: how many.
+        total: their sum.
+        least: log times between which the first of the least ones is, inclusive; equal if known.
+        greatest: of the greatest ones likewise.
+    """
+
+    size: int
+    total: float
+    least: Span
+    greatest: Span
+
+
+class Letters(NamedTuple):
+    """Which casefolded rows of letters are in the texts of a column.
+
+    Attributes:
+        words: the rows of letters, and of what is not ASCII between them.
+        has: for each of them, packed bits: which texts have it.
+        size: how many texts there are.
+    """
+
+    words: tuple[str, ...]
+    has: NDArray[np.uint8]
+    size: int
+
+    @classmethod
+    def of(cls, texts: Texts) -> Letters | None:
+        """Returns the letters of texts; None where they are too many."""
+        spellings, nth = numbered(frozenset(words_of(caseless(text))) for text in texts.words)
+        words = sorted(frozenset().union(*spellings))
+        if len(words) > _MOST_LETTERS:
+            return None
+        has_word = [[word in spelling for spelling in spellings] for word in words]
+        rows = np.array(has_word, np.bool_).reshape(len(words), len(spellings))[:, nth[texts.codes]]
+        return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
+
+    def may_have(self, text: str) -> Flags:
+        """Returns in which texts a casefolded text may be; surely, if it is one row of letters."""
+        bits = np.full(self.has.shape[1], 0xFF, np.uint8)
+        for letters in letters_of(text):
+            containing = [nth for nth, word in enumerate(self.words) if letters in word]
+            bits &= np.bitwise_or.reduce(self.has[containing], axis=0)
+        return np.unpackbits(bits, count=self.size).view(np.bool_)
+
+
+class Outline(NamedTuple):
+    """What is known of the columns of a part; of some of them nothing is.
+
+    Attributes:
+        paths: of columns of numbers.
+        sizes: how many finite numbers each has.
+        sums: what they add up to.
+        times: when the ends of each were, as of `Totals` (N x 4).
+        letters: of columns of texts, by their paths.
+    """
+
+    paths: Sequence[str]
+    sizes: IntArray
+    sums: Floats
+    times: Ints
+    letters: Mapping[str, Letters]
+
+    @classmethod
+    def of(cls, totals: Mapping[str, Totals], letters: Mapping[str, Letters]) -> Outline:
+        """Returns the outline of columns, by their paths."""
+        sizes, sums, least, greatest = zip(*totals.values(), strict=True) if totals else ((),) * 4
+        ends = np.array([*zip(least, greatest, strict=True)], np.int64).reshape(-1, 4)
+        return cls([*totals], np.array(sizes, np.int64), np.array(sums, float), ends, letters)
+
+    def totals(self, path: str) -> Totals | None:
+        """Returns what is known of a column of numbers; None: nothing."""
+        if path not in self.paths:
+            return None
+        nth = self.paths.index(path)
+        first, second, third, fourth = self.times[nth].tolist()
+        size, total = int(self.sizes[nth]), float(self.sums[nth])
+        return Totals(size, total, (first, second), (third, fourth))
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        texts = sum(
+            letters.has.nbytes + 100 * len(letters.words) for letters in self.letters.values()
+        )
+        return texts + _BYTES + 120 * len(self.paths)
+
+
+def outline_of(table: Table, times: IntArray) -> Outline:
+    """Returns the outline of a part, all of whose columns are stored, and its log times."""
+    totals: dict[str, Totals] = {}
+    letters: dict[str, Letters] = {}
+    for path in table.columns:
+        zone = table.zone(path)
+        if zone is None:
+            continue
+        if (zone.words or "").startswith(IN_PART):
+            texts = table.columns[path]
+            if isinstance(texts, Texts) and (in_texts := Letters.of(texts)) is not None:
+                letters[path] = in_texts
+        elif np.isfinite([zone.low, zone.high]).all():
+            column = table.columns[path]
+            if not isinstance(column, Texts) and column.dtype.kind in "iuf":
+                totals[path] = _totals_of(column, table.error(path), times)
+    return Outline.of(totals, letters)
+
+
+def _totals_of(column: Numbers, error: float, times: IntArray) -> Totals:
+    is_finite = np.isfinite(column)
+    if not is_finite.all():
+        column, times = column[is_finite], times[is_finite]
+    numbers = cast("Floats", column if error == 0.0 else column.astype(np.float64, copy=False))
+    with np.errstate(over="ignore", invalid="ignore"):  # not finite where no float holds it
+        total = float(numbers.sum(dtype=np.float64))
+    if error == 0.0:
+        least, greatest = int(times[numbers.argmin()]), int(times[numbers.argmax()])
+        return Totals(len(numbers), total, (least, least), (greatest, greatest))
+    may_be_least = times[numbers - error <= (numbers + error).min()]
+    may_be_greatest = times[numbers + error >= (numbers - error).max()]
+    spans = [(int(ends[0]), int(ends[-1])) for ends in (may_be_least, may_be_greatest)]
+    return Totals(len(numbers), total, *spans)
+
+
+OUTLINE: Final[FragmentKind[Outline]] = FragmentKind("outline", (Outline, Letters))

@@ -23,9 +23,8 @@ from ros2_memory.analysis.conditions import (
     NearPosition,
     points,
 )
-from ros2_memory.columns.limits import Limit, TruthValues, nowhere, placed, unknown
+from ros2_memory.columns.detections import may_be_json, without_low
 from ros2_memory.columns.shown import NOTHING, ByType, Node, Shape, at_field, leaves_of
-from ros2_memory.columns.sources import may_be_json, without_low
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import MAX_NUMBERS, as_float
 from ros2_memory.columns.values import (
@@ -34,8 +33,13 @@ from ros2_memory.columns.values import (
     Leaf,
     LeafNumbers,
     Level,
+    Limit,
+    TruthValues,
     UnknownShapeError,
     Values,
+    nowhere,
+    placed,
+    unknown,
     zone_of,
 )
 from ros2_memory.messages.detections import looks_like_json, without_low_scores

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
+from ros2_memory.columns.stored import Layout, columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 

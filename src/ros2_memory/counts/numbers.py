@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.conditions import leaves
-from ros2_memory.columns.numbers import FieldNumbers, column_of, numbers
+from ros2_memory.columns.shown import FieldNumbers, column_of, numbers
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows

@@ -18,7 +18,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import excluded_between
-from ros2_memory.columns.numbers import words_of
+from ros2_memory.columns.shown import words_of
 from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Key

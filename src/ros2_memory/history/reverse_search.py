@@ -27,9 +27,9 @@ from ros2_memory.analysis.conditions import (
     summarising,
 )
 from ros2_memory.analysis.facts import FULL_CHARGE, charge_of
-from ros2_memory.columns.limits import TruthValues
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
+from ros2_memory.columns.values import TruthValues
 from ros2_memory.core.errors import (
     BagError,
     InvalidArgumentsError,

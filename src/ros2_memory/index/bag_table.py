@@ -1,20 +1,25 @@
 """The files of a bag directory: scans it again and again, and classifies what has changed.
 
 One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, of which one counts.
+So does one of bags that somebody copied beside themselves, `run_0 (copy).mcap` beside `run_0.mcap`:
+messages of one folder are no copies of each other, so all would count twice.
 """
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
-from ros2_memory.index.copied_files import alike_among, is_copy
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree
 from ros2_memory.index.segment import Segment
@@ -22,12 +27,15 @@ from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.bag_rows import BagRows
     from ros2_memory.storage.base import BagReader
+
+_BLOCK_BYTES: Final = 64 << 10
+_BLOCKS: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,3 +379,39 @@ class BagTable:
 
 def _sorted_by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
     return tuple(sorted(asides, key=lambda aside: aside.path))
+
+
+def alike_among(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
+    """Yields bags with the folder, size and summary of one with a shorter name, behind that one."""
+    starts = timeline.starts
+    is_same = starts[1:] == starts[:-1]
+    are_suspects = np.append(is_same, False) | np.append(False, is_same)
+    edges = np.cumsum([len(segment.bags) for segment in timeline.segments])
+    of_segments = zip(timeline.segments, np.split(are_suspects, edges), strict=False)
+    suspects = chain.from_iterable(segment.bags.at(rows) for segment, rows in of_segments)
+    originals: dict[tuple[Path, int, int, int], BagFile] = {}
+    for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
+        original = originals.setdefault((bag.recording, bag.size, bag.start, bag.end), bag)
+        if original is not bag and original.summary == bag.summary:
+            yield original, bag
+
+
+def is_copy(original: BagFile, bag: BagFile) -> bool:
+    """Returns whether two bags of one size are the same bytes, as blocks all over them show.
+
+    Runs of a simulation may have the same times and sizes.
+
+    Raises:
+        OSError: one of them cannot be read.
+    """
+    return _blocks(original) == _blocks(bag)
+
+
+def _blocks(bag: BagFile) -> list[bytes]:
+    step = max(bag.size // _BLOCKS, _BLOCK_BYTES)
+    places = (*range(0, bag.size, step), max(bag.size - _BLOCK_BYTES, 0))
+    file = os.open(bag.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        return [os.pread(file, _BLOCK_BYTES, place) for place in places]
+    finally:
+        os.close(file)

@@ -1,4 +1,19 @@
-"""The bag directory as it is known at one moment."""
+"""The bag directory as it is known at one moment.
+
+A file that cannot be read shows nothing of its times; the files around it do:
+
+    not before   the end of the split before it in its recording, else the time in the name of a
+                 recording of this program
+    not after    the start of the split after it, else the last time that the file was written to
+
+Between two splits nothing more is known. Where only one side is known, the file is taken to hold a
+day at most: so an old file that nobody removes, or one that was copied here later, does not affect
+answers about other days. Where neither side is known, or the file's own date cannot be true, its
+time is unknown.
+
+That a file holds a day at most is an estimate, good enough for a note beside an answer. Where the
+answer is that there is nothing, the file counts wherever it can contain a message.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +33,22 @@ from ros2_memory.analysis.silences import (
     silences,
     usual_periods,
 )
-from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.layout import is_carried, named_start
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.spans import Spans, united, without
-from ros2_memory.core.timebase import MAX_NS, Ns, Span
-from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates, dated_segments
-from ros2_memory.index.holes import Pause, Rhythm, pause_between
-from ros2_memory.index.split_order import (
-    Neighbours,
-    is_recording,
-    neighbours,
-    split_of,
-    steps_of,
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, Ns, Span
+from ros2_memory.index.clock_faults import (
+    FIRST_BAGS_NS,
+    ClockFault,
+    Dating,
+    check_dates,
+    dated_segments,
+    max_plausible,
 )
-from ros2_memory.index.timeline import Timeline
-from ros2_memory.index.unreadable_span import unreadable_bounds, unreadable_span
+from ros2_memory.index.holes import Pause, Rhythm, pause_between
+from ros2_memory.index.split_order import Neighbours, is_recording, neighbours, split_of, steps_of
+from ros2_memory.index.timeline import MAX_FILE_NS, Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -309,3 +324,55 @@ class Snapshot:
 def _after(until: Ns) -> TimeWindow:
     """Returns the times behind what was read of a file that goes on."""
     return TimeWindow(min(until + 1, MAX_NS), MAX_NS)
+
+
+def unreadable_span(
+    recording: str, near: Neighbours, written: Ns | None, now: Ns, *, growing: bool = False
+) -> TimeWindow | None:
+    """Returns the log times between which all messages of a file lie; None where unknown.
+
+    Args:
+        recording: the name of the file's folder.
+        near: the splits around it.
+        written: the file's mtime; None where unknown.
+        now: the present.
+        growing: whether the file is still being written.
+    """
+    start = named_start(recording) if near.before is None else near.before
+    if near.after is not None:
+        if start is None or (near.before is None and start > near.after):
+            start = max(near.after - MAX_FILE_NS, MIN_NS)
+        low, high = sorted((start, near.after))
+        return TimeWindow(low, min(high + 1, MAX_NS))
+    if growing:
+        return TimeWindow(max(now - MAX_FILE_NS, MIN_NS) if start is None else start, MAX_NS)
+    end = _last_written(written, now)
+    if start is None:
+        return None if end is None else TimeWindow(end - MAX_FILE_NS, end)
+    longest = min(start + MAX_FILE_NS, MAX_NS)
+    # A file last written before its start was recorded by another clock than its file system's.
+    return TimeWindow(start, longest if end is None or end <= start else min(end, longest))
+
+
+def unreadable_bounds(
+    recording: str, near: Neighbours, written: Ns | None, now: Ns
+) -> TimeWindow | None:
+    """Returns the log times outside of which a closed file has no message; None: anywhere.
+
+    As `unreadable_span`, without the estimate of how much a file holds. Splits between which the
+    clock was set back bound nothing.
+    """
+    start = named_start(recording) if near.before is None else near.before
+    end = _last_written(written, now) if near.after is None else min(near.after + 1, MAX_NS)
+    if start is None and end is None:
+        return None
+    if start is not None and end is not None and end <= start:
+        return None
+    return TimeWindow(MIN_NS if start is None else start, MAX_NS if end is None else end)
+
+
+def _last_written(written: Ns | None, now: Ns) -> Ns | None:
+    """Returns the latest log time that a file can have, by its mtime; None where that cannot be."""
+    if written is None or not FIRST_BAGS_NS <= written <= max_plausible(now):
+        return None
+    return min(written + FUTURE_NS, MAX_NS)

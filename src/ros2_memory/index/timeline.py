@@ -31,13 +31,14 @@ from ros2_memory.index.segment import (
     is_log,
     wider,
 )
-from ros2_memory.index.unreadable_span import MAX_FILE_NS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
 
+MAX_FILE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
+"""The longest span that a file is taken to hold when one end of it is known."""
 SEGMENT_BAGS: Final = 1024
 """The most bags in a segment: few enough to compute in some milliseconds; a week has 60."""
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.columns.limits import TruthValues, nowhere
+from ros2_memory.columns.values import TruthValues, nowhere
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow

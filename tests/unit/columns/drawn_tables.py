@@ -24,10 +24,9 @@ from ros2_memory.analysis.conditions import (
     positions,
 )
 from ros2_memory.columns.decode import Group, _Kind, _Undecoded
-from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import pack
 from ros2_memory.columns.plan import plan_of
-from ros2_memory.columns.stored import StoredTable, lazy_columns
+from ros2_memory.columns.stored import Layout, StoredTable, columns_in, lazy_columns
 from ros2_memory.columns.table import Column, Table, Texts
 from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
 from ros2_memory.storage.mcap_reader import McapReader

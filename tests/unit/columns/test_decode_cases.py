@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import struct
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -13,7 +12,7 @@ import pytest
 
 from ros2_memory.columns import decode
 from ros2_memory.columns.decode import Group, undecoded
-from ros2_memory.columns.layout import columns_in
+from ros2_memory.columns.stored import columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Texts, order_of
 from ros2_memory.core.errors import BagError
 from ros2_memory.storage.mcap import bulk
@@ -21,7 +20,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
     Msg,
-    definition,
     detections,
     header,
     make,
@@ -38,13 +36,12 @@ from tests.support.mcap_surgery import SMALL, chatter, raw_mcap, spoil_chunk
 from tests.unit.columns.decoded_bags import (
     bag_of,
     compared,
-    decoded_alike,
     tables_of,
 )
 from tests.unit.columns.drawn_types import DrawnField, DrawnTypes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator
 
     from mcap.writer import Writer
 
@@ -77,12 +74,6 @@ def numbers(table: Table, path: str) -> list[object]:
     column = table.columns[path]
     assert isinstance(column, np.ndarray)
     return list(column.tolist())
-
-
-def texts(table: Table, path: str) -> list[str]:
-    column = table.columns[path]
-    assert isinstance(column, Texts)
-    return column.values()
 
 
 LONG_TYPES: Final = DrawnTypes(
@@ -138,54 +129,6 @@ def test_what_follows_long_sequences_is_read_where_it_is(
     assert fallbacks == []
 
 
-def strings(path: Path, payloads: Sequence[bytes]) -> Table:
-    """The table of strings with these payloads, each in a chunk with the others."""
-    messages = [
-        Msg("/chatter", "std_msgs/msg/String", nth, each) for nth, each in enumerate(payloads)
-    ]
-    [table] = tables_of(McapReader(), write_mcap(path, messages))
-    return table
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 60) + b"a\0", id="into the neighbour"),
-        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2**32 - 1) + b"a\0", id="past the file"),
-        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 0), id="no zero"),
-        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2) + b"ab", id="another end"),
-        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2) + b"\xff\0", id="no UTF-8"),
-        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2) + b"a\0" + bytes(4), id="too long"),
-        pytest.param(b"\0\1\0", id="shorter than its header"),
-        pytest.param(b"", id="empty"),
-        pytest.param(struct.pack("<4sI", b"\0\3\0\0", 2) + b"a\0", id="another encoding"),
-    ],
-)
-def test_a_hostile_payload_changes_no_other_message(tmp_path: Path, bad: bytes) -> None:
-    good = [text(nth, f"message {nth}").payload for nth in range(4)]
-    table = strings(tmp_path / "a.mcap", [good[0], bad, *good[1:]])
-    assert texts(table, "data") == [f"message {nth}" for nth in range(4)]
-    assert table.log_times.tolist() == [0, 2, 3, 4]
-
-
-def two_publishers(writer: Writer) -> None:
-    """A topic with a channel for each of two publishers."""
-    kind = "std_msgs/msg/String"
-    schema = writer.register_schema(kind, "ros2msg", definition(kind).encode())
-    channels = [writer.register_channel("/said", "cdr", schema) for _ in range(2)]
-    for time in range(9):
-        writer.add_message(channels[time % 2], time, text(time, f"{time}").payload, time)
-
-
-def test_publishers_and_encodings_may_share_a_topic(tmp_path: Path, fallbacks: list[str]) -> None:
-    big_endian = struct.pack(">4sI", b"\0\0\0\0", 4) + b"big\0"
-    odd = [Msg("/chatter", "std_msgs/msg/String", 60 + nth, big_endian) for nth in range(2)]
-    odd_bag = write_mcap(tmp_path / "odd.mcap", [*mixed(5), *odd])
-    for path in (odd_bag, raw_mcap(tmp_path / "two.mcap", two_publishers, profile="ros2")):
-        decoded_alike(McapReader(), path)
-    assert set(fallbacks) == {"/chatter"}
-
-
 def mixed(count: int) -> list[Msg]:
     messages: list[Msg] = []
     for time in range(0, count * 10, 10):
@@ -220,19 +163,6 @@ def test_small_groups_hold_together_what_one_group_does(tmp_path: Path) -> None:
         tables = tables_of(reader, path)
     assert compared(reader, path, tables).wrong == []
     assert {len(table) for table in tables} == {len(table) for table in whole}
-
-
-def test_a_group_without_a_message_that_can_be_decoded_has_no_table_of_the_topic(
-    tmp_path: Path,
-) -> None:
-    spoiled = [Msg(message.topic, message.type, message.log_time, b"") for message in chatter(40)]
-    path = write_mcap(tmp_path / "a.mcap", [*spoiled, *mixed(40)], McapLayout(chunk_size=1500))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(decode, "GROUP_BYTES", 2000)
-        patch.setattr(bulk, "BATCH_BYTES", 1000)
-        groups = [*undecoded(McapReader(), path, skip_undecodable=True)]
-    assert len(groups) > 5
-    assert sum(len(table) for group in groups for table in group.tables()) == len(mixed(40))
 
 
 def drawn_bag(path: Path, draw: random.Random) -> Path:

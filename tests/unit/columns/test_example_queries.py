@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.columns.database import TABLES
 from ros2_memory.columns.fill import StoreLimits
-from ros2_memory.columns.schema import TABLES
 from tests.support.bags import battery, odom, write_mcap
 from tests.support.column_worlds import World, store_file
 from tests.support.memories import ROOT

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.columns.fill import StoreLimits
-from ros2_memory.columns.outline import Letters
+from ros2_memory.columns.stored import Letters
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -50,11 +50,6 @@ def test_letters_rule_out_no_text_that_has_them(texts: list[str], needle: str) -
     assert not (has & ~may).any()
     if folded.isalpha():
         assert (may == has).all()
-
-
-def test_of_texts_with_too_many_different_letters_nothing_is_known() -> None:
-    words = ["".join(chr(97 + int(digit)) for digit in str(number)) for number in range(2_000)]
-    assert Letters.of(Texts.of(words)) is None
 
 
 def write_world(folder: Path, draw: Random, hours: float = 1.5) -> None:

@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.columns.limits import placed
-from ros2_memory.columns.numbers import numbers
-from ros2_memory.columns.shown import Constant, Node, Shape
+from ros2_memory.columns.shown import Constant, Node, Shape, numbers
 from ros2_memory.columns.values import (
     ROWS,
     Conversion,
@@ -22,6 +20,7 @@ from ros2_memory.columns.values import (
     Leaf,
     UnknownShapeError,
     Values,
+    placed,
     seconds,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import Beyond, Condition
-from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.stored import Topic
+from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.zones import PartZones, Zones
@@ -31,7 +30,7 @@ from tests.unit.columns.drawn_tables import (
 )
 
 if TYPE_CHECKING:
-    from ros2_memory.columns.limits import TruthValues
+    from ros2_memory.columns.values import TruthValues
     from ros2_memory.core.model import JsonValue
 
 EXTRACTOR = shipped_extractor()
@@ -144,19 +143,3 @@ def test_a_limit_is_not_beyond_itself_in_a_float32(limit: float) -> None:
         assert met(condition, kind, *both) == [False, True]
         long = ColumnCondition(replace(condition, field="ranges"), EXTRACTOR)
         assert not long.truth(drawn_of(scans, [scan]).table).surely.any()
-
-
-def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:
-    kind = "vision_msgs/msg/Detection2DArray"
-    random = Random(2)
-    while True:
-        whole = message(kind, random, is_odd=False)
-        found = [each for each in whole.detections if each.results]  # type: ignore[attr-defined]
-        if found:
-            break
-    whole.detections[:] = found[:1]  # type: ignore[attr-defined]
-    for result in found[0].results:
-        result.hypothesis.class_id, result.hypothesis.score = "", 0.1
-    condition = Condition(Beyond(-1e300, above=True), "detections.results.pose", 0.5)
-    table = drawn_of(kind, [whole]).table
-    assert ColumnCondition(condition, EXTRACTOR).truth(table).unsure.all()

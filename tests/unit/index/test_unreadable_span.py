@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.index.split_order import Neighbours
-from ros2_memory.index.unreadable_span import (
-    MAX_FILE_NS,
+from ros2_memory.index.snapshot import (
     unreadable_bounds,
     unreadable_span,
 )
+from ros2_memory.index.split_order import Neighbours
+from ros2_memory.index.timeline import MAX_FILE_NS
 
 S = 10**9
 NOW = 1_790_000_000 * S
