@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from itertools import product
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
@@ -32,12 +31,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 T0: Final = 1_790_000_000 * NS_PER_S
-LENGTHS: Final = {
-    "the longest that are held": [MAX_NUMBERS] * 20,
-    "one more": [MAX_NUMBERS + 1] * 20,
-    "some short, some long": [5, 40] * 10,
-    "empty ones among them": [0, 40] * 10,
-}
 
 
 def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> Msg:
@@ -45,37 +38,6 @@ def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> M
     none = np.zeros(0)
     arrays = {"position": np.array(positions), "velocity": none, "effort": none}
     return Msg("/joints", kind, at, make(kind, header=header(at, ""), name=[*names], **arrays))
-
-
-def joints(lengths: Sequence[int]) -> list[Msg]:
-    """States of joints whose positions rise by 1 from message to message."""
-    spans = enumerate(lengths)
-    return [joint_state(nth, [], [*np.linspace(nth, nth + 0.75, length)]) for nth, length in spans]
-
-
-@pytest.mark.parametrize("lengths", LENGTHS.values(), ids=LENGTHS)
-def test_conditions_on_arrays_are_answered_alike_stored_or_not(
-    tmp_path: Path, lengths: Sequence[int]
-) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", joints(lengths))
-    bags = memory_of(tmp_path)
-    stored = with_store(memory_of(tmp_path), tmp_path)
-    conditions: list[dict[str, Any]] = [
-        {"condition_type": kind, "value": value, **({"field": field} if field else {})}
-        for kind, value, field in product(
-            ("above", "below", "equals"), (3.5, 7.0, 100.0, -1.0), ("positions", "positions.0", "")
-        )
-        if field or kind == "equals"
-    ]
-    some = 0
-    for condition in conditions:
-        for tool in ("find_matches", "find_last_match"):
-            given = {"topic": "/joints", **condition}
-            expected = asked(bags, tmp_path, tool, **given)
-            assert asked(stored, tmp_path, tool, **given) == expected, (tool, condition)
-            found = expected or {}
-            some += bool(found.get("total") or found.get("timestamp"))
-    assert some > 8
 
 
 def test_a_sequence_whose_columns_were_dropped_is_read_from_its_bag(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import random
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -146,12 +145,6 @@ def test_a_zone_of_too_many_texts_keeps_the_letters_in_them() -> None:
     found = ["label", "abel", "größe 7".casefold(), '"score": 0.5', "12345"]
     assert all(zones.may_have(text).all() for text in found)
     assert not any(zones.may_have(text).any() for text in ("labels", "cup", "letters", "score cup"))
-
-
-def test_a_zone_of_too_many_different_words_keeps_none() -> None:
-    draw = random.Random(5)
-    words = ["".join(draw.choices("abcdefgh", k=9)) for _ in range(1000)]
-    assert pack(Texts.of(words)).zone.words is None
 
 
 @given(st.lists(st.text(max_size=30), max_size=30), st.text(max_size=5))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import sys
 from typing import TYPE_CHECKING
@@ -11,14 +10,11 @@ from typing import TYPE_CHECKING
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ros2_memory.columns.store import ColumnStore
 from ros2_memory.columns.table import Zone, letters_of
 from ros2_memory.columns.zones import Zones
-from tests.support.bags import odom, write_mcap
-from tests.support.column_worlds import World, store_file
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    pass
 
 T0 = 1_700_000_000 * 10**9
 NUMBERS = st.one_of(
@@ -65,19 +61,6 @@ def test_zones_rule_out_what_the_zone_of_each_part_does(
                 assert among_others == alone
         assert together.may_have(text)[nth] == zone.may_have(text)
         assert together.may_be_json[nth] == zone.may_be_json
-
-
-def test_known_bags_are_those_that_were_indexed(tmp_path: Path) -> None:
-    for number in range(3):
-        messages = [odom(T0 + (10 * number + n) * 10**9, float(n), 0.0) for n in range(5)]
-        path = write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
-        os.utime(path, ns=(T0, T0))
-    world = World.of(tmp_path)
-    world.fill()
-    store = ColumnStore([store_file(tmp_path)], lambda _: None)
-    [bags] = store.known_bags(tmp_path)
-    assert [*bags] == [*world.memory.index.snapshot().bags]
-    assert len(bags) == 3
 
 
 @given(st.text(st.characters(codec="ascii")) | st.text())

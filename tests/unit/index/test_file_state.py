@@ -132,17 +132,6 @@ def test_a_growth_that_was_seen_counts_for_three_splits_and_not_for_a_file_put_i
     assert scan.run(path, age_s=3600) is FileState.INCOMPLETE
 
 
-def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after(
-    scan: RepeatedScan, tmp_path: Path
-) -> None:
-    path = tmp_path / "rec_0.mcap"
-    path.touch()
-    assert scan.run(path, age_s=5) is FileState.ACTIVE
-    assert scan.run(path, age_s=31) is FileState.DAMAGED
-    assert scan.reason() == "the file is empty"
-    assert scan.is_watched()
-
-
 def test_a_bag_left_open_before_its_first_message_is_damaged(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
@@ -183,18 +172,6 @@ def test_a_file_that_vanishes_while_it_is_read_is_not_classified(
     scan.reader.before_summary = Path.unlink
     with pytest.raises(BagVanishedError):
         scan.run(path, age_s=0)
-
-
-@pytest.mark.parametrize(
-    ("age_s", "state"),
-    [(0, FileState.ACTIVE), (30, FileState.ACTIVE), (30.001, FileState.CLOSED)],
-)
-def test_a_db3_that_looks_closed_is_active_for_three_splits(
-    scan: RepeatedScan, tmp_path: Path, age_s: float, state: FileState
-) -> None:
-    path = plain(tmp_path / "rec" / "rec_0.db3", [1])
-    assert scan.run(path, age_s=age_s) is state
-    assert scan.is_watched() is (state is FileState.ACTIVE)
 
 
 @pytest.mark.parametrize("name", ["rec_0.db3", "rec_1.db3", "rec_2.db3", "rec_3.db3", "c_0.db3"])

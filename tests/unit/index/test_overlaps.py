@@ -64,12 +64,6 @@ def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
     assert overlapping(taken) == ()
 
 
-def test_folders_of_one_name_are_told_apart() -> None:
-    pair = Overlapping(Path("/bags/robin/run"), Path("/bags/wren/run"), 0, 1)
-    other = Overlapping(Path("/bags/a"), Path("/bags/b"), 0, 1)
-    assert [pair.names, other.names] == [("robin/run", "wren/run"), ("a", "b")]
-
-
 halves_of_seconds = st.integers(0, 120).map(lambda number: number * NS_PER_S // 2)
 drawn_bags = st.lists(
     st.tuples(st.integers(0, 3), st.just(MIN_NS) | halves_of_seconds, halves_of_seconds)
