@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 PRAGMAS: Final = (
     "page_size = 4096",
-    "cache_size = -64",  # KiB: a server may have hundreds open, and the kernel has their pages
+    "cache_size = -256",  # KiB: a server may have hundreds open, and the kernel has their pages
     "auto_vacuum = INCREMENTAL",
     "secure_delete = ON",
 )

@@ -4,7 +4,7 @@ The first few of each kind are named, and the others counted:
 
 - files that were not read at all: damaged, or of a kind that is not read here. Such a file has no
   readable times, so it counts where its recording and its own date place it (see
-  `index.unreadable_span`): an old one that nobody removes is not part of every answer for ever.
+  `index.snapshot`): an old one that nobody removes is not part of every answer for ever.
   Where the answer is that there is nothing, it counts unless it is known to lie elsewhere.
 - splits that the metadata.yaml of a recording lists and that are missing, for searches and answers
   that there is nothing.
