@@ -271,17 +271,22 @@ def _zone_of(values: Floats) -> Zone:
 
 
 def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
-    """The bits of floats as integers that are ordered as the floats are; NaN is the greatest."""
+    """Returns the bits of floats as integers that are ordered as the floats are.
+
+    NaN is the greatest, and -0.0 is 0.0. `rounded`: without the lowest bits of the mantissa.
+    """
     integer, magnitude, dropped = _BITS[values.itemsize]
-    zeroed = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
-    is_nan = np.isnan(zeroed)
+    alike = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
+    is_nan = np.isnan(alike)
     if is_nan.any():
-        zeroed[is_nan] = np.nan
-    bits = zeroed.view(integer).astype(np.int64)
+        alike[is_nan] = np.nan  # one for all: there are negative ones, and others carry bits
+    bits = alike.view(integer).astype(np.int64)
     if rounded:
-        bits = (bits + (1 << (dropped - 1))) >> dropped
+        half = 1 << (dropped - 1)
+        bits = (bits + half) >> dropped
         magnitude >>= dropped
-    return bits ^ ((bits >> 63) & magnitude)
+    is_negative = bits >> 63  # as a mask: all bits, or none
+    return bits ^ (is_negative & magnitude)
 
 
 def _from_ordered(

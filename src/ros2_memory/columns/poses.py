@@ -158,14 +158,19 @@ def _elements(node: Node | None, count: int) -> tuple[str, ...]:
 
 
 def _point(route: PointPose, shape: Shape) -> _Columns | None:
+    """Returns the columns of a point and its rotation; None where there is no point.
+
+    Raises:
+        UnknownShapeError: one is in a list, or an array of another length in each message.
+    """
     position = shape.at(route.position.segments)
     orientation = shape.at(route.orientation.segments)
     axes, turn = _numbers(position, "xyz"), _numbers(orientation, "xyzw")
-    if route.arrays:
-        axes = axes or _elements(position, 3)
-        # PX4 writes w first.
-        elements = () if turn else _elements(orientation, 4)
-        turn = turn or (*elements[1:], *elements[:1])
+    if route.arrays and not axes:
+        axes = _elements(position, 3)
+    if route.arrays and not turn:
+        wxyz = _elements(orientation, 4)  # as PX4 writes it
+        turn = (*wxyz[1:], *wxyz[:1])
     return _Columns(axes, turn) if axes else None
 
 

@@ -136,27 +136,28 @@ class Scan:
     check: Callable[[Ns], None] = lambda _: None
 
     def __post_init__(self) -> None:
-        self._coverage: Coverage | None = None
-        since = bisect_right(self.shared, self.window.start, key=itemgetter(1))
-        until = bisect_left(self.shared, self.window.stop, since, key=itemgetter(0))
-        self.shared = self.shared[since:until]
         self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
+        # Rows that do not count, by the keys of their units: found when they are asked for.
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
         self._latched_again: dict[object, IntArray] = {}
         self._latched_again_since = MAX_NS
-        reach = self.window
-        if self.repeats_latched:
-            reach = TimeWindow.everything()
-        elif self.shared:
-            reach = reach.widened(2 * COPY_HORIZON_NS)
-        self._sources = self._ordered(self._settled(reach))
+        self.shared = _overlapping(self.shared, self.window)
+        self._coverage: Coverage | None = None
+        sources = self._settled(self._reach())  # which also sets `_coverage`
+        self._sources = self._ordered(sources)
         self._firsts = np.array([source.first for source in self._sources], np.int64)
         self._lasts = np.array([source.last for source in self._sources], np.int64)
         self._latest = np.maximum.accumulate(self._lasts)
         if self.shared:
             self.shared = self._holding_copies()
         self._ends = [stop for _, stop in self.shared]
+
+    def _reach(self) -> TimeWindow:
+        """Returns the window, and the times beside it in which it may have copies of messages."""
+        if self.repeats_latched:
+            return TimeWindow.everything()
+        return self.window.widened(2 * COPY_HORIZON_NS) if self.shared else self.window
 
     def rows(
         self, *, newest_first: bool = False, among: TimeWindow | None = None
@@ -565,6 +566,13 @@ def _in_window(unit: Unit, window: TimeWindow) -> Mask:
     times, is_counted = unit.times(), unit.counting()
     is_inside: Mask = (times >= window.start) & (times < window.stop)
     return is_inside if is_counted is None else is_inside & is_counted
+
+
+def _overlapping(spans: Sequence[Span], window: TimeWindow) -> Sequence[Span]:
+    """Returns those half-open spans, of some in order and apart, that overlap a window."""
+    begin = bisect_right(spans, window.start, key=itemgetter(1))
+    end = bisect_left(spans, window.stop, begin, key=itemgetter(0))
+    return spans[begin:end]
 
 
 def _heads(sources: Iterable[_Source]) -> list[PartHead]:

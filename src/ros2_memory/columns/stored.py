@@ -314,13 +314,17 @@ class Letters(NamedTuple):
     @classmethod
     def of(cls, texts: Texts) -> Letters | None:
         """Returns the letters of texts; None where they are too many."""
-        spellings, nth = numbered(frozenset(words_of(caseless(text))) for text in texts.words)
-        words = sorted(frozenset().union(*spellings))
+        # Many texts differ in their numbers alone, and have the same words.
+        word_sets, set_of = numbered(frozenset(words_of(caseless(text))) for text in texts.words)
+        words = sorted(frozenset().union(*word_sets))
         if len(words) > _MOST_LETTERS:
             return None
-        has_word = [[word in spelling for spelling in spellings] for word in words]
-        rows = np.array(has_word, np.bool_).reshape(len(words), len(spellings))[:, nth[texts.codes]]
-        return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
+        row_of = {word: row for row, word in enumerate(words)}
+        is_in_set = np.zeros((len(words), len(word_sets)), np.bool_)
+        for nth, word_set in enumerate(word_sets):
+            is_in_set[[row_of[word] for word in word_set], nth] = True
+        is_in_text = is_in_set[:, set_of[texts.codes]]
+        return cls(tuple(words), np.packbits(is_in_text, axis=1), len(texts))
 
     def may_have(self, text: str) -> Flags:
         """Returns in which texts a casefolded text may be; surely, if it is one row of letters."""

@@ -145,20 +145,23 @@ class _Walk:
         return value
 
     def _object(self, value: JsonObject, frame: str, depth: int, listed: bool | None) -> JsonValue:
+        """Returns what is left of an object that is a detection, or has some in it."""
         label = _label(value)
         if label is None:
             return self._parts(value, frame, depth, listed)
         own = _placed((value,), frame, label, _score(value))
-        if listed is not None and own.score is None and _SHOWN.isdisjoint(value):
-            begin = len(self.detections)
-            kept = self._parts(value, frame, depth, listed)
-            if label.strip().casefold() != _NOTHING and (listed or _is_alone(value)):
-                inner = self.detections[begin:]
-                scored = [one for one in inner if one.score is not None]
-                self.detections[begin:] = [own, *scored]
-            return kept
-        self.detections.append(own)
-        return None if self._is_below(value) else value
+        is_seen = own.score is not None or not _SHOWN.isdisjoint(value)
+        if listed is None or is_seen:
+            self.detections.append(own)
+            return None if self._is_below(value) else value
+        # JSON that has a name alone: perhaps a state, of which parts may be detections.
+        begin = len(self.detections)
+        kept = self._parts(value, frame, depth, listed)
+        if label.strip().casefold() != _NOTHING and (listed or _is_alone(value)):
+            # It is a detection: what has no score in it belongs to it, and is none of its own.
+            inner = self.detections[begin:]
+            self.detections[begin:] = [own, *(one for one in inner if one.score is not None)]
+        return kept
 
     def _parts(self, value: JsonObject, frame: str, depth: int, listed: bool | None) -> JsonValue:
         """Returns what is left of an object of which only parts may be detections."""

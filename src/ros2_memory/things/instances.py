@@ -822,21 +822,23 @@ def _split_around_others(stays: Sequence[PlacedStay], observed: _Observations) -
     return parts
 
 
-def _without_overlap(stays: list[PlacedStay], observed: _Observations) -> list[PlacedStay]:
-    """Removes single sightings at places that a thing has left: they are false."""
-    spots, kept = observed.sights.spots, []
-    for number, whole in enumerate(stays):
-        stay, rows = whole, whole.spots
+def _without_overlap(stays: Sequence[PlacedStay], observed: _Observations) -> list[PlacedStay]:
+    """Returns stays without single sightings at places that the thing has left: they are false."""
+    spots = observed.sights.spots
+    kept: list[PlacedStay] = []
+    for number, stay in enumerate(stays):
+        rows = stay.spots
         if number + 1 < len(stays):
             end = max(stays[number + 1].firm_first, stay.firm_last)
             rows = rows[spots[rows, Spot.LAST] <= end]
         if number:
             begin = min(stays[number - 1].firm_last, stay.firm_first)
             rows = rows[spots[rows, Spot.FIRST] >= begin]
-        if len(rows) < len(stay.spots):
+        if len(rows) == len(stay.spots):
+            kept.append(stay)
+        else:
             [trimmed] = _placed(observed, [(stay.place, stay.stay)], rows, np.array([len(rows)]))
-            stay = replace(trimmed, also=stay.also, left=stay.left)
-        kept.append(stay)
+            kept.append(replace(trimmed, also=stay.also, left=stay.left))
     return kept
 
 
