@@ -285,15 +285,14 @@ class SchemaExtractor:
         """Returns a full path in a message as one in its extracted value.
 
         Such as `position.x` for `pose.pose.position.x` of an odometry. A path that no mapped field
-        leads to, or that begins with one of their names, is returned as it is.
+        leads to is returned as it is, and so is one that begins with the name of another one.
         """
         fields, segments = self.plan(type_name).fields, tuple(path.split("."))
-        if segments[0] in fields:
-            return path
         leading = [
             (len(mapped), name)
             for name, mapped in fields.items()
             if segments[: len(mapped)] == mapped
+            and (name == segments[0] or segments[0] not in fields)
         ]
         if not leading:
             return path

@@ -188,3 +188,18 @@ def test_transforms_that_tf_refuses_are_left_out() -> None:
     left = EXTRACTOR.transforms(message, NS, static=False)
     # an edge without a parent is part of what was recorded, though no lookup goes through it
     assert [edge.child for edge in left] == ["b", "base_link"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "own"),
+    [
+        ("nav_msgs/msg/Path", "poses.pose.position.x", "poses.position.x"),
+        ("nav_msgs/msg/Path", "poses.position.x", "poses.position.x"),
+        (ODOMETRY, "pose.pose.position.x", "position.x"),
+        (ODOMETRY, "position.x", "position.x"),
+    ],
+)
+def test_a_full_path_is_found_in_the_extracted_value_also_below_its_own_name(
+    kind: str, path: str, own: str
+) -> None:
+    assert EXTRACTOR.own_path(path, kind) == own

@@ -302,7 +302,7 @@ class Letters(NamedTuple):
     """Which casefolded rows of letters are in the texts of a column.
 
     Attributes:
-        words: the rows of letters, and of what is not ASCII between them.
+        words: runs of letters, of which what is not ASCII is part.
         has: for each of them, packed bits: which texts have it.
         size: how many texts there are.
     """

@@ -194,8 +194,8 @@ class _Shortener:
     """Keeps so many elements of each array, and as much of texts and objects as goes with it.
 
     Attributes:
-        shortened: what had more: (dot-path without indices, how it was shortened) to how much was
-            kept of how much, of the longest list or widest object there; (0, 0) for texts.
+        shortened: by (dot-path without indices, how it was shortened): how many elements or keys
+            the reply has, and how many there were, of the longest one there; (0, 0) for texts.
     """
 
     def __init__(self, most: int) -> None:

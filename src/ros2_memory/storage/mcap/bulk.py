@@ -83,7 +83,7 @@ def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> It
         indexes: list[bytes] = []
         left = BATCH_BYTES
         end = begin
-        # Whoever reads them one by one finds the reason.
+        # Chunks that fail are read again one by one, which reports the reason.
         with suppress(UnreadableError), as_unreadable():
             while end < len(chunks) and left > 0 and len(parts) < MAX_GROUP_CHUNKS:
                 chunk = chunks[end]
