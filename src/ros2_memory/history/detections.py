@@ -187,12 +187,13 @@ def hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
     looked at, or has no stamp.
     """
     newest = view.stream.newest(topic, window)
-    stamp = None if newest is None else _stamp_of(view.bags.decode(newest))
-    if newest is None or not stamp or newest.time - stamp <= _LONGEST_LATENCY_NS:
+    if newest is None:
         return None
     before = view.stream.newest(topic, TimeWindow(window.start, newest.time))
-    repeats = before is not None and before.record.payload == newest.record.payload
-    return stamp if repeats else None
+    if before is None or before.record.payload != newest.record.payload:
+        return None
+    stamp = _stamp_of(view.bags.decode(newest))
+    return stamp if stamp and newest.time - stamp > _LONGEST_LATENCY_NS else None
 
 
 def _stamp(view: View, stored: StoredMessage) -> Ns:
