@@ -530,9 +530,12 @@ def _in_memory() -> OpenDatabase:
 def is_transient(error: Exception) -> bool:
     """Returns whether the database may work again as it is.
 
-    Operational errors are those of the machine or of the moment, such as a full disk. Only a table
-    that is missing (`SQLITE_ERROR`) and text that is not UTF-8 (no code) are faults of the content.
+    Operational errors are those of the machine or of the moment, such as a full disk. Faults of the
+    content are only a table that is missing (`SQLITE_ERROR`), text that is not UTF-8 (no code) and
+    pages that end too soon: those of a write-ahead log that something has overwritten.
     """
+    if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_IOERR_SHORT_READ:
+        return False
     is_operational = isinstance(error, sqlite3.OperationalError)
     is_of_content = sqlite_code(error) in {0, sqlite3.SQLITE_ERROR}
     return isinstance(error, MemoryError) or (is_operational and not is_of_content)
