@@ -22,11 +22,9 @@ from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import RETRIED_S
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (
-    DeletionPlan,
     DirContents,
     RetentionLimits,
     StoredBag,
-    by_hours,
     plan_deletions,
     too_old,
 )
@@ -189,9 +187,9 @@ class GarbageCollector:
             contents = replace(self._contents(known, limits, run), needed=needed)
             if free_bytes_wanted is not None:
                 contents = replace(contents, free_bytes=self.measure_free(self.bag_dir))
-            plan = plan_deletions(contents, limits)
-            going = plan.to_delete if self.memory is None else by_hours(plan, contents)
-            going = going[: MOST_AT_ONCE - len(run.deleted)]
+            # So that what stays of an hour is written once.
+            plan = plan_deletions(contents, limits, whole_hours=self.memory is not None)
+            going = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
             if going:
                 run.saved |= {
                     bag.path
@@ -200,7 +198,7 @@ class GarbageCollector:
                 }
                 self._carry(going, snapshot, run)
                 left = [bag for bag in going if bag.path not in run.remaining]
-                self._delete_bags(self._keep_memory(left, plan, snapshot, run), run)
+                self._delete_bags(self._keep_memory(left, contents, limits, snapshot, run), run)
                 run.unshipped += sorted(contents.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
@@ -285,11 +283,16 @@ class GarbageCollector:
                 run.waiting.add(bag.path)
 
     def _keep_memory(
-        self, going: list[StoredBag], plan: DeletionPlan, snapshot: Snapshot, run: _Pass
+        self,
+        going: list[StoredBag],
+        contents: DirContents,
+        limits: RetentionLimits,
+        snapshot: Snapshot,
+        run: _Pass,
     ) -> list[StoredBag]:
         """Writes what stays of bags; returns those that go now.
 
-        Where that fails, age waits for a day, the budget does not. Then only the bags go that must,
+        Where that fails, age waits for a day, the limits do not. Then only the bags go that must,
         and not those that would go with them, in the same hour; few at first, as that makes room to
         write what stays of the others.
         """
@@ -303,8 +306,10 @@ class GarbageCollector:
             now = self.monotonic()
             since = now if self._memory_fails_since is None else self._memory_fails_since
             self._memory_fails_since = since
-            must_go = {bag.path for bag in plan.to_delete}
-            must_go -= plan.aged if now - since < RETRIED_S else frozenset()
+            if now - since < RETRIED_S:
+                everything = frozenset(bag.path for bag in contents.bags)
+                contents = replace(contents, needed=everything)  # by no age
+            must_go = {bag.path for bag in plan_deletions(contents, limits).to_delete}
             waiting = paths - must_go
             run.remaining |= waiting
             going = [bag for bag in going if bag.path in must_go]

@@ -107,6 +107,11 @@ class StoredBag(NamedTuple):
         """The log time of the last message that dates it, else when its file was written."""
         return self.end if self.has_dates else self.written
 
+    @property
+    def hour(self) -> int:
+        """The hour of its date, counted from the epoch."""
+        return self.date // HOUR_NS
+
     def dated(self, at: Ns) -> StoredBag:
         """Returns it with another date."""
         return self._replace(start=at, end=at) if self.has_dates else self._replace(written=at)
@@ -157,37 +162,41 @@ class DirContents:
 class DeletionPlan(NamedTuple):
     """The deletions that the limits require.
 
-    `to_delete` has the oldest bag first; those in `aged` are too old, the others make room.
-    `newest` is the bag that stays.
-    `total_bytes` is what the budget counted, each file once. `fits`: whether the limits are kept
-    once those bags are deleted. `most_free`: how much of the disk would be free if all bags were
-    deleted that may be, where that is too little; then none is deleted for it.
+    `to_delete` has the oldest bag first. `total_bytes` is what the budget counted, each file once.
+    `fits`: whether the limits are kept once those bags are deleted. `most_free`: how much of the
+    disk would be free if all bags were deleted that may be, where that is too little; then none is
+    deleted for it.
     """
 
     to_delete: tuple[StoredBag, ...]
     total_bytes: int
     fits: bool
     most_free: int | None = None
-    aged: frozenset[str] = frozenset()
-    newest: str = ""
 
 
 def too_old(
     contents: DirContents, limits: RetentionLimits, max_age_ns: Ns
 ) -> dict[bool, frozenset[str]]:
-    """Returns the bags that age could delete if it were so much.
+    """Returns the bags older than `max_age_ns`.
 
-    By whether the clock is synchronised, or not.
+    Under True are those that count as older if the clock is synchronised, under False if it is not.
+    What a pause and a wrong date are is judged by `limits`.
     """
     contents = _with_consistent_dates(contents, limits)
     return _too_old(contents, _periods(contents, limits), max_age_ns)
 
 
-def plan_deletions(contents: DirContents, limits: RetentionLimits) -> DeletionPlan:
+def plan_deletions(
+    contents: DirContents, limits: RetentionLimits, *, whole_hours: bool = False
+) -> DeletionPlan:
     """Plans which bags to delete: all that are too old, then no more than the limits need.
 
     Where deleting everything that may go would not free enough of the disk, nothing is deleted for
     that: it would cost all history, and recording would still have to pause.
+
+    With `whole_hours`, age waits until all bags of an hour are too old, and to make room the rest
+    of an hour goes, too, but for the hour of the newest bag. Bags that no age deletes neither go
+    with an hour nor keep it.
     """
     left, dated = _Remaining(contents), _with_consistent_dates(contents, limits)
     total, periods, most_free = left.total, _periods(dated, limits), None
@@ -196,53 +205,46 @@ def plan_deletions(contents: DirContents, limits: RetentionLimits) -> DeletionPl
         return DeletionPlan((), total, fits=True)
     order = _oldest_first(dated, limits, periods[-1] if periods else [])
     newest = _newest(order, periods)
-    order = [bag for bag in order if bag is not newest]
+    order = [bag for bag in order if bag.path != newest]
+    if whole_hours:
+        aged = _of_whole_hours(aged, contents, newest)
     going = left.delete_until_fits(order, aged, limits)
     if left.free is not None and left.free < limits.min_free_bytes:
         most_free = left.free
         left = _Remaining(replace(contents, free_bytes=None))
         going = left.delete_until_fits(order, aged, limits)
+    if whole_hours:
+        going |= _rest_of_hours(going - aged, contents, newest)
     given = {bag.path: bag for bag in contents.bags}
     return DeletionPlan(
         tuple(given[bag.path] for bag in order if bag.path in going),
         total,
         fits=most_free is None and left.fits(limits),
         most_free=most_free,
-        aged=aged & going,
-        newest="" if newest is None else newest.path,
     )
 
 
-def _newest(order: Sequence[StoredBag], periods: Sequence[_Period]) -> StoredBag | None:
+def _newest(order: Sequence[StoredBag], periods: Sequence[_Period]) -> str:
     """Returns the bag that stays: the newest dated one, else the last written with messages."""
     if periods:
-        return max(periods[-1], key=attrgetter("end", "path"))
-    with_messages = [bag for bag in order if bag.has_dates]
-    return next(reversed(with_messages or order), None)
+        return max(periods[-1], key=attrgetter("end", "path")).path
+    with_messages = [bag.path for bag in order if bag.has_dates]
+    return next(reversed(with_messages or [bag.path for bag in order]), "")
 
 
-def by_hours(plan: DeletionPlan, contents: DirContents) -> tuple[StoredBag, ...]:
-    """Returns what a plan deletes, in whole hours, so that what stays of an hour is written once.
+def _of_whole_hours(aged: frozenset[str], contents: DirContents, newest: str) -> frozenset[str]:
+    """Returns the bags that are too old in hours of which all are, but for those that stay."""
+    stays = aged | contents.needed | contents.unshipped | {newest}
+    young = {bag.hour for bag in contents.bags if bag.path not in stays}
+    return frozenset(bag.path for bag in contents.bags if bag.hour not in young) & aged
 
-    Age waits until all bags of an hour are too old; to make room the rest of an hour goes, too, but
-    for bags that are needed, and for the hour of the newest bag. Those keep no other one.
-    """
-    stays = contents.needed | contents.unshipped | {plan.newest}
-    going = {bag.path for bag in plan.to_delete}
-    hours: dict[Ns, list[StoredBag]] = {}
-    for bag in contents.bags:
-        if bag.path not in stays or bag.path in going:
-            hours.setdefault(bag.date // HOUR_NS, []).append(bag)
-    last = next((bag.end // HOUR_NS for bag in contents.bags if bag.path == plan.newest), None)
-    deleted: list[StoredBag] = []
-    for hour, bags in sorted(hours.items()):
-        bags.sort(key=attrgetter("date"))
-        inside = [bag for bag in bags if bag.path in going]
-        if all(bag.path in plan.aged for bag in inside):
-            deleted += inside if len(inside) == len(bags) else ()
-        else:
-            deleted += inside if hour == last else bags
-    return tuple(deleted)
+
+def _rest_of_hours(going: set[str], contents: DirContents, newest: str) -> set[str]:
+    """Returns the bags of the hours in which some go to make room, but for those that stay."""
+    hours = {bag.hour for bag in contents.bags if bag.path in going}
+    hours -= {bag.hour for bag in contents.bags if bag.path == newest}
+    rest = {bag.path for bag in contents.bags if bag.hour in hours}
+    return rest - contents.needed - contents.unshipped
 
 
 class _Remaining:
@@ -263,16 +265,22 @@ class _Remaining:
         self, order: Sequence[StoredBag], aged: Collection[str], limits: RetentionLimits
     ) -> set[str]:
         """Takes away the bags that are too old, then others in this order; returns their paths."""
-        going: set[str] = set()
-        for bag in sorted(order, key=lambda bag: bag.path not in aged):
-            is_old, freed = bag.path in aged, self.freed_by(bag)
-            if not is_old and self.fits(limits):
+        going = {bag.path for bag in order if bag.path in aged}
+        for bag in order:
+            if bag.path in going:
+                self._delete(bag)
+        for bag in order:
+            if self.fits(limits):
                 break
-            if is_old or freed:
+            if bag.path not in going and self.freed_by(bag):
+                self._delete(bag)
                 going.add(bag.path)
-                self.total -= freed
-                self.free = None if self.free is None else self.free + freed
         return going
+
+    def _delete(self, bag: StoredBag) -> None:
+        freed = self.freed_by(bag)
+        self.total -= freed
+        self.free = None if self.free is None else self.free + freed
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""

@@ -648,6 +648,24 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     assert (whole["error"], whole["reason"]) == ("no_data", "deleted")
 
 
+def test_a_full_disk_does_not_wait_until_a_whole_hour_is_too_old(bag_dir: Path) -> None:
+    """By age the split of 13:20 would be room enough, but those of 13:30 to 13:50 still stay."""
+    splits(bag_dir, range(0, 40, 10))
+    split(bag_dir, 86_400 + 300, name="rec_B")
+    own_all(bag_dir)
+    full = sum(path.stat().st_size for path in bag_dir.rglob("rec_*/*.mcap"))
+
+    def free(_: Path) -> int:
+        return full - sum(path.stat().st_size for path in bag_dir.rglob("rec_*/*.mcap"))
+
+    now, memory = T0 + (86_400 + 360) * S, days_of(bag_dir)
+    keeper = house(bag_dir, now, max_age_h=24, memory=memory, measure_free=free)
+    keeper.apply()
+    assert bags_left(bag_dir) == 4
+    keeper.make_room(1000)
+    assert free(bag_dir) >= 1000
+
+
 def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
     splits(bag_dir, range(3))
     keep_all(bag_dir, limits=MemoryLimits(texts=("/chat*",)))
@@ -688,6 +706,21 @@ def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_di
     max_bytes = sum(sizes) - min(sizes) // 2
     house(bag_dir, T0 + 7300 * S, max_bytes=max_bytes, memory=memory).apply()
     assert bags_left(bag_dir, "rec_*") == 10
+
+
+def test_where_a_day_cannot_be_written_what_the_limits_need_goes_the_oldest_first(
+    bag_dir: Path,
+) -> None:
+    """The hour from 13:00 is too old, that from 14:00 is not."""
+    splits(bag_dir, range(0, 80, 10))
+    split(bag_dir, 86_400 + 3000, name="rec_B")
+    own_all(bag_dir)
+    sizes = [path.stat().st_size for path in bag_dir.rglob("rec_*/*.mcap")]
+    memory, now = days_of(bag_dir, writer=Failing(0)), T0 + (86_400 + 3060) * S
+    max_bytes = sum(sizes) - min(sizes) // 2
+    house(bag_dir, now, max_age_h=24, max_bytes=max_bytes, memory=memory).apply()
+    left = {path.name for path in (bag_dir / "rec_A").glob("*.mcap")}
+    assert left == {f"rec_A_{minute}.mcap" for minute in range(10, 80, 10)}
 
 
 def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(

@@ -4,16 +4,16 @@ import zlib
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.retention.policy import (
+    DeletionPlan,
     DirContents,
     RetentionLimits,
     StoredBag,
     StoredFile,
-    by_hours,
     plan_deletions,
 )
 
@@ -64,6 +64,10 @@ def expired(contents: DirContents, limits: RetentionLimits) -> tuple[StoredBag, 
     return plan_deletions(contents, limits).to_delete
 
 
+def by_hours(contents: DirContents, limits: RetentionLimits) -> DeletionPlan:
+    return plan_deletions(contents, limits, whole_hours=True)
+
+
 def names(bags: Iterable[StoredBag]) -> list[str]:
     return [each.path.rpartition("/")[2] for each in bags]
 
@@ -81,9 +85,8 @@ class TestAge:
     def test_whole_hours_go_to_make_room_but_for_what_is_needed_and_the_newest_hour(self) -> None:
         minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(200)]
         held = replace(contents(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
-        plan = plan_deletions(held, budget(1900))
-        going = set(names(by_hours(plan, held)))
-        assert set(names(plan.to_delete)) <= going
+        going = set(names(by_hours(held, budget(1900)).to_delete))
+        assert set(names(expired(held, budget(1900)))) <= going
         assert "m170" not in going
         first = min(int(name[1:]) for name in going)
         left = {each.path for each in minutes} - {f"rec/{name}" for name in going}
@@ -97,9 +100,7 @@ class TestAge:
         ahead = bag("ahead", NOW + 900 * DAY)
         minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
         held = contents(*minutes, ahead)
-        plan = plan_deletions(held, budget(200))
-        going = by_hours(plan, held)
-        assert plan.newest not in {each.path for each in going}
+        assert "m0" not in names(by_hours(held, budget(200)).to_delete)
 
     def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
@@ -265,6 +266,22 @@ class TestAlways:
         if lost:
             spared = [each for each in lost if each.files != lost[-1].files]
             assert not fits(without(waiting, [*by_age, *spared]), limits)
+
+    @given(
+        st.lists(st.integers(0, 180), min_size=1, max_size=12),
+        st.integers(1, 40),
+        st.sets(st.integers(0, 12)),
+    )
+    @example([0, 45, 68], 10, set())  # of the older hour only one is too old, and would be enough
+    def test_in_whole_hours_the_limits_are_kept_as_well(
+        self, minutes_ago: list[int], too_many: int, numbers: set[int]
+    ) -> None:
+        bags = [bag(f"b{n}", NOW - ago * 60 * S) for n, ago in enumerate(minutes_ago)]
+        needed = frozenset(each.path for n, each in enumerate(bags) if n in numbers)
+        held = replace(contents(*bags), needed=needed)
+        limits = RetentionLimits(10 * len(bags) - too_many, HOUR)
+        plan = by_hours(held, limits)
+        assert fits(without(held, plan.to_delete), limits) == plan.fits
 
     @given(stocks(), all_limits)
     def test_after_it_is_applied_nothing_more_is_to_delete(
