@@ -152,6 +152,7 @@ class Inventory:
         self._root = root
         self._own = own
         self._static_topics = frozenset(static_topics)
+        self._device: int | None = None
         self._unchanged: dict[str, StoredBag] = {}
         self._folders: dict[str, _Folder] = {}
 
@@ -164,8 +165,11 @@ class Inventory:
         unknown. A bag that a crash left open may, unless the recorder named it last.
 
         Raises:
-            OSError: the list of the recorder's own recordings cannot be read.
+            OSError: the bag directory or the list of the recorder's own recordings cannot be read.
         """
+        device = self._root.stat().st_dev
+        if device != self._device:  # a disk may come back under another number
+            self._device, self._unchanged, self._folders = device, {}, {}
         bags: list[StoredBag] = []
         other_bytes = state_bytes = state_bytes_in(self._root)
         foreign_bytes = 0
@@ -173,13 +177,13 @@ class Inventory:
         named = {str(self._root / name) for name in known.named}
         if self._own is not None:
             self._own.names()
-        judge = cache((lambda _: bool) if self._own is None else self._own.judge_of)
+        judge = None if self._own is None else cache(self._own.judge_of)
         for state, bag in chain(self._changing(known), self._settled(known)):
             path, recording = bag.path, bag.recording
             if path in deleted:
                 continue
             name, is_named = path[len(recording) + 1 :], recording in named
-            is_own, is_saved = judge(recording)(name), path in known.saved
+            is_own, is_saved = judge is None or judge(recording)(name), path in known.saved
             # One is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
             if not (is_own or is_saved or is_new):
@@ -194,7 +198,6 @@ class Inventory:
             elif self._counts(state, bag):
                 other_bytes += sum(file.size for file in bag.files)
         other_bytes += sum(self._folder_at(path, known.now).size for path in recordings)
-        device = -1
         with suppress(OSError):
             device = (self._root / MOMENTS_FOLDER).stat().st_dev
         return DirContents(

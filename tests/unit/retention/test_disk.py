@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.retention.disk import RETRIED_S, FailingFiles, HomeDisk, device_of
+from tests.support.housekeepers import A, B, keeper_of, recording
 
 
 class Devices:
@@ -65,3 +67,30 @@ def test_a_file_is_given_up_after_a_day_unless_it_was_read_meanwhile() -> None:
     found = [files.may_recover(path, fault) for _ in hours]
     assert found == [True] * 24 + [False, True, True]
     assert not files.may_recover(path, BagError("a_0.mcap", "it is damaged"))
+
+
+class OnAnotherDevice:
+    """The status of a file, but for its device."""
+
+    def __init__(self, status: os.stat_result) -> None:
+        self._status = status
+        self.st_dev = status.st_dev + 1
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._status, name)
+
+
+def test_bags_are_deleted_after_their_disk_came_back_under_another_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = recording(tmp_path, A, 0)
+    house = keeper_of(tmp_path, max_age_h=1)
+    with monkeypatch.context() as patched:
+        stat = Path.stat
+        patched.setattr(Path, "stat", lambda path, **how: OnAnotherDevice(stat(path, **how)))
+        house.apply()
+        house.apply()
+    assert all(path.exists() for path in old)
+    recording(tmp_path, B, 2 * 3600)
+    house.apply()
+    assert not any(path.exists() for path in old)
