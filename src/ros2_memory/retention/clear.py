@@ -93,7 +93,7 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
         if _is_left_alone(path[begin:]):
             continue
         folder = Path(path)
-        holds = own.judge(path[begin:], known_identity(path)) if own else bool
+        holds = own.judge(path[begin:], known_identity(path)) if own else lambda _: True
         bags = [
             folder / entry.name
             for entry in entries

@@ -129,8 +129,8 @@ class TopicCutter:
     def cut(self, contents: DirContents, limits: RetentionLimits, snapshot: Snapshot) -> int:
         """Cuts what is too old until `SLICE_S` is over; returns how many bags were cut.
 
-        None while messages are being forgotten, nor while the machine is busy (for `PATIENCE_S`
-        at most), nor where the new file beside the old one would leave less than
+        Nothing is cut while messages are being forgotten, while the machine is busy (for
+        `PATIENCE_S` at most), or where the new file beside the old one would leave less than
         `limits.min_free_bytes` of the disk free. A bag that cannot be cut is reported once, and
         stays as it is until it changes.
 
