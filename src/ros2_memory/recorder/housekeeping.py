@@ -157,7 +157,7 @@ class Housekeeping:
         self._unwritten: list[Loss] = []
 
     def prepare(self) -> None:
-        """Notes that an earlier run was cut short, and removes what it began without a byte.
+        """Notes that an earlier run was cut short, and removes what it began or left without a bag.
 
         Nothing may be recording.
 
@@ -179,6 +179,9 @@ class Housekeeping:
                 # Killed before it was listed as a directory: nothing shows whose it is.
                 if self._own.began(directory):
                     remove_if_empty(directory)
+        # Killed between the deletion of a last bag and of its directory.
+        directories = (self._bag_dir / name for name in self._own.names())
+        self._collector.emptied.update(filter(self._own.owns, directories))
         self._clear_memory()
 
     def _clear_memory(self) -> None:

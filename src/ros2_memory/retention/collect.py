@@ -133,6 +133,9 @@ class GarbageCollector:
         grace_s: how long latched messages are carried before their bag is deleted.
         memory: what stays of deleted bags; None where nothing does.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
+
+    Attributes:
+        emptied: recordings that go with the next pass if no bag is left of them.
     """
 
     bag_dir: Path
@@ -157,7 +160,7 @@ class GarbageCollector:
         )
         self._carried_since: dict[str, float] = {}
         self._reported: set[str] = set()
-        self._emptied: set[Path] = set()
+        self.emptied: set[Path] = set()
         self._unwritten: list[Deleted] = []
 
     def apply(
@@ -364,14 +367,14 @@ class GarbageCollector:
 
     def _remove_emptied(self, known: KnownBags, run: _Pass) -> None:
         """Deletes what is left of recordings without a bag, except those being written."""
-        self._emptied |= {Path(path).parent for path in run.deleted}
-        for recording in self._emptied - {self.bag_dir / name for name in known.named}:
+        self.emptied |= {Path(path).parent for path in run.deleted}
+        for recording in self.emptied - {self.bag_dir / name for name in known.named}:
             try:
                 remove_emptied(self.bag_dir, recording)
             except OSError as error:
                 self._report(str(recording), str(error))
             else:
-                self._emptied.discard(recording)
+                self.emptied.discard(recording)
                 run.result.recordings += not recording.exists()
 
     def _keep_failed(self, bag: StoredBag, reason: str, run: _Pass) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import pytest
 import structlog
@@ -21,6 +22,7 @@ from ros2_memory.bag_dir.state_files import (
     deleted_spans,
     read_deleted,
 )
+from ros2_memory.retention import collect
 from tests.support.clocks import SettableClock
 from tests.support.fakes import failing
 from tests.support.housekeepers import (
@@ -32,6 +34,7 @@ from tests.support.housekeepers import (
     described,
     house_of,
     kept,
+    own_all,
     recording,
     size_of,
 )
@@ -131,6 +134,27 @@ def test_a_deletion_is_written_down_before_it_happens(
     # What was not deleted after all answers as ever.
     assert ask(tmp_path, "get_position_at", timestamp=T0_S + 45)["x"] == 45
     assert ask(tmp_path, "get_position_at", timestamp=T0_S + 3000)["reason"] == "gap"
+
+
+def test_a_kill_before_the_directory_goes_with_its_last_bag_leaves_it_to_the_next_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed(tmp_path, A, 0)
+    listed(tmp_path, B, 3 * 3600)
+    own_all(tmp_path)
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "metadata.yaml").touch()
+    limits: dict[str, Any] = {"max_age_h": 1, "keeps_foreign": True}
+    with monkeypatch.context() as patched:
+        patched.setattr(collect, "remove_emptied", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            house_of(tmp_path, **limits).apply()
+    assert not [*(tmp_path / A).glob("*.mcap")]
+    house = house_of(tmp_path, **limits)
+    house.prepare()
+    house.apply()
+    assert not (tmp_path / A).exists()
+    assert (tmp_path / "theirs" / "metadata.yaml").exists()
 
 
 def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_there_is_room(
