@@ -157,7 +157,8 @@ def rewritten(
 
     Raises:
         EpisodicError: it cannot be rewritten, or another program rewrites it; nothing is changed.
-        OSError: likewise, or it is another file now.
+        OSError: likewise, or it is another file now; or the folder of the new one cannot be
+            flushed.
     """
     with opened_folder(bag_dir, path) as here, here.open("rb") as old:
         try:
@@ -177,7 +178,7 @@ def replace_file(new: Path, path: Path, inode: Identity) -> None:
     """Gives a file the name of another, which must still be the one that was read.
 
     Raises:
-        OSError: it is not, or has gone.
+        OSError: it is not, or has gone; or it has the name, but the folder cannot be flushed.
     """
     status = path.lstat()
     if (status.st_dev, status.st_ino) != inode:

@@ -197,7 +197,7 @@ class TopicCutter:
 
         Raises:
             EpisodicError: it cannot be rewritten; nothing is changed.
-            OSError: likewise.
+            OSError: likewise; or it was, and its folder cannot be flushed.
         """
         path = cut.bag.path
         before = path.lstat()
@@ -237,10 +237,11 @@ class TopicCutter:
                     shipped = replace(receipt, size=new.stat().st_size)
                     SHIPPED.append(self.bag_dir, [shipped])
         except (EpisodicError, OSError):
-            EXPIRED.write(self.bag_dir, expired)
-            if receipt is not None:
-                with suppress(OSError):
-                    SHIPPED.append(self.bag_dir, [receipt])
+            if os.path.samestat(path.lstat(), before):  # else it was cut, and then not flushed
+                EXPIRED.write(self.bag_dir, expired)
+                if receipt is not None:
+                    with suppress(OSError):
+                        SHIPPED.append(self.bag_dir, [receipt])
             raise
         return gone
 

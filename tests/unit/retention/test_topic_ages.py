@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 from collections.abc import Callable
 from pathlib import Path
@@ -239,4 +240,18 @@ def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
     assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
     house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert "/speech" not in counts_of(path)
+    assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
+
+
+def test_what_went_stays_written_down_where_the_folder_cannot_be_flushed_afterwards(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag_dir / "rec_A" / "rec_A_0.mcap"
+    receipt = Receipt("rec_A/rec_A_0.mcap", "id", path.stat().st_size, "00", "lake", 1)
+    append_receipts(bag_dir, [receipt])
+    with monkeypatch.context() as patched:
+        patched.setattr(repair, "flush", failing(errno.EIO))
+        house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+    assert "/speech" not in counts_of(path)
+    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
     assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
