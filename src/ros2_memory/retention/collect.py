@@ -187,7 +187,7 @@ class GarbageCollector:
             limits = replace(limits, min_free_bytes=free_bytes_wanted)
         run = _Pass(urgent=free_bytes_wanted is not None)
         while True:
-            contents = replace(self._contents(known, limits, run), needed=needed)
+            contents = self._contents(known, needed, limits, run)
             if free_bytes_wanted is not None:
                 contents = replace(contents, free_bytes=self.measure_free(self.bag_dir))
             # So that what stays of an hour is written once.
@@ -236,7 +236,9 @@ class GarbageCollector:
             most_free=plan.most_free,
         )
 
-    def _contents(self, known: KnownBags, limits: RetentionLimits, run: _Pass) -> DirContents:
+    def _contents(
+        self, known: KnownBags, needed: frozenset[str], limits: RetentionLimits, run: _Pass
+    ) -> DirContents:
         """Returns what is stored, how long was recorded after it, and where the clock was right."""
         contents = self._inventory.contents(known, deleted=run.deleted, remaining=run.remaining)
         root = f"{self.bag_dir}{os.sep}"
@@ -251,6 +253,7 @@ class GarbageCollector:
             recorded_since={path: since[name] for path, name in names.items()},
             doubtful=frozenset(path for path, name in names.items() if name in doubtful),
             places={path: order[name] for path, name in names.items() if name in order},
+            needed=needed,
             unshipped=frozenset(root + path for path in missing),
         )
         old = too_old(contents, limits, limits.max_age_ns)

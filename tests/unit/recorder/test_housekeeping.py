@@ -127,6 +127,16 @@ class TestRetention:
         keeper.apply()
         assert clock.call_count == 3
 
+    def test_what_rules_need_is_not_held_by_the_clock(self, tmp_path: Path) -> None:
+        old = [bag(tmp_path / f"a/a_{n}.mcap", n * 10) for n in range(2)]
+        bag(tmp_path / "b/b_0.mcap", 3 * 3600)
+        rules = Mock(restarts=(), needed=lambda _: frozenset({str(old[0])}))
+        keeper = keeper_of(
+            tmp_path, max_age_h=2, is_synchronised=lambda: False, watch=lambda _: rules
+        )
+        keeper.apply()
+        assert "1 bag is older than 2 h" in str(keeper.status().age_held)
+
     def test_where_bags_must_be_shipped_age_waits_for_the_receipt_of_this_very_bag(
         self, tmp_path: Path
     ) -> None:
