@@ -57,9 +57,9 @@ _LAST_LINES: Final = 6
 class SplitChanges(NamedTuple):
     """What changed since the last observation.
 
-    `closed` names splits in the order in which they were recorded, and `empty` all those that are
-    empty though a newer one was seen. `gone`: the directory existed and does not any more. `faults`
-    are sentences about what could not be read.
+    `closed` names splits in the order in which they were recorded, and `empty` those that are found
+    to stay empty though a newer one was seen. `gone`: the directory existed and does not any more.
+    `faults` are sentences about what could not be read.
     """
 
     closed: tuple[str, ...] = ()
@@ -73,6 +73,7 @@ class _Split:
     first_seen_s: float
     size: int = 0
     closed: bool = False
+    stays_empty: bool = False
     start: Ns = MAX_NS
 
 
@@ -110,12 +111,16 @@ class Splits:
         closed.sort(key=lambda name: (self._files[name].start, name))
         newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
         overdue = now_s - newest_s >= EMPTY_GRACE_S
-        empty = tuple(
+        empty = [
             name
             for name, size in sizes.items()
-            if overdue and not size and newest_s > self._files[name].first_seen_s
-        )
-        return SplitChanges(tuple(closed), empty, faults=tuple(faults))
+            if overdue
+            and not (size or self._files[name].stays_empty)
+            and newest_s > self._files[name].first_seen_s
+        ]
+        for name in empty:
+            self._files[name].stays_empty = True
+        return SplitChanges(tuple(closed), tuple(empty), faults=tuple(faults))
 
     @property
     def bytes_written(self) -> int:
@@ -536,7 +541,7 @@ class RecordingSessions:
         for name in changes.empty:
             file = f"{session.name}/{name}"
             sentence = f"{file} is empty although a newer split was started"
-            self.events.lasting("split_empty", file, sentence, recording=session.name)
+            self.events.fail("split_empty", sentence, recording=session.name)
         for fault in changes.faults:
             self.events.lasting("unreadable", session.name, fault, recording=session.name)
         return changes

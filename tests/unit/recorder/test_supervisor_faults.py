@@ -316,6 +316,18 @@ class TestSpace:
         assert len(reported) >= 2
         assert len({each["reason"] for each in reported}) == len(reported)
 
+    def test_once_a_newer_split_is_closed_an_empty_one_is_past(self, tmp_path: Path) -> None:
+        world = World(tmp_path).started(8)
+        world.disk_full = True
+        world.run(12)
+        world.disk_full = False
+        world.run(2)
+        assert world.heartbeat()["recovered"] is False
+        world.run(18)
+        assert "is empty" in str(world.heartbeat()["last_error"])
+        assert world.heartbeat()["recovered"] is True
+        assert len(world.recorders) == 1
+
 
 class TestUnmounted:
     """The disk is unmounted: its recordings are not there, and an empty directory is."""
