@@ -247,7 +247,7 @@ class Reception:
         self.background.add(_TASK, lambda: self._report_losses(self._losses.flush))
 
     def lost(self, recording: str, topic: str, count: int) -> None:
-        """Notes that rosbag2 itself lost messages of a topic in a recording that ends."""
+        """Notes that rosbag2 itself lost messages of a topic, up to a recording's last split."""
 
         def reported() -> list[Loss]:
             state = self._recordings.get(recording)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections import deque
+from collections import Counter, deque
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import Enum, auto
@@ -36,7 +36,7 @@ from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -212,6 +212,7 @@ class RecordingSession:
         self.of_unknown_type: set[str] = set()
         self._reported: set[tuple[str | None, str]] = set()
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
+        self._lost, self._lost_before = Counter[str](), Counter[str]()
 
     @property
     def is_recording(self) -> bool:
@@ -247,6 +248,9 @@ class RecordingSession:
             line = parse_line(raw)
             if line.text and line.topic is None and "[INFO]" not in raw:
                 self._last_lines.append(line.text)
+            if line.kind is LineKind.TOPIC_LOST and line.topic is not None:
+                # It counts from the beginning of the recording.
+                self._lost[line.topic] = line.count or 0
             if line.kind is LineKind.READY:
                 if not self.has_recorded:
                     lines.append(line)
@@ -263,6 +267,11 @@ class RecordingSession:
                     self.of_unknown_type.add(line.topic)
                 lines.append(line)
         return lines
+
+    def take_lost(self) -> Mapping[str, int]:
+        """Returns how many more messages of topics the child has lost than at the last call."""
+        more, self._lost_before = self._lost - self._lost_before, self._lost.copy()
+        return more
 
     def silent_topics(self) -> frozenset[str]:
         """Returns topics subscribed to that no closed split contains; none before the first."""
@@ -534,6 +543,10 @@ class RecordingSessions:
         for name in changes.closed:
             self.events.info("split_closed", recording=session.name, file=name)
             self.orders.reception.learn(session.name, session.splits.directory / name)
+        if changes.closed or session.state is SessionState.ENDED:
+            # What a split shows to be missing is counted first.
+            for topic, count in session.take_lost().items():
+                self.orders.reception.lost(session.name, topic, count)
         if changes.closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s
@@ -560,8 +573,6 @@ class RecordingSessions:
                 reception.refused(session.name, line.topic, best_effort=best_effort)
             elif line.kind is LineKind.SEVERAL_TYPES and line.topic in session.subscribed:
                 reception.refused(session.name, line.topic, best_effort=None)
-            elif line.kind is LineKind.TOPIC_LOST:
-                reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush_later(
         self, session: RecordingSession, directory: Path, names: tuple[str, ...]

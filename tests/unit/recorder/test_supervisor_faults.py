@@ -23,6 +23,8 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder import sessions
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.supervisor import make_bag_dir
+from tests.support import simulated_recorders
+from tests.support.bags import odom
 from tests.support.fakes import failing
 from tests.support.housekeepers import keeper_of
 from tests.support.simulated_recorders import (
@@ -399,6 +401,49 @@ class TestUnmounted:
             world.run(1)
         world.run(10)
         assert len(world.recorders) <= 3
+
+
+class TestLost:
+    """What `ros2 bag record` itself counts; it prints that before it closes the split."""
+
+    def test_it_is_said_of_the_time_until_the_split_that_closes(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
+        world.started(2)
+        recorder = world.recorders[0]
+        recorder.lines.append("\t/door: 5")
+        world.run(5)
+        recorder.lines.append("\t/door: 5")
+        world.run(2)
+        recorder.lines.append("\t/door: 12")
+        world.supervisor.stop()
+        first, last = min(published := world.published(counting=False)), max(published)
+        early, late = read_losses(tmp_path, MIN_NS, MAX_NS)
+        assert [(loss.topic, loss.lost, loss.by) for loss in (early, late)] == [
+            ("/door", 5, "rosbag2"),
+            ("/door", 7, "rosbag2"),
+        ]
+        assert first <= early.start < early.stop < last <= late.stop
+
+    def test_what_the_messages_themselves_show_to_be_missing_counts_once(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(
+            simulated_recorders, "boolean", lambda at, _, topic: odom(at, 1.0, 2.0, topic=topic)
+        )
+        world = World(tmp_path, split_duration_s=100).started(20)
+        recorder = world.recorders[0]
+        recorder.deaf = True
+        world.run(1.25)
+        recorder.deaf = False
+        world.run(20)
+        recorder.lines += ["\t/bumper: 5", "\t/door: 5"]
+        world.supervisor.stop()
+        losses = read_losses(tmp_path, MIN_NS, MAX_NS)
+        assert sorted((loss.topic, loss.lost, loss.by) for loss in losses) == [
+            ("/bumper", 5, "stamps"),
+            ("/door", 5, "stamps"),
+        ]
 
 
 class TestHouse:
