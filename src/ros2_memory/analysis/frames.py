@@ -413,21 +413,23 @@ class FrameTree:
                 lacking = self._missing_link(frame, time)
                 if lacking is not None:
                     return lacking
-        # In a loop, the frame where it closes.
-        roots = [[*self._newest_chain(frame)][-1] for frame in (self.target, name)]
+        # A root is, in a loop, the frame where it closes.
+        pair = f"frames '{self.target}' and '{name}'"
         if name in tree:
+            at = np.array(time, np.int64)
+            target_root, root = ([*self._chain(frame, at)][-1] for frame in (self.target, name))
             detail = (
-                f"frames '{self.target}' and '{name}' were not connected at {_unix(time)}, because"
-                f" the tree changes or contains a loop; the newest known roots are"
-                f" '{roots[0]}' and '{roots[1]}'; ask about another time"
+                f"{pair} were not connected at {_unix(time)}, because the tree changes or contains"
+                f" a loop; then their roots were '{target_root}' and '{root}'; ask about another"
+                " time"
             )
         else:
+            target_root, root = ([*self._newest_chain(frame)][-1] for frame in (self.target, name))
             others = sorted(connected_with(name, self._pairs) - {name})
             detail = (
-                f"frames '{self.target}' and '{name}' are not connected: '{self.target}' is in the"
-                f" tree of '{roots[0]}', '{name}' in that of '{roots[1]}', and no recorded"
-                f" transform joins them; connected to '{name}':"
-                f" {listed(others, at_most=_MAX_NAMES)}"
+                f"{pair} are not connected: '{self.target}' is in the tree of '{target_root}',"
+                f" '{name}' in that of '{root}', and no recorded transform joins them; connected"
+                f" to '{name}': {listed(others, at_most=_MAX_NAMES)}"
             )
         return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 

@@ -163,6 +163,18 @@ def test_frames_that_the_tree_connects_only_at_other_times_are_not_connected_the
     assert "were not connected at 11.000000" in refused.detail
 
 
+def test_frames_that_are_not_connected_have_the_roots_of_that_time() -> None:
+    """What their roots are now does not say why they were apart."""
+    tree = Tree(
+        [
+            *(edge("map", "odom", at * S) for at in range(1, 30)),
+            *(edge("a", "base", at * S) for at in range(1, 11)),
+            *(edge("map", "base", at * S) for at in range(11, 30)),
+        ]
+    )
+    assert "their roots were 'map' and 'a';" in refusal(tree, "odom", "base", 5 * S).detail
+
+
 @pytest.mark.parametrize("static", [True, False])
 def test_a_loop_is_an_answer_and_not_an_endless_walk(static: bool) -> None:
     tree = Tree(
