@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import compress, pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -42,8 +42,8 @@ class Contents(NamedTuple):
 
     Attributes:
         totals: the messages of each channel that has some, by its number.
-        set_back: by how much the log times of a channel go back at most in the order of the file,
-            and the first one after that.
+        set_back: by how much a log time lies at most before an earlier one of its channel in the
+            order of the file, and that log time.
         pauses: where no channel has a message for more than `SHORTEST_PAUSE_NS`.
         absences: by channel, where it has none for more than `SHORTEST_SILENCE_NS`.
     """
@@ -123,6 +123,13 @@ class _Spans(NamedTuple):
         return cls(numbers[is_row], firsts, lasts, np.where(alone, 1, sizes[span]))
 
 
+def _set_back(firsts: Ints, lasts: Ints) -> tuple[Ns, Ns]:
+    """Returns by how much spans begin at most before an earlier one has ended, and when that is."""
+    behind = np.maximum.accumulate(lasts)[:-1] - firsts[1:]
+    most = int(behind.argmax())
+    return int(behind[most]), int(firsts[most + 1])
+
+
 class Tally:
     """Counts the messages of a file, some at a time."""
 
@@ -145,10 +152,13 @@ class Tally:
         numbers, times, chunks = numbers[order], times[order], chunks[order]
         is_other = (numbers[1:] != numbers[:-1]) | (chunks[1:] != chunks[:-1])
         begins = np.append(0, np.flatnonzero(is_other) + 1)
-        back = -np.diff(times, prepend=times[:1])
-        back[begins] = 0
-        most = int(back.argmax())
-        self._back = max(self._back, (int(back[most]), int(times[most])))
+        goes_back = np.append(False, times[1:] < times[:-1])
+        goes_back[begins] = False
+        if goes_back.any():
+            groups = pairwise([*begins.tolist(), times.size])
+            for group in compress(groups, np.logical_or.reduceat(goes_back, begins)):
+                of_group = times[slice(*group)]
+                self._back = max(self._back, _set_back(of_group, of_group))
         self._by_channel.append(_Spans.of(numbers, times, begins, SHORTEST_SILENCE_NS))
 
     def contents(self) -> Contents:
@@ -174,9 +184,7 @@ class Tally:
             totals[number] = Extent(count, first, last)
             rows = slice(begin, end)
             if number in going_back:
-                behind = np.maximum.accumulate(lasts[rows])[:-1] - firsts[rows][1:]
-                most = int(behind.argmax())
-                back = max(back, (int(behind[most]), int(firsts[begin + most + 1])))
+                back = max(back, _set_back(firsts[rows], lasts[rows]))
             if last - first > SHORTEST_SILENCE_NS:
                 columns = firsts[rows], lasts[rows], counts[rows]
                 if pauses := pauses_among(*columns, longer_than=SHORTEST_SILENCE_NS):
