@@ -18,7 +18,7 @@ import resource
 import signal
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from decimal import Decimal
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -55,6 +55,8 @@ _PROGRAM_MB: Final = 1024
 _PROGRAM: Final = f"from {__name__} import main; main()"
 ALLOCATORS: Final = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2"}
 """By default those of Arrow and of C reserve 2 GB of addresses for its threads."""
+_WITHOUT_MEMORY: Final = (signal.SIGABRT, signal.SIGBUS, signal.SIGKILL, signal.SIGSEGV)
+"""Signals that end code of C which gets no memory, or come from a system that has none left."""
 _LOOKED_AGAIN_S: Final = 0.1
 _LONGEST_S: Final = 86_400.0
 """How long a statement may take for which nobody set a time."""
@@ -168,9 +170,9 @@ class Select:
                 process.kill()
         if process.returncode:
             log.warning("lake_select_failed", reason=f"exit code {process.returncode}")
-            # Code of C that gets no memory is ended by a signal.
-            is_killed = process.returncode < 0
-            raise RefusedError(_too_much(self.memory_mb) if is_killed else f"it failed; {_LOGGED}")
+            lacks_memory = -process.returncode in _WITHOUT_MEMORY
+            reason = _too_much(self.memory_mb) if lacks_memory else f"it failed; {_LOGGED}"
+            raise RefusedError(reason)
         answer = json.loads(text)
         if "error" not in answer:
             return Selected(**answer)
@@ -344,10 +346,11 @@ def main() -> None:
     # Should the one who asks be killed.
     signal.setitimer(signal.ITIMER_REAL, max(left_s, 0.0) + 1.0)
     try:
-        answer = asdict(select.rows(tables))
+        found = select.rows(tables)
+        # Copies of all values would be too many.
+        answer = {"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut}
     except EpisodicError as error:
         # A path is for the log alone.
-        cause = str(error.__cause__ or "") if isinstance(error, RefusedError) else ""
-        cause = _short(cause)
+        cause = _short(str(error.__cause__ or "")) if isinstance(error, RefusedError) else ""
         answer = {"error": error.code, "reason": str(error), "cause": cause}
     json.dump(answer, sys.stdout)

@@ -21,6 +21,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.select import QUERY_LAKE, select_tools
 from ros2_memory.history.context import Call
+from ros2_memory.lake import select as lake_select
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.select import ALLOCATORS, Select, check_select
 from ros2_memory.lake.tables import TABLES
@@ -205,6 +206,17 @@ def test_memory_that_duckdb_does_not_count_and_time_without_end_are_bounded(flee
     assert answer["error"] == "timeout"
     assert asked(fleet, BAGS, Call(Deadline.after(-1.0)))["error"] == "timeout"
     assert asked(fleet, BAGS)["rows"] == [[ATTIC, 2], [HALL, 3]]
+
+
+@pytest.mark.parametrize("number", [signal.SIGABRT, signal.SIGTERM])
+def test_an_end_that_shows_no_want_of_memory_is_not_called_that(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    program = f"import os; os.kill(os.getpid(), {int(number)})"
+    monkeypatch.setattr(lake_select, "_PROGRAM", program)
+    reason = asked(fleet, BAGS)["detail"]
+    assert ("needs more than 256 MiB" in reason) == (number is signal.SIGABRT)
+    assert ("it failed" in reason) == (number is signal.SIGTERM)
 
 
 def test_its_process_ends_by_itself_should_the_server_be_killed() -> None:
