@@ -138,8 +138,9 @@ def compared(
     """
     buffer, sizes = content.buffer, np.array(content.sizes)
     chunk_ends = np.cumsum(sizes)
-    at = pairs.offsets + (chunk_ends - sizes)[pairs.chunks]
-    if at.size and (pairs.offsets.min() < 0 or at.max() > len(buffer) - _HEAD.itemsize):
+    at, last = pairs.offsets + (chunk_ends - sizes)[pairs.chunks], len(buffer) - _HEAD.itemsize
+    # A sum may have wrapped.
+    if at.size and (pairs.offsets.min() < 0 or max(pairs.offsets.max(), at.max()) > last):
         raise UnreadableError(_NOT_THERE)
     heads, room = gathered(buffer, _HEAD, at), chunk_ends[pairs.chunks] - at - RECORD.size
     is_other = heads["opcode"] != _MESSAGE

@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 import zstandard
 from hypothesis import given, settings
@@ -15,7 +16,10 @@ from mcap.writer import CompressionType
 
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.mcap import bulk
+from ros2_memory.storage.mcap.bulk import ReadChunks
+from ros2_memory.storage.mcap.chunk import Pairs
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.examples import examples
@@ -70,6 +74,13 @@ def test_of_a_damaged_file_batches_hold_what_records_do(seed: int, how: McapLayo
     if not contradicted:
         assert found == expected
     assert bool(errors) == bool(others)
+
+
+def test_a_place_past_all_that_can_be_counted_is_damage() -> None:
+    content = ReadChunks((), bytes(200), [100, 100])
+    pairs = Pairs(*np.array([[1], [0], [2**63 - 1], [1]]))
+    with pytest.raises(UnreadableError, match="a message is not where its index says"):
+        bulk.compared(content, pairs)
 
 
 def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:
