@@ -6,6 +6,7 @@ only while it is the very file that was judged. A recording's directory is delet
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import stat
@@ -63,7 +64,8 @@ def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
     with directories.opened(root, path.parent) as directory:
         status = os.stat(path.name, dir_fd=directory, follow_symlinks=False)
         if not stat.S_ISREG(status.st_mode) or (status.st_dev, status.st_ino) != inode:
-            raise OSError(f"{path} is not the file that was looked at")
+            reason = "it is not the file that was looked at"
+            raise OSError(errno.ESTALE, reason, str(path))
         os.unlink(path.name, dir_fd=directory)
         for suffix in _JOURNALS if path.suffix.lower() == ".db3" else ():
             with suppress(FileNotFoundError, IsADirectoryError):

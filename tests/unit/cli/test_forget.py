@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -13,6 +14,7 @@ import yaml
 from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import OWN_FOLDER
+from ros2_memory.cli.output import format_size
 from ros2_memory.columns.store import FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -260,6 +262,25 @@ class TestUnreadable:
         left(other)
         assert "stays" not in forget(0, 39, 55, "--yes storage=mcap").out
         assert not other.exists()
+
+    def test_a_form_that_cannot_be_deleted_stays_alone(
+        self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+    ) -> None:
+        bag, other = bag_dir / "rec_1" / "rec_2.mcap", bag_dir / "rec_1" / "rec_2.mcap.zstd"
+        other.write_bytes(b"compressed")
+        left(other)
+        size, unlink = bag.stat().st_size, os.unlink
+
+        def refused(path: str, *, dir_fd: int | None = None) -> None:
+            if path == other.name:
+                raise PermissionError(errno.EPERM, "Operation not permitted", path)
+            unlink(path, dir_fd=dir_fd)
+
+        monkeypatch.setattr(os, "unlink", refused)
+        printed = forget(1, 39, 55, "--yes storage=mcap").out
+        assert f"deleted: 1 bag, {format_size(size)}" in printed
+        assert "stays: rec_1/rec_2.mcap.zstd: Operation not permitted" in printed
+        assert (bag.exists(), other.exists()) == (False, True)
 
     def test_one_that_a_crash_left_open_is_closed_by_recover_also_where_none_counts(
         self, bag_dir: Path, forget: Forget, exits: Program

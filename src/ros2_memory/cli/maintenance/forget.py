@@ -402,7 +402,7 @@ class _Forget:
                 try:
                     remove_emptied(self._bag_dir, recording)
                 except OSError as error:
-                    kept.append(f"{recording}: {error}")
+                    kept.append(f"{self._name(recording)}: {error.strerror or error}")
             try:
                 self._forget_derived(map(self._name, deleted))
             except BagError as error:
@@ -445,19 +445,21 @@ class _Forget:
             kept.append(f"the list of deleted bags: {error.strerror or error}")
 
     def _delete_files(self, bags: Sequence[BagFile], kept: list[str]) -> tuple[list[BagFile], int]:
-        """Deletes bags in every form; returns which, and their bytes; adds faults to `kept`."""
-        deleted, freed = [], 0
-        for bag in bags:
+        """Deletes bags in every form, and adds faults to `kept`.
+
+        Returns those of which the form that counted is gone, and the bytes of all that is.
+        """
+        staying, freed = set[Path](), 0
+        for path in (path for bag in bags for path in (bag.path, Path(other_form(bag.file)))):
             try:
-                for path in (bag.path, Path(other_form(bag.file))):
-                    with suppress(FileNotFoundError):
-                        status = path.lstat()
-                        inode = status.st_dev, status.st_ino
-                        freed += remove_bag(self._bag_dir, path, inode)
-                deleted.append(bag)
+                with suppress(FileNotFoundError):
+                    status = path.lstat()
+                    inode = status.st_dev, status.st_ino
+                    freed += remove_bag(self._bag_dir, path, inode)
             except OSError as error:
-                kept.append(f"{bag.path}: {error}")
-        return deleted, freed
+                kept.append(f"{self._name(path)}: {error.strerror or error}")
+                staying.add(path)
+        return [bag for bag in bags if bag.path not in staying], freed
 
     def _request_of_lake(self, forgettings: Sequence[Forgetting]) -> list[str]:
         """Stores what a lake has to forget; returns a line on what the lake keeps if it cannot."""
