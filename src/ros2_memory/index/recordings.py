@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import re
 from functools import partial
+from heapq import nlargest
 from itertools import chain, pairwise
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -174,14 +176,17 @@ def overlapping_recordings(
 
 
 def _long_overlaps(snapshot: Snapshot) -> tuple[Overlapping, ...]:
+    """Returns the pairs that share most time, in order of time, also those of handovers."""
     lengths, overlaps = _sweep(snapshot)
     pairs = []
     for (first, second), overlap in overlaps.items():
         shorter = min(lengths[first], lengths[second])
         shared = overlap.shared
         if shared > LONG_NS or (shared > SHORT_NS and 2 * shared >= shorter):
-            pairs.append(Overlapping(Path(first), Path(second), overlap.start, overlap.end))
-    return tuple(sorted(pairs, key=lambda pair: pair.start)[:_MAX_READ])
+            pair = Overlapping(Path(first), Path(second), overlap.start, overlap.end)
+            pairs.append((shared, pair))
+    longest = nlargest(_MAX_READ, pairs, key=itemgetter(0))
+    return tuple(sorted((pair for _, pair in longest), key=lambda pair: pair.start))
 
 
 class _Overlap(NamedTuple):

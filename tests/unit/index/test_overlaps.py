@@ -13,7 +13,7 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.spans import overlap_spans
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.index import timeline
+from ros2_memory.index import recordings, timeline
 from ros2_memory.index.recordings import Overlapping, overlapping_recordings
 from ros2_memory.queries import list_recorded_topics
 from tests.support.bags import odom, text, write_mcap
@@ -62,6 +62,17 @@ def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
     assert pairs(overlapping(taken)) == [("a", "b", 8.0, 15.0)]
     write_handover(tmp_path / "b", Handover(previous="a"))
     assert overlapping(taken) == ()
+
+
+def test_two_robots_are_found_behind_however_many_handovers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recordings, "_MAX_READ", 3)
+    joined = {f"a{number}": [(number * 10, number * 10 + 20)] for number in range(5)}
+    taken = robot(tmp_path, {**joined, "b": [(100, 150)], "c": [(100, 150)]})
+    for number in range(1, 5):
+        write_handover(tmp_path / f"a{number}", Handover(previous=f"a{number - 1}"))
+    assert pairs(overlapping(taken)) == [("b", "c", 100.0, 150.0)]
 
 
 halves_of_seconds = st.integers(0, 120).map(lambda number: number * NS_PER_S // 2)
