@@ -101,7 +101,7 @@ class Child:
             RecorderError: it cannot be started.
         """
         if threading.current_thread() is not threading.main_thread():
-            raise RecorderError("a recorder must be started from the main thread: it dies with it")
+            raise RecorderError("a child must be started from the main thread: it dies with it")
         launched = [sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid()), *argv]
         process = _spawn(launched, env, subprocess.PIPE, stderr, keep_open)
         return cls(process, patience or Patience())
