@@ -28,7 +28,7 @@ from ros2_memory.analysis.facts import (
 from ros2_memory.analysis.topic_events import Change, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.text import Quoted
+from ros2_memory.core.text import Quoted, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
@@ -265,15 +265,19 @@ def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]
 def _change_sentence(topic: str, change: Change, level_before: int) -> str:
     """Returns a sentence for a status, a goal or a charge; empty for what is not reported."""
     if change.kind == STATUS:
-        is_known = 0 <= change.value < len(_LEVELS)
-        word = _LEVELS[change.value] if is_known else f"level {change.value}"
         more = f": {change.text}" if change.text else ""
-        return Quoted(f"status of {change.name} became {word}{more}"[:_MAX_LOG_CHARS])
+        sentence = f"status of {change.name} became {_level(change.value)}{more}"
+        return shortened(Quoted(sentence), _MAX_LOG_CHARS)
     if change.kind == GOAL:
         return f"{action_of(topic)} goal {GOAL_WORDS.get(change.value, 'accepted')}"
     if change.kind == CHARGE and change.value > level_before:
         return f"{topic} fell below {LOW_CHARGES[change.value - 1]:.0%}"
     return ""
+
+
+def _level(number: int) -> str:
+    """Returns the level of a diagnostic status in words."""
+    return _LEVELS[number] if 0 <= number < len(_LEVELS) else f"level {number}"
 
 
 def _goal_activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
@@ -320,8 +324,7 @@ def _state_at_end(
             yield f"{action_of(topic)} goal", word
         for status in events.of_kind(STATUS)[0]:
             if status.last:
-                word = _LEVELS[status.last] if 0 < status.last < len(_LEVELS) else str(status.last)
-                yield Quoted(f"status of {status.name}"), word
+                yield Quoted(f"status of {status.name}"), _level(status.last)
 
 
 def before(

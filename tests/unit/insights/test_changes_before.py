@@ -97,6 +97,20 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
     assert [each["text"] for each in below] == ["/battery_state fell below 20%"]
 
 
+def test_levels_without_a_name_are_numbers_and_long_texts_end_with_an_ellipsis(
+    tmp_path: Path,
+) -> None:
+    text = "the current is above what is allowed " * 3
+    levels = [diagnostics(at(t), motor=(7, text) if t > 38 else (0, "ok")) for t in range(60)]
+    write_splits(tmp_path, [*driving(60, 43), *levels])
+    reply = before(tmp_path, 43.0)
+    [(sentence, _)] = told(reply)
+    assert sentence.startswith("status of motor became level 7: the current is above")
+    assert sentence.endswith("…")
+    assert len(sentence) == 100
+    assert reply["state"] == {"status of motor": "level 7"}
+
+
 def test_how_far_back_can_be_asked(tmp_path: Path) -> None:
     write_splits(tmp_path, ALL)
     assert told(before(tmp_path, 43.0, seconds_before=1)) == [
