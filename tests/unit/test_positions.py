@@ -124,6 +124,27 @@ def test_numbers_without_a_fix_are_told_where_they_count(tmp_path: Path) -> None
     assert not any("no fix" in note for note in before.get("notes", ()))
 
 
+@each_way
+def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """As in the fields that are shown."""
+    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n, 0.0) for n in range(9)])
+    topic = "/fmu/out/vehicle_odometry"
+    for field, value, last in (
+        ("velocity.0", 0.5, 8),
+        ("position.0", 5, 5),
+        ("position.2", 1, None),
+    ):
+        given = {"topic": topic, "field": field, "condition_type": "equals", "value": value}
+        found = ask(tmp_path, recalls, "find_last_match", **given)
+        assert (None if found is None else found["timestamp"] - T0_S) == last
+    shown = ask(
+        tmp_path, recalls, "get_topic_at_time", topic=topic, timestamp=T0_S, fields=["velocity.0"]
+    )
+    assert shown["value"] == {"velocity.0": 0.5}
+
+
 def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n, 0.0) for n in range(9)])
     topic, above = "/fmu/out/vehicle_odometry", {"condition_type": "above", "value": 1.0}

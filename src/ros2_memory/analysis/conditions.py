@@ -43,6 +43,9 @@ _LISTED_PATHS: Final = 16
 _INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 ELEMENT_NAMES: Final = ("names", "name", "joint_names")
 """Keys of a list that names the elements of the arrays beside it, as in joint states."""
+_AXES: Final = {"0": "x", "1": "y", "2": "z"}
+"""An array of three numbers may be shown as a point."""
+_POINT: Final = {*_AXES.values()}
 _PICKED: Final = re.compile(r"(\.-?\d+)+$")
 _EXAMPLES: Final = {
     "contains": 'condition_type "contains", value "scissors"',
@@ -383,8 +386,9 @@ def at_field(value: T, dot_path: str) -> list[T]:
     """Returns what is at a dot-path in an extracted value; empty where there is nothing.
 
     Over a list the path goes on in every element, unless the segment is a whole number, which
-    selects one (negative: from the end). `detections.label` gives every label, `detections.0.label`
-    the first. Of joint states `positions.elbow` is what `names` has beside it in each value.
+    selects one (negative: from the end); of a point it selects an axis. `detections.label` gives
+    every label, `detections.0.label` the first. Of joint states `positions.elbow` is what `names`
+    has beside it in each value.
     """
     head, _, name = dot_path.partition(".")
     names = names_beside(value, dot_path)
@@ -526,6 +530,8 @@ def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> 
     if isinstance(node, dict):
         if segment in node:
             yield node[segment]
+        elif segment in _AXES and node.keys() == _POINT:
+            yield node[_AXES[segment]]
     elif isinstance(node, list):
         if _INDEX.fullmatch(segment):
             yield from pick(node, int(segment))
