@@ -215,6 +215,7 @@ def _pack_integers(column: Numbers) -> Packed | _Whole:
 # Floats
 
 
+@np.errstate(invalid="ignore")  # of signalling NaNs
 def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
     """Returns a column as multiples of its step, else with fewer bits, else as it is."""
     values = column.astype(np.float64, copy=False)

@@ -193,3 +193,11 @@ def golden() -> bytes:
         pack(Texts.of(["cup", "Tasse", "cup"])),
     ]
     return b"".join(f"{packed.codec}|{packed.zone}|".encode() + packed.data for packed in columns)
+
+
+@pytest.mark.parametrize("size", [4, 8])
+@pytest.mark.filterwarnings("error")
+def test_a_signalling_nan_is_one_without_a_warning(size: int) -> None:
+    signalling = {4: 0x7FA0_0000, 8: 0x7FF4 << 48}[size]
+    column = np.array([signalling, 1], f"u{size}").view(f"f{size}")
+    assert pack(column, METRES).zone.nulls == 1
