@@ -49,8 +49,8 @@ def lake_location(settings: Settings) -> LakeLocation:
         ConfigError: no warehouse is given, its secrets cannot be read, or the extra is missing.
     """
     require_extra("a lake", "lake", "pyarrow", "pyiceberg")
-    # Has what was read or shipped go back before more is: Arrow's own heap keeps as much of each.
-    # Arrow reads it when it is loaded, which nothing has done yet.
+    # Arrow's own allocator keeps freed memory; the system's returns it. Arrow reads this once, when
+    # it is imported, which nothing has done yet.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     from ros2_memory.lake.warehouse import LakeLocation, location_of
 

@@ -135,14 +135,18 @@ class _Reads:
 
         def noted(part: Record | Batch) -> Record | Batch:
             times = [part.log_time] if isinstance(part, Record) else part.log_times.tolist()
-            if times:
-                start, stop = call.get(part.channel.topic, (MAX_NS, MIN_NS))
-                call[part.channel.topic] = min(start, *times), max(stop, max(times) + 1)
+            if not times:
+                return part
+            start, stop = call.get(part.channel.topic, (MAX_NS, MIN_NS))
+            first, last = min(times), max(times)
+            call[part.channel.topic] = min(start, first), max(stop, last + 1)
             return part
 
         messages = read(*given, **options)
-        if messages is None or isinstance(messages, Record):
-            return messages and noted(messages)
+        if messages is None:
+            return None
+        if isinstance(messages, Record):
+            return noted(messages)
         # Mapped: it goes on behind what cannot be read.
         return map(noted, messages)
 

@@ -195,18 +195,18 @@ def _held_by_events(
     None where the condition is on neither.
     """
     types = {name for topic in topics for name in binned.view.timeline.types_of(topic)}
-    wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if not any(map(has_events, types)):
         return None, None
-    if wanted is None:
-        may_be_label = isinstance(value, str) and condition.field is None
-        if may_be_label and not any(map(has_errors, types)):
-            return _label_held(binned, topics, condition, scope)
+    wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
+    if wanted is not None:
+        # A topic that was recorded as text before has no events of what that said.
+        if len(types) > 1 or len(topics) > 1:
+            return None, None
+        return _boolean_held(binned, topics[0], condition, scope, wanted=wanted)
+    may_be_label = isinstance(value, str) and condition.field is None
+    if not may_be_label or any(map(has_errors, types)):
         return None, None
-    # What texts say of a topic that had them before is no event.
-    if len(types) > 1 or len(topics) > 1:
-        return None, None
-    return _boolean_held(binned, topics[0], condition, scope, wanted=wanted)
+    return _label_held(binned, topics, condition, scope)
 
 
 def _boolean_held(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
-from ros2_memory.core.arrays import Ints, joined_codes
+from ros2_memory.core.arrays import Ints, joined_codes, run_starts
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
@@ -272,14 +272,15 @@ class Timeline:
         if not self.segments:
             return []
         folders, starts, ends = self.folder_numbers, self.starts, self.ends
-        # Of bags of one recording that follow each other those count that begin while another one
-        # goes on, and the one that reaches farthest.
-        is_first = np.diff(folders, prepend=-1) != 0
-        begins, run = np.flatnonzero(is_first), np.cumsum(is_first) - 1
-        before = np.append(MIN_NS, np.maximum.accumulate(ends)[begins[1:] - 1])
-        is_near = np.maximum(starts, MIN_NS + COPY_HORIZON_NS) - COPY_HORIZON_NS <= before[run]
-        is_farthest = ends == np.maximum.reduceat(ends, begins)[run]
-        rows = np.flatnonzero(is_near | is_farthest)
+        # A run is bags of one folder in a row. Two sorts of its bags show all that it shares: those
+        # that begin before an earlier run has ended, and the one that ends last.
+        begins = run_starts(folders)
+        sizes = np.diff(begins, append=folders.size)
+        reached = np.append(MIN_NS, np.maximum.accumulate(ends)[begins[1:] - 1])
+        nearest = np.maximum(starts, MIN_NS + COPY_HORIZON_NS) - COPY_HORIZON_NS
+        is_near = nearest <= np.repeat(reached, sizes)
+        is_last = ends == np.repeat(np.maximum.reduceat(ends, begins), sizes)
+        rows = np.flatnonzero(is_near | is_last)
         return overlap_spans(
             zip(*(of[rows].tolist() for of in (starts, ends, folders)), strict=True)
         )

@@ -269,12 +269,12 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
     for topic in snapshot.timeline.topics():
         if snapshot.timeline.is_log(topic) or latching.is_latched(snapshot, topic):
             continue
-        totals_by_type = snapshot.totals(topic)
-        messages = sum(totals.messages for totals in totals_by_type)
-        last = max((totals.last for totals in totals_by_type), default=begin - 1)
+        parts = snapshot.totals(topic)
+        messages = sum(totals.messages for totals in parts)
+        last = max((totals.last for totals in parts), default=begin - 1)
         if messages < _MIN_MESSAGES or last < begin:
             continue
-        first = min(totals.first for totals in totals_by_type)
+        first = min(totals.first for totals in parts)
         recorded = last - first - length_in(snapshot.gaps, first, last)
         usual = recorded // (messages - 1)
         longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))

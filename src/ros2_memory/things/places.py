@@ -257,7 +257,9 @@ def _differences(series: _Series) -> list[Floats]:
     sums, thing = np.add.reduceat(series.columns, starts, axis=1), series.thing[starts]
     means = sums / sums[0]
     begins = run_starts(thing)
-    normal = np.add.reduceat(_squares(sums, _VISIT_MM**2), begins, axis=2).transpose(2, 0, 1)
+    normal = np.add.reduceat(_normal_equations(sums, _VISIT_MM**2), begins, axis=2).transpose(
+        2, 0, 1
+    )
     fit = np.linalg.solve(normal[:, :, :3] + np.diag(_PRIOR), normal[:, :, 3:])
     off = means[3:] - np.einsum("iv,vij->jv", means[:3], fit[thing])
     by_looks = 1 / sums[0, :-1] + 1 / sums[0, 1:]
@@ -293,14 +295,11 @@ Of the place next to nothing, so that the equations have a solution.
 """
 
 
-def _squares(sums: Floats, visit: Floats | float) -> Floats:
-    """Returns the squares of visits' means, each by its weight; `visit` is their own variance.
-
-    Without those of the place alone, which nothing needs.
-    """
+def _normal_equations(sums: Floats, visit_variance: Floats | float) -> Floats:
+    """Returns what each visit adds to the normal equations of the regression: 3 x 5 x visits."""
     weight = np.maximum(sums[0], 1e-30)
-    squares: Floats = sums[:3, None] * sums * (1 / weight / (1 + visit * weight))
-    return squares
+    added: Floats = sums[:3, None] * sums * (1 / weight / (1 + visit_variance * weight))
+    return added
 
 
 def _are_moved(series: _Series, variance: Floats) -> Flags:
@@ -378,14 +377,14 @@ def _before_and_after(
     starts = np.flatnonzero(is_start)
     ends = np.append(starts, len(series.n))
     sums = np.hstack((np.zeros((5, 1)), np.cumsum(series.columns, axis=1)))
-    squares = _squares(np.diff(sums[:, ends]), variance[starts])
+    squares = _normal_equations(np.diff(sums[:, ends]), variance[starts])
     until = np.concatenate((np.zeros((3, 5, 1)), np.cumsum(squares, axis=2)), axis=2)
     first = np.searchsorted(starts, begins)
     stop = np.append(first[1:], len(starts))
     visit, thing, own = np.searchsorted(starts, at) - 1, series.thing[at], variance[at]
     here, begin, end = sums[:, at], sums[:, ends[visit]], sums[:, ends[visit + 1]]
-    old = until[..., visit] - until[..., first[thing]] + _squares(here - begin, own)
-    new = until[..., stop[thing]] - until[..., visit + 1] + _squares(end - here, own)
+    old = until[..., visit] - until[..., first[thing]] + _normal_equations(here - begin, own)
+    new = until[..., stop[thing]] - until[..., visit + 1] + _normal_equations(end - here, own)
     return old, new
 
 

@@ -522,32 +522,34 @@ def looks_without(
     cell's own rate is known as well as its messages make it (a uniform prior).
     """
     looks, is_hit = evidence.looks, evidence.hits > 0
-    slices, first, last = (column[looks] for column in every[:3])
+    slices, first, last = every.slice[looks], every.first[looks], every.last[looks]
     during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
     during &= (last <= seen_to) | is_hit
     start, stop = window
     misses = (first >= start) & (last < stop) & evidence.fair & ~during & ~is_hit
     distinct, cell_of = np.unique(evidence.cell, return_inverse=True)
-    cell, hits, n = cell_of[during], evidence.hits[during], evidence.n[during]
-    seen = (1.0 + np.bincount(cell, hits, len(distinct))).tolist()
-    missed = (1.0 + np.bincount(cell, n - hits, len(distinct))).tolist()
-    chance, messages = 0.0, 0
+    hits, n = (
+        np.bincount(cell_of[during], column[during], len(distinct))
+        for column in (evidence.hits, evidence.n)
+    )
+    alphas, betas = (1.0 + hits).tolist(), (1.0 + n - hits).tolist()
+    log_chance, messages = 0.0, 0
     crossed: Ns | None = None
     for look in np.flatnonzero(misses).tolist():
-        number, n_missed = int(cell_of[look]), int(evidence.n[look])
-        alpha, beta = seen[number], missed[number]
+        cell, n_missed = int(cell_of[look]), int(evidence.n[look])
+        alpha, beta = alphas[cell], betas[cell]
         if alpha <= 1.0:
             continue
         # The chance of so many misses in a row, by a beta distribution of the rate.
-        chance += (
+        log_chance += (
             math.lgamma(beta + n_missed)
             - math.lgamma(beta)
             + math.lgamma(alpha + beta)
             - math.lgamma(alpha + beta + n_missed)
         )
-        missed[number] += n_missed
+        betas[cell] += n_missed
         messages += n_missed
-        if crossed is None and chance < math.log(_MISSED_BY_CHANCE):
+        if crossed is None and log_chance < math.log(_MISSED_BY_CHANCE):
             crossed = int(last[look])
     return messages, crossed
 

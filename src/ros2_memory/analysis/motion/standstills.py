@@ -248,14 +248,15 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
         return NO_BLOCKS
     slots = _Slots(poses.times[valid], poses.positions[valid])
     links = slots.links()
-    before, after = np.r_[False, links], np.r_[links, False]
-    is_first = after & ~before
-    firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(before & ~after)
-    beside = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
-    is_long = slots.lasts[beside[1]] - slots.firsts[beside[0]] >= SHORTEST_NS
-    chains = np.cumsum(is_first)
+    to_previous, to_next = np.r_[False, links], np.r_[links, False]
+    begins_chain = to_next & ~to_previous
+    firsts, lasts = np.flatnonzero(begins_chain), np.flatnonzero(to_previous & ~to_next)
+    # The robot may stand in a part of the slot beside a chain, too.
+    previous, following = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
+    is_long = slots.lasts[following] - slots.firsts[previous] >= SHORTEST_NS
     # Each slot with links on both sides is of the newest chain that began.
-    inner = np.flatnonzero(before & after)
+    chains = np.cumsum(begins_chain)
+    inner = np.flatnonzero(to_previous & to_next)
     blocks = _blocks(slots, inner[is_long[chains[inner] - 1]], chains)
     times, _ = blocks.span()
     return rows_of(blocks, (times >= start) & (times < stop))
