@@ -313,6 +313,7 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
         rules.append(
             Rule(
                 name=name,
+                kind=given.kind,
                 topic=given.topic,
                 condition=condition,
                 hold=ns_from_unix(given.for_s),
@@ -378,6 +379,7 @@ def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
         rules.append(
             ExclusionRule(
                 name=name,
+                kind=given.kind,
                 topic=value.topic,
                 condition=_condition_of(settings, value, f"{path}: the rule {name!r}"),
                 margin=ns_from_unix(value.margin_s),

@@ -558,11 +558,9 @@ class PlacesFile:
 class KeepRule:
     """When what was recorded is kept as a moment, and how much of it.
 
-    `kind` is checked against the rest, which shows it too: without `topic` a rule is of restarts,
-    without a condition of silences. `topic`, `condition_type`, `value`, `field` and `min_score` as
-    in `find_matches`; `for_s` is how long the condition, or a silence, must hold. A moment has
-    `before_s` before the match began and `after_s` after the rule fired. All moments of the rule
-    together take `max_gb` at most.
+    `topic`, `condition_type`, `value`, `field` and `min_score` as in `find_matches`; `for_s` is how
+    long the condition, or a silence, must hold. A moment has `before_s` before the match began and
+    `after_s` after the rule fired. All moments of the rule together take `max_gb` at most.
     """
 
     kind: Literal["message", "silent", "recorder_restart"] = "message"

@@ -40,6 +40,7 @@ def rule(name: str = "bumper", **given: Any) -> Rule:
     """A rule on `/bumper` being true, unless told otherwise."""
     made: dict[str, Any] = {
         "name": name,
+        "kind": "message",
         "topic": "/bumper",
         "condition": parse_condition("equals", True, 0.5),
         "before": 5 * S,
@@ -51,8 +52,8 @@ def rule(name: str = "bumper", **given: Any) -> Rule:
     return Rule(**made | given)
 
 
-SILENT: dict[str, Any] = {"condition": None}
-RESTART: dict[str, Any] = {"topic": None, "condition": None}
+SILENT: dict[str, Any] = {"kind": "silent", "condition": None}
+RESTART: dict[str, Any] = {"kind": "recorder_restart", "topic": None, "condition": None}
 """What makes a rule one over silences, or over restarts of the recorder."""
 
 

@@ -39,11 +39,10 @@ def test_the_ready_rules_are_valid_and_none_is_on(tmp_path: Path) -> None:
         "recorder restarted",
         "odometry silent",
     ]
-    by_topic = {each.name for each in ready if each.topic is not None}
-    assert {each.name for each in ready} - by_topic == {"recorder restarted"}
-    assert [each.name for each in ready if each.name in by_topic and each.condition is None] == [
-        "odometry silent"
-    ]
+    assert {each.name: each.kind for each in ready if each.kind != "message"} == {
+        "recorder restarted": "recorder_restart",
+        "odometry silent": "silent",
+    }
     assert sum(each.max_bytes for each in ready) <= 10**9
 
 

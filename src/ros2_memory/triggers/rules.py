@@ -22,7 +22,7 @@ import hashlib
 import heapq
 import time
 from dataclasses import KW_ONLY, dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.analysis.conditions import refusal_for
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.storage.base import BagReader, Record
+    from ros2_memory.storage.base import BagReader, Channel, Record
 
 
 LEAST_NEAR_NS: Final[Ns] = 60 * NS_PER_S
@@ -73,8 +73,9 @@ class Rule:
     """When to keep something, and how much.
 
     Attributes:
-        topic: the name or glob of the topics; None for a restart of the recorder.
-        condition: what a message must meet; None for a rule over silences, and for a restart.
+        kind: whether it fires for messages, for silences, or when the recorder restarts.
+        topic: the name or glob of the topics; None for a restart.
+        condition: what a message must meet; None for the other kinds.
         hold: for how long the condition, or the silence, must hold before it fires.
         before: how much is kept of the time before the match began.
         after: how much is kept of the time after it fired.
@@ -82,6 +83,7 @@ class Rule:
     """
 
     name: str
+    kind: Literal["message", "silent", "recorder_restart"]
     topic: str | None = None
     condition: Condition | None = None
     hold: Ns = 0
@@ -90,11 +92,6 @@ class Rule:
     label: str
     max_bytes: int
     max_per_hour: int
-
-    @property
-    def is_of_restarts(self) -> bool:
-        """Whether it fires when the recorder restarts (`kind: recorder_restart`)."""
-        return self.topic is None
 
     def window(self, first: Ns, fired: Ns) -> TimeWindow:
         """Returns what is kept of a match that began at `first` and made the rule fire."""
@@ -122,40 +119,41 @@ class Rule:
         run = runs.get(topic)
         if run is not None and time < run.last - SILENCE_NS:
             run = None  # the clock was set back
-        if self.condition is None:
-            fired = None if run is None else self._fire(topic, run, time)
-            spoke = time if run is None else max(time, run.last)
-            runs[topic] = RunRecord(spoke, spoke)
-            return fired
-        fired = None
-        if run is not None and run.lasts:
-            # Its value held until now, whatever it is from now on.
-            fired = self._fire(topic, run, time)
-        elif run is not None and abs(time - run.last) > SILENCE_NS:
-            run = None
-        if matches is False:
-            run = None
-        elif matches and run is None:
-            run = RunRecord(time, time, lasts=latched)
-        if run is None:
-            runs.pop(topic, None)
-            return fired
-        runs[topic] = run
-        run.last = max(run.last, time)
-        if matches:
-            fired = fired or self._fire(topic, run, time)
-        return fired
+        match self.kind:
+            case "recorder_restart":
+                return None
+            case "silent":
+                spoke = time if run is None else max(time, run.last)
+                runs[topic] = RunRecord(spoke, spoke)
+                return self._fire(topic, run, time)
+            case "message":
+                fired = None
+                if run is not None and run.lasts:
+                    # Its value held until now, whatever it is from now on.
+                    fired = self._fire(topic, run, time)
+                elif run is not None and abs(time - run.last) > SILENCE_NS:
+                    run = None
+                if matches is False:
+                    run = None
+                elif matches and run is None:
+                    run = RunRecord(time, time, lasts=latched)
+                if run is None:
+                    runs.pop(topic, None)
+                    return fired
+                runs[topic] = run
+                run.last = max(run.last, time)
+                return fired or (self._fire(topic, run, time) if matches else None)
 
     def reach(self, runs: Mapping[str, RunRecord], until: Ns) -> Iterator[Firing]:
         """Yields what fires because nothing more came before a moment."""
         for topic, run in runs.items():
-            if self.condition is None or run.lasts:
+            if self.kind == "silent" or run.lasts:
                 fired = self._fire(topic, run, until)
                 if fired is not None:
                     yield fired
 
-    def _fire(self, topic: str, run: RunRecord, time: Ns) -> Firing | None:
-        if run.fired or time - run.first < self.hold:
+    def _fire(self, topic: str, run: RunRecord | None, time: Ns) -> Firing | None:
+        if run is None or run.fired or time - run.first < self.hold:
             return None
         run.fired = True
         return Firing(self.name, topic, run.first, run.first + self.hold)
@@ -263,7 +261,7 @@ class SplitSearch:
     def __post_init__(self) -> None:
         """Sets what is known at the beginning."""
         self._failing = FailingFiles(self.monotonic)
-        self._rules = [rule for rule in self.rules if not rule.is_of_restarts]
+        self._rules = [rule for rule in self.rules if rule.kind != "recorder_restart"]
         self._watching: dict[str, tuple[Rule, ...]] = {}
         self._tested: set[tuple[str, str]] = set()
 
@@ -314,20 +312,15 @@ class SplitSearch:
             latched = record.channel.latched
             if latched and _receive(record, event.recording, state):
                 return
-            if any(rule.condition is not None for rule in rules):
+            if any(rule.kind == "message" for rule in rules):
                 try:
                     value = self.extractor.exact(self.reader.decode(record), record.channel.type)
                 except UndecodableError as error:
                     value = error
         for rule in rules:
-            if latched and rule.condition is None:
+            if latched and rule.kind == "silent":
                 continue  # its publisher is silent until something changes
-            matches = None
-            if rule.condition is not None:
-                condition = rule.condition
-                if record is not None:
-                    condition = condition.of_type(record.channel.type, self.extractor)
-                matches = self._test(rule, condition, event.topic, value, state)
+            matches = None if record is None else self._test(rule, record.channel, value, state)
             runs = state.rules[rule.name].runs
             fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)
             if fired is not None:
@@ -336,20 +329,25 @@ class SplitSearch:
     def _test(
         self,
         rule: Rule,
-        condition: Condition,
-        topic: str,
+        channel: Channel,
         value: JsonValue | UndecodableError,
         state: TriggerState,
     ) -> bool | None:
-        """Returns whether a value meets a condition; None where it could not be decoded.
+        """Returns whether a value meets a rule's condition; None where it has none.
+
+        None, too, where the value could not be decoded.
 
         Notes why messages cannot make the rule fire; whether any could, once for each topic.
         """
         record = state.rules[rule.name]
+        if rule.condition is None:
+            return None
         if isinstance(value, UndecodableError):
             record.problem = f"not all could be searched: {value}"
             return None
+        condition = rule.condition.of_type(channel.type, self.extractor)
         matches = condition.matches(value)
+        topic = channel.topic
         if (rule.name, topic) not in self._tested:
             self._tested.add((rule.name, topic))
             if not matches and condition.can_be_refused:
@@ -394,7 +392,7 @@ class SplitSearch:
         read: list[str] = []
         times: list[tuple[Ns, str]] = []
         for topic, rules in watched.items():
-            if topic in latched or any(rule.condition is not None for rule in rules):
+            if topic in latched or any(rule.kind == "message" for rule in rules):
                 read.append(topic)
                 continue
             for batch in self.reader.batches(bag.path, [topic], part.window, bare=[topic]):

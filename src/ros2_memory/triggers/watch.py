@@ -105,11 +105,11 @@ class Triggers:
             restarts, self.restarts = self.restarts, []
             deleted, self._deleted = self._deleted, 0
         for (first, at), rule in product(restarts, self._rules.values()):
-            if rule.is_of_restarts:
+            if rule.kind == "recorder_restart":
                 self._add_firing(Firing(rule.name, "", first, at), state, snapshot)
         for name, rule in self._rules.items():
             self._store_moments(name, state.rules[name], snapshot)
-            if rule.condition is not None:
+            if rule.kind == "message":
                 _note_lasting_match(name, state.rules[name])
         if deleted:
             sentence = (
