@@ -379,7 +379,6 @@ def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
         rules.append(
             ExclusionRule(
                 name=name,
-                kind=given.kind,
                 topic=value.topic,
                 condition=_condition_of(settings, value, f"{path}: the rule {name!r}"),
                 margin=ns_from_unix(value.margin_s),
@@ -426,7 +425,6 @@ class SharedParts(NamedTuple):
 
     reader: BagReader
     large: LargeReads
-    schemas: Mapping[str, Mapping[str, str]]
     extractor: SchemaExtractor
     caches: Caches
 
@@ -440,14 +438,12 @@ def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedPa
         ConfigError: the reader cannot be built, or the schema map is refused.
     """
     from ros2_memory.columns.scanner import Caches
-    from ros2_memory.extract import SchemaExtractor
 
-    schemas = load_message_schemas(settings)
-    extractor = SchemaExtractor(schemas, settings.data.max_array_length)
+    extractor = _extractor_of(settings)
     large = LargeReads()
     reader = build_reader(settings, cache_mb=cache_mb, large=large)
     caches = Caches.of(cache_mb or settings.store.cache_mb)
-    return SharedParts(reader, large, schemas, extractor, caches)
+    return SharedParts(reader, large, extractor, caches)
 
 
 def build_memory(
@@ -469,7 +465,7 @@ def build_memory(
 
     clock = WallClock()
     shared = shared or shared_parts(settings)
-    schemas, bag_dir = shared.schemas, settings.recording.bag_dir
+    bag_dir = settings.recording.bag_dir
     reader = BagDirReader(shared.reader, bag_dir)
     columns = build_columns(settings, reader)
 
@@ -486,7 +482,7 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
         large=shared.large,
     )
-    reading = reading_of(settings, schemas)
+    reading = reading_of(settings, shared.extractor.schemas)
     scanner = Scanner(columns, bag_dir, reading, shared.large, shared.caches)
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)

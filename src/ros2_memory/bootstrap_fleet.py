@@ -191,7 +191,8 @@ def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: Share
 
     index = LakeIndex(lake, name, memory.index.bag_dir, memory.clock)
     reader = LakeReader(index, memory.reader, shared.large)
-    store, reading = build_columns(own, shared.reader, name), reading_of(own, shared.schemas)
+    store = build_columns(own, shared.reader, name)
+    reading = reading_of(own, shared.extractor.schemas)
     scanner = Scanner(store, index.bag_dir, reading, shared.large, shared.caches)
     return replace(memory, index=index, reader=reader, scanner=scanner, memo=Memo())
 
@@ -234,7 +235,7 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
         own = robot_settings(settings, name)
         memory = build_memory(own, shared, setting=ROBOTS_SETTING)
         filling = build_backfill(own, memory).filling
-        reading = reading_of(own, shared.schemas)
+        reading = reading_of(own, shared.extractor.schemas)
         return RobotBags(name, memory, shared.reader, reading, settings.lake.messages, filling)
 
     return [*map(built, settings.fleet.robots)]

@@ -185,6 +185,7 @@ class SchemaExtractor:
 
     Attributes:
         limit: see `max_array_length`.
+        schemas: as given.
 
     Raises:
         ConfigError: a field's name or path is malformed, or a limit is below 1.
@@ -200,6 +201,7 @@ class SchemaExtractor:
         if max_array_length < 1:
             raise ConfigError(f"max_array_length is {max_array_length}; it must be at least 1")
         self.limit = max_array_length
+        self.schemas = schemas
         self._max_chars = max_chars
         self._plans = {name: _compile(name, fields) for name, fields in schemas.items()}
 
