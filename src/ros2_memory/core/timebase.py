@@ -15,6 +15,7 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from datetime import time as clock_time
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 if TYPE_CHECKING:
@@ -42,6 +43,9 @@ _ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
 _SECONDS: Final = re.compile(r":\d\d:\d\d(?:[.,](\d+))?")
 _END_OF_DAY: Final = re.compile(r"(?<=[T ])24:00(?::00)?(?![:.,0-9])")
 """Midnight as the end of a day in ISO 8601, which `datetime` does not read."""
+_MIDNIGHT: Final = re.compile(r"24(?::?00){1,2}")
+"""The same without a date."""
+_BETWEEN_HOURS: Final = re.compile("-|to|and|,")
 _LONGEST_TIME: Final = 64
 _MINUTE_S: Final = 60.0
 _END_S: Final = 1.125e-6
@@ -153,6 +157,24 @@ def unix_from_text(text: str) -> float:
     if weekday is not None and weekday != _WEEKDAYS[read.weekday()]:
         raise ValueError(f"is a {_WEEKDAYS[read.weekday()]}, not a {weekday}")
     return seconds
+
+
+def hours_from_text(text: str) -> tuple[clock_time, clock_time]:
+    """Returns two local times of day of a text, such as 19:00-22:00 or 19:00 to 24:00.
+
+    Raises:
+        ValueError: it is something else; the message completes "the hours, which".
+    """
+    parts = _BETWEEN_HOURS.split(text) if len(text) <= _LONGEST_TIME else ()
+    try:
+        begin, end = (part.strip() for part in parts)
+        ends = "00:00" if _MIDNIGHT.fullmatch(end) else end
+        first, last = clock_time.fromisoformat(begin), clock_time.fromisoformat(ends)
+    except ValueError:
+        raise ValueError("is not two times of day") from None
+    if first.tzinfo is not None or last.tzinfo is not None:
+        raise ValueError("has an offset from UTC: these hours are local, so leave it out")
+    return first, last
 
 
 def require_no_date(seconds: float) -> None:

@@ -31,6 +31,7 @@ from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import (
+    hours_from_text,
     require_no_date,
     rest_of_text_s,
     rounded_off_s,
@@ -69,8 +70,6 @@ LONGEST_REASON_S: Final = 60.0
 _RELATIVE: Final = re.compile(r"-.*|.*(?:ago|now)|\d+(?:\.\d+)? ?[smhd][a-z]*")
 """Times before now, as people write them."""
 _WITHOUT_DATE: Final = re.compile(r"today|yesterday|\d{1,2}:\d\d")
-_END_OF_DAY: Final = re.compile(r"24(?::?00){1,2}")
-"""Midnight as the end of a day in ISO 8601, which `datetime` does not read."""
 _AGO: Final = "for a time before now give seconds_ago, seconds or last_s, where a tool has it"
 _DATE: Final = "give the date, too: now_local of data_time_range has today's"
 # Not today's by this machine: of replayed bags (`data.now=latest`) now is another day.
@@ -182,19 +181,9 @@ def _while_condition(parsed: object) -> WhileCondition:
 
 
 def _as_hours(value: object) -> object:
-    """Returns two local times of day, which planners also send as one text."""
-    parts = re.split(r"\s*(?:-|to|and|,)\s*", value) if isinstance(value, str) else value
-    if isinstance(value, str) and isinstance(parsed := _parse_json(value), list):
-        parts = parsed
-    try:
-        begin, end = map(str, parts)  # type: ignore[call-overload]
-        ends = "00:00" if _END_OF_DAY.fullmatch(end.strip()) else end
-        first, last = time.fromisoformat(begin), time.fromisoformat(ends)
-    except (TypeError, ValueError):
-        raise ValueError("is not two times of day") from None
-    if first.tzinfo is not None or last.tzinfo is not None:
-        raise ValueError("has an offset from UTC: these hours are local, so leave it out")
-    return first, last
+    """Returns two local times of day, which planners also send as a list, or as JSON text."""
+    parsed = _parse_json(value) if isinstance(value, str) else value
+    return hours_from_text("-".join(map(str, parsed if isinstance(parsed, list) else [value])))
 
 
 def _as_integer(value: object) -> object:

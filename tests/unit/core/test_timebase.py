@@ -13,6 +13,7 @@ from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_S,
     NS_PER_US,
+    hours_from_text,
     iso_local,
     local_text,
     ns_from_unix,
@@ -135,3 +136,35 @@ def test_any_text_is_a_finite_time_or_refused(text: str) -> None:
     except ValueError:
         return
     assert math.isfinite(seconds)
+
+
+@pytest.mark.parametrize(
+    ("text", "first", "last"),
+    [
+        ("19:00-22:00", (19, 0), (22, 0)),
+        (" 07:05 to 24:00 ", (7, 5), (0, 0)),
+        ("2330, 01:00", (23, 30), (1, 0)),
+        ("00:00 and 24:00:00", (0, 0), (0, 0)),
+    ],
+)
+def test_hours_are_read_as_people_write_them(
+    text: str, first: tuple[int, int], last: tuple[int, int]
+) -> None:
+    read = hours_from_text(text)
+    assert [(each.hour, each.minute) for each in read] == [first, last]
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "two times of day"),
+        ("19:00", "two times of day"),
+        ("19:00-22:00-23:00", "two times of day"),
+        ("19:00-25:00", "two times of day"),
+        (" " * 1_000_000, "two times of day"),
+        ("19:00Z-22:00Z", "offset from UTC"),
+    ],
+)
+def test_what_is_not_two_hours_is_refused(text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        hours_from_text(text)
