@@ -360,13 +360,17 @@ def _near(targets: Sequence[JsonValue], random: Random) -> NearPosition:
     return NearPosition(x + off, y, random.choice([None, z]), tolerance)
 
 
+def _part_of(text: str, random: Random) -> str:
+    begin = random.randrange(max(len(text), 1))
+    return text[begin : begin + random.randint(1, 8)] or "x"
+
+
 def _test(leaf: JsonValue, random: Random) -> Contains | Equals | Beyond:
     if leaf is None or (isinstance(leaf, float) and math.isnan(leaf)):
         leaf = 0
     needle: bool | float | str = 0
     if isinstance(leaf, str):
-        begin = random.randrange(max(len(leaf), 1))
-        part = leaf[begin : begin + random.randint(1, 8)] or "x"
+        part = _part_of(leaf, random)
         needle = random.choice([leaf, leaf.upper(), part, f"{part}q"])
     elif isinstance(leaf, bool):
         alike: list[bool | str | int] = [leaf, str(leaf), int(leaf)]
@@ -379,5 +383,9 @@ def _test(leaf: JsonValue, random: Random) -> Contains | Equals | Beyond:
         is_number = isinstance(needle, int | float) and not isinstance(needle, bool)
         return Beyond(needle if is_number else 0.5, kind == "above")  # type: ignore[arg-type]
     if kind == "contains":
-        return Contains(needle if not isinstance(needle, str) or needle.strip() else "cup")
+        held = needle if not isinstance(needle, str) or needle.strip() else "cup"
+        if not isinstance(held, str) or random.random() < 0.5:
+            return Contains(held)
+        other = random.choice(["cup", "x", _part_of(str(leaf), random)])
+        return Contains(random.choice([held, held, f"{held} -{other}"]), whole=True)
     return Equals(needle)

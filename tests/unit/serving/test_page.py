@@ -6,6 +6,8 @@ from importlib import resources
 import pytest
 
 from ros2_memory.serving.page import POLICY, SCRIPTS, STYLES
+from ros2_memory.serving.page.routes import page_routes
+from tests.unit.serving.test_dispatch import served
 from tests.unit.serving.test_web_app import EVERYWHERE, GOOD, SHOWN, app, client
 
 FOLDER = resources.files("ros2_memory.serving.page")
@@ -64,7 +66,7 @@ async def test_it_is_shown_without_the_token_which_it_asks_for(host: str) -> Non
             assert (await http.get(path)).status_code == 200
         assert (await http.post("/")).status_code == 401
         assert (await http.post("/mcp")).status_code == 401
-        for path in ("/page/span", "/page/moment", "/page/topics", "/page/path"):
+        for path in (route.path for route in page_routes(served().dispatcher)):
             assert (await http.get(path)).status_code == 401
             assert (await http.get(path, headers=SHOWN)).status_code != 401
 
