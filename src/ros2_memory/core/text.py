@@ -36,12 +36,19 @@ _ELLIPSIS: Final = "…"
 LABELS: Final = ("label", "class_id", "class_name", "class", "object")
 """Fields with the label of a detection, the first that is there."""
 LISTS_OF_LABELS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
+NAMED_IN_TYPES: Final = {
+    frozenset({"family", "id"}): "id",  # apriltag_msgs, isaac_ros_apriltag_interfaces
+    frozenset({"marker_id", "pose"}): "marker_id",  # aruco_opencv_msgs
+    frozenset({"Class", "probability"}): "Class",  # darknet_ros_msgs of ROS 1
+}
+"""The name of an object that has these fields, for types in which no label says what was seen."""
 _FRAMES: Final = ("frame_id", "child_frame_id", "parent", "child")
 _OTHER_NAMES: Final = (
-    *("name", "names", "id", "hardware_id", "type", "encoding", "format", "skill"),
-    *("Class", "family"),  # of darknet_ros_msgs and AprilTags
+    *("name", "names", "hardware_id", "type", "encoding", "format", "skill", "family"),
 )
-NAMES_IN_MESSAGES: Final = LISTS_OF_LABELS.union(LABELS, _FRAMES, _OTHER_NAMES)
+NAMES_IN_MESSAGES: Final = LISTS_OF_LABELS.union(
+    LABELS, NAMED_IN_TYPES.values(), _FRAMES, _OTHER_NAMES
+)
 """Fields of messages that hold names."""
 _NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")
 """One word, or two: `map`, `traffic light`."""

@@ -17,7 +17,7 @@ from itertools import product
 from operator import is_, itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.text import LABELS, LISTS_OF_LABELS
+from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES
 from ros2_memory.messages.conversions import number, triple, xyz
 
 if TYPE_CHECKING:
@@ -46,13 +46,7 @@ _SHOWN: Final = frozenset({"box", "z"}.union(*(path[:1] for path in POSITIONS)))
 """What has a score and one of these is something that was seen, and named as such things are."""
 _NOTHING: Final = "none"
 """What JSON names so, without a score, is that nothing was seen."""
-_NAMED_IN_TYPES: Final = {
-    frozenset({"family", "id"}): "id",  # apriltag_msgs, isaac_ros_apriltag_interfaces
-    frozenset({"marker_id", "pose"}): "marker_id",  # aruco_opencv_msgs
-    frozenset({"Class", "probability"}): "Class",  # darknet_ros_msgs of ROS 1
-}
-"""The name of an object that has these fields, for types in which no label says what was seen."""
-_NAMED_BY: Final = frozenset(LABELS).union(("name", "category", "id"), *_NAMED_IN_TYPES)
+_NAMED_BY: Final = frozenset(LABELS).union(("name", "category", "id"), *NAMED_IN_TYPES)
 """An object without any of these fields has no name."""
 _MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 7
@@ -91,7 +85,7 @@ def naming(fields: Collection[str]) -> Iterator[str]:
     """
     if not _NAMED_BY.isdisjoint(fields) and NOT_LABELLED.isdisjoint(fields):
         yield from LABELS
-        yield from (name for own, name in _NAMED_IN_TYPES.items() if own.issubset(fields))
+        yield from (name for own, name in NAMED_IN_TYPES.items() if own.issubset(fields))
         if not (_SCORED.isdisjoint(fields) or _SHOWN.isdisjoint(fields)):
             yield from ("name", "category", "id")
 

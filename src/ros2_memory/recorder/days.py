@@ -41,7 +41,7 @@ from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, caseless, match_topics
+from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES, caseless, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_since
 from ros2_memory.messages.detections import detections_of, looks_like_json
 from ros2_memory.recorder.thinning import (
@@ -97,7 +97,9 @@ _PEOPLE: Final = frozenset(_WORDS_FOR_PEOPLE.split())
 _WORD: Final = re.compile(r"[A-Z]*[^\W\d_A-Z]+|[A-Z]+")
 """Words also begin at capitals: `TrackedPersons`."""
 _OF_DETECTIONS: Final = LISTS_OF_LABELS.union(LABELS)
-_NAMES: Final = _OF_DETECTIONS.union(("Class", "child_frame_id", "frame_id", "name", "names"))
+_NAMES: Final = _OF_DETECTIONS.union(
+    NAMED_IN_TYPES.values(), ("child_frame_id", "frame_id", "name", "names")
+)
 """Fields that may name people."""
 _FIRST_DAY: Final = "2014"
 """Days before it have a wrong date: there was no ROS 2."""
