@@ -32,7 +32,7 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
 from ros2_memory.core.spans import enclosing
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import NS_PER_S, Ns, Span
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, Ns, Span
 from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.scan import (
     joined_back,
@@ -181,13 +181,22 @@ class Sessions:
             self._lending[folder, at] = self._with_lender(self._session_of(folder), at)
         return self._lending[folder, at]
 
-    def recorded_at(self, moment: Ns) -> list[Session] | None:
-        """Returns the sessions whose transforms hold at a moment; None if none was recorded."""
+    def recorded_at(self, moment: Ns) -> list[list[Session]] | None:
+        """Returns the sessions whose transforms hold at a moment; None if none was recorded.
+
+        In groups, of which those of the first count that has an answer: the sessions that went on
+        then; those that had ended or not begun yet, by `_AROUND_NS` at most. What had ended comes
+        before what had not begun, and what is nearer before what is farther.
+        """
         around = self._around(moment)
         if not around:
             return None
-        with_transforms = (session for session in around if self._kinds(session))
-        return [*dict.fromkeys(self._with_lender(session, moment) for session in with_transforms)]
+        apart = {each: _apart(span, moment) for each, span in around.items() if self._kinds(each)}
+        nearest = sorted(apart, key=lambda session: apart[session])
+        then = dict.fromkeys(self._with_lender(s, moment) for s in nearest if not any(apart[s]))
+        beside = dict.fromkeys(self._with_lender(s, moment) for s in nearest if any(apart[s]))
+        groups = [*then], [each for each in beside if each not in then]
+        return [group for group in groups if group]
 
     def names(self, session: Session, at: Ns) -> str:
         """Returns the names of a session's recordings at a moment; of all if none went on."""
@@ -247,14 +256,25 @@ class Sessions:
         kinds = enumerate(self._spans.kinds)
         return frozenset(kind for kind, spans in kinds if session & spans.keys())
 
-    def _around(self, moment: Ns) -> list[Session]:
-        """Returns the sessions that were being recorded at a moment."""
-        return [*dict.fromkeys(map(self._session_of, sorted(self._folders_around(moment))))]
+    def _around(self, moment: Ns) -> dict[Session, Span]:
+        """Returns the sessions that were being recorded around a moment.
 
-    def _folders_around(self, moment: Ns) -> set[str]:
-        """Returns the folders of the recordings that went on at a moment."""
-        bags = self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
-        return {self.folder(bag.recording) for bag in bags} - {self._carried}
+        With the log times of the first and the last message of their bags that are near.
+        """
+        around: dict[Session, Span] = {}
+        for folder, span in sorted(self._folders_around(moment).items()):
+            session = self._session_of(folder)
+            around[session] = wider(around.get(session), span)
+        return around
+
+    def _folders_around(self, moment: Ns) -> dict[str, Span]:
+        """Returns the folders of the recordings that went on around a moment; see `_around`."""
+        spans: dict[str, Span] = {}
+        for bag in self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS)):
+            folder = self.folder(bag.recording)
+            spans[folder] = wider(spans.get(folder), (bag.start, bag.end))
+        spans.pop(self._carried, None)
+        return spans
 
     def _session_of(self, folder: str) -> Session:
         if folder == self._carried:
@@ -516,6 +536,13 @@ def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
             large |= small
             component.update(dict.fromkeys(small, large))
     return component
+
+
+def _apart(span: Span, moment: Ns) -> Span:
+    """Returns how long a moment is before the begin of a span of time, and after its end."""
+    first, last = span
+    before, after = first - moment, moment - last
+    return max(before - AT_OR_BEFORE_SLACK_NS, 0), max(after - AT_OR_BEFORE_SLACK_NS, 0)
 
 
 def _distance(span: Span, moment: Ns) -> Ns:

@@ -82,7 +82,8 @@ def transform_at(
     """Returns the pose of `child` in `parent` at a moment, by tf2's rules.
 
     With the `recording` of a message the transforms of that recording's session are used; else
-    those of the session that was recorded then. Where several were, and differ, a note reports it.
+    those of the session that was recorded then; of one that was within 10 s, if that has none.
+    Where several were, and differ, a note reports it.
     The reason why there is none takes far longer to find: `explains=False` leaves it out.
 
     Raises:
@@ -96,17 +97,20 @@ def transform_at(
     if recording is not None:
         session = lending_to(view, recording, frames, at)
         return _transform_of_session(view, session, frames, at, explains=explains)
-    recorded = sessions.recorded_at(at)
+    groups = sessions.recorded_at(at)
+    if groups is None:
+        groups = [[session] for session in sessions.nearest_to(at)]
     answers: list[tuple[Session, FoundTransform]] = []
     failures: list[NoDataError] = []
-    for session in (sessions.nearest_to(at) if recorded is None else recorded) or [frozenset()]:
-        try:
-            answer = _transform_of_session(view, session, frames, at, explains=explains)
-            answers.append((session, answer))
-        except NoDataError as error:
-            # A traceback has this frame, which has the failures: they would stay for long.
-            failures.append(error.with_traceback(None))
-        if recorded is None and answers:
+    for group in groups or [[frozenset[str]()]]:
+        for session in group:
+            try:
+                answer = _transform_of_session(view, session, frames, at, explains=explains)
+                answers.append((session, answer))
+            except NoDataError as error:
+                # A traceback has this frame, which has the failures: they would stay for long.
+                failures.append(error.with_traceback(None))
+        if answers:
             break
     if not answers:
         raise failures.pop(0)

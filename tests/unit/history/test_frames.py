@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, pairwise, repeat
 from pathlib import Path
@@ -131,7 +132,7 @@ def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repe
         for second, (child, x) in enumerate(received):
             bag(folder, second, [static(second, child, float(x))])
         view = View(memory_of(folder), Call())
-        [session] = view.sessions.recorded_at(T0) or []
+        [[session]] = view.sessions.recorded_at(T0) or []
         found = static_at(view.sessions.static(session), T0 + at * S - AT_OR_BEFORE_SLACK_NS)
     expected: dict[str, float] = {}
     for second, (child, x) in enumerate(received):
@@ -228,6 +229,46 @@ def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(tmp_
     named = {100.0: first, 500.0: second}[found.transform.translation[0]]
     [note] = [note for note in found.notes if "2 sessions" in note]
     assert note.endswith(f"this is that of {named}")
+
+
+@each_way
+@pytest.mark.parametrize("names", [("rec_a", "rec_b"), ("rec_b", "rec_a")], ids="-".join)
+@pytest.mark.parametrize("gap", [S // 5, S, 5 * S, 15 * S])
+@pytest.mark.parametrize("again", [False, True])
+def test_after_a_restart_a_transform_is_that_of_the_recording_that_goes_on(
+    tmp_path: Path, *, again: bool, gap: int, names: tuple[str, str], recalls: bool
+) -> None:
+    """Whatever it is called, however soon it began, and if it received the old transform again."""
+    end = T0 + 18 * S
+    begin = end + gap
+    first = [fixed(T0 + S, "map", "odom", 1.0), *drive(T0, 18)]
+    late = fixed(begin + S // 20, "map", "odom", 1.0)
+    second = [
+        *drive(begin, 30),
+        *([replace(late, publish_time=T0 + S)] if again else []),
+        fixed(begin + S, "map", "odom", 2.0),
+        fixed(begin + 2 * S, "map", "odom", 3.0),
+    ]
+    for name, messages in zip(names, (first, second), strict=True):
+        record(tmp_path / name, messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    before = 1.0 if again else 2.0  # a session's first holds before it was received, too
+    expected = {end: 1.0, begin: before, begin + S: 2.0, begin + 2 * S: 3.0, begin + 9 * S: 3.0}
+    for at, x in expected.items():
+        found = queries.transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(at)))
+        assert found.transform.translation[0] == x
+        assert not [note for note in found.notes if "sessions" in note]
+    if gap < 10 * S:
+        assert x_of(memory, begin - S // 10) == 1.0
+
+
+def test_what_a_recording_lacks_is_that_of_one_that_has_just_ended(tmp_path: Path) -> None:
+    record(tmp_path / "rec_a", [fixed(T0, "map", "odom", 1.0), *drive(T0, 18)])
+    record(tmp_path / "rec_b", [fixed(T0 + 20 * S, "base", "eye", 2.0), *drive(T0 + 19 * S, 30)])
+    memory = memory_of(tmp_path)
+    assert x_of(memory, T0 + 22 * S) == 1.0
+    with pytest.raises(NoDataError):
+        x_of(memory, T0 + 35 * S)
 
 
 @each_way
