@@ -555,7 +555,7 @@ class RecordingSessions:
             file = f"{session.name}/{name}"
             sentence = f"{file} is empty although a newer split was started"
             self.events.fail("split_empty", sentence, recording=session.name)
-        for fault in changes.faults:
+        for fault in changes.faults or (None,):
             self.events.lasting("unreadable", session.name, fault, recording=session.name)
         return changes
 

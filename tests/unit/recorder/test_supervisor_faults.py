@@ -208,6 +208,20 @@ class TestFailingDisk:
         assert len(world.running) == 1
         assert "Stale file handle" in events(logs, "unreadable")[0]["reason"]
 
+    def test_once_its_splits_can_be_read_again_and_one_is_closed_that_fault_is_past(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path).started(3)
+        for _ in range(2):
+            with monkeypatch.context() as failing_disk:
+                failing_disk.setattr(world.reader, "closing", failing(errno.ESTALE))
+                [reported] = world.logged(12, "unreadable")
+            assert reported["reason"] == world.heartbeat()["last_error"]
+            assert world.heartbeat()["recovered"] is False
+            world.run(13)
+            assert world.heartbeat()["recovered"] is True
+        assert len(world.recorders) == 1
+
     def test_one_task_that_fails_keeps_no_other_from_being_done(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
