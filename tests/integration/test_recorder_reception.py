@@ -151,7 +151,7 @@ def test_what_was_lost_is_counted_to_the_message(site: Machine) -> None:
         recorder.stop()
     lost = lost_of(numbers(recorder.bag_dir)["/odom"])
     # A busy machine may lose more in a later split, which is told with that.
-    assert lost >= told[0]["lost"] > 10
+    assert lost >= told[0]["lost"] > 0
     window = (0, time.time_ns())
     assert sum(loss.lost for loss in read_losses(recorder.bag_dir, *window)) == lost
     beat = recorder.heartbeat.heartbeat
