@@ -75,6 +75,8 @@ OTHER_ROBOTS: Final = {
     "darknet_ros_msgs/msg/BoundingBoxes": (
         "std_msgs/Header header\nBoundingBox[] bounding_boxes\n"
     ),
+    "yolo_msgs/msg/Detection": "string class_name\nfloat64 score\nstring id\n",
+    "yolo_msgs/msg/DetectionArray": "std_msgs/Header header\nDetection[] detections\n",
     "aruco_opencv_msgs/msg/MarkerPose": "uint16 marker_id\ngeometry_msgs/Pose pose\n",
     "aruco_opencv_msgs/msg/ArucoDetection": "std_msgs/Header header\nMarkerPose[] markers\n",
     "radar_msgs/msg/RadarReturn": "float32 range\nfloat32 azimuth\nfloat32 amplitude\n",

@@ -955,6 +955,21 @@ def test_boxes_of_darknet_stay_without_people(bag_dir: Path) -> None:
     assert [box.Class for box in message.bounding_boxes] == ["cup"]
 
 
+def test_a_tracked_person_is_hidden_by_its_id(bag_dir: Path) -> None:
+    kind = "yolo_msgs/msg/DetectionArray"
+    tracked = [
+        make("yolo_msgs/msg/Detection", class_name="thing", score=0.9, id=name)
+        for name in ("cup_3", "person_17")
+    ]
+    at = [T0 + nth * S for nth in range(3)]
+    seen = [make(kind, header=header(each, "camera"), detections=tracked) for each in at]
+    record(bag_dir, [Msg("/tracked", kind, *each) for each in zip(at, seen, strict=True)])
+    keep_all(bag_dir)
+    [found, *_] = of_topic(bag_dir, "/tracked")
+    message: Any = McapReader().decode(found)
+    assert [detection.id for detection in message.detections] == ["cup_3"]
+
+
 def test_of_a_latched_message_only_the_hidden_frame_goes(bag_dir: Path) -> None:
     """All that many robots say of their static frames is one message."""
     at = [T0 + n * S for n in range(10)]
