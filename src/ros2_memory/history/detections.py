@@ -187,13 +187,12 @@ def hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
     looked at, or has no stamp.
     """
     newest = view.stream.newest(topic, window)
-    if newest is None:
+    stamp = None if newest is None else _stamp_of(view.bags.decode(newest))
+    if newest is None or not stamp or newest.time - stamp <= _LONGEST_LATENCY_NS:
         return None
     before = view.stream.newest(topic, TimeWindow(window.start, newest.time))
-    if before is None or before.record.payload != newest.record.payload:
-        return None
-    stamp = _stamp_of(view.bags.decode(newest))
-    return stamp if stamp and newest.time - stamp > _LONGEST_LATENCY_NS else None
+    repeats = before is not None and before.record.payload == newest.record.payload
+    return stamp if repeats else None
 
 
 def _stamp(view: View, stored: StoredMessage) -> Ns:
