@@ -199,7 +199,7 @@ def _held_by_events(
         return None, None
     wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if wanted is not None:
-        # A topic that was recorded as text before has no events of what that said.
+        # Texts that a topic had before are no events.
         if len(types) > 1 or len(topics) > 1:
             return None, None
         return _boolean_held(binned, topics[0], condition, scope, wanted=wanted)

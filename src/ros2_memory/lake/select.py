@@ -343,14 +343,14 @@ def main() -> None:
         (resource.RLIMIT_CORE, 0),
     ):
         resource.setrlimit(limit, (most, most))
-    # Should the one who asks be killed.
+    # Nobody else ends this process if its parent is killed.
     signal.setitimer(signal.ITIMER_REAL, max(left_s, 0.0) + 1.0)
     try:
         found = select.rows(tables)
-        # Copies of all values would be too many.
+        # `asdict` would copy every value.
         answer = {"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut}
     except EpisodicError as error:
-        # A path is for the log alone.
+        # The cause may name a path, which is for the log alone.
         cause = _short(str(error.__cause__ or "")) if isinstance(error, RefusedError) else ""
         answer = {"error": error.code, "reason": str(error), "cause": cause}
     json.dump(answer, sys.stdout)
