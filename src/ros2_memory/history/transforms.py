@@ -126,7 +126,7 @@ def _note_sessions(
     sessions, (session, counting) = view.sessions, answers[0]
     if not all(alike(counting.transform, answer.transform) for _, answer in answers):
         view.notes.add(
-            f"{len(answers)} sessions recorded at that time have different transforms; "
+            f"{len(answers)} sessions recorded around that time have different transforms; "
             f"this is that of {sessions.names(session, at)}"
         )
     parts = sessions.parts.get(session, ())
