@@ -343,8 +343,10 @@ def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
 
 def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
     """Returns whether one of these texts looks like JSON, or is not in the columns."""
+    zones = ((leaf, values.zone(leaf)) for leaf in texts)
+    possible = [leaf for leaf, zone in zones if zone is None or zone.may_be_json]
     try:
-        return any(looks_like_json(word) for leaf in texts for word in values.texts(leaf).words)
+        return any(looks_like_json(word) for leaf in possible for word in values.texts(leaf).words)
     except UnknownShapeError:
         return True
 
@@ -453,18 +455,29 @@ class DetectionColumns:
         plan = self._plans.of(table)
         return plan is None or any(not isinstance(source, Json) for source in plan.sources)
 
-    def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
-        """Returns whether a message may hold a detection, as known without reading a column.
-
-        Of several parts for each of them, or for all.
-        """
-        plan = self._plans.of(table_or_parts)
-        possible: bool | Mask = plan is None
-        for source in () if plan is None else plan.sources:
-            if not isinstance(source, Json):
-                return True
-            possible = possible | _may_be_json(table_or_parts, source.leaf)
+    def may_match(self, parts: PartZones) -> bool | Mask:
+        """Returns in which parts a message may hold a detection, by their zones; or of all."""
+        texts = self._only_texts(parts)
+        if texts is None:
+            return True
+        possible: bool | Mask = False
+        for leaf in texts:
+            zone = zone_of(leaf, parts.zone)
+            possible = possible | (True if zone is None else zone.may_be_json)
         return possible
+
+    def may_have_any(self, table: Table) -> bool:
+        """Returns whether a message of a table may hold a detection."""
+        texts = self._only_texts(table)
+        return texts is None or may_be_json(Values(table), texts)
+
+    def _only_texts(self, table_or_parts: Table | PartZones) -> list[Leaf] | None:
+        """Returns the texts of a type if it has detections in them alone; None if not so."""
+        plan = self._plans.of(table_or_parts)
+        if plan is None:
+            return None
+        texts = [source.leaf for source in plan.sources if isinstance(source, Json)]
+        return texts if len(texts) == len(plan.sources) else None
 
 
 def _bytes_of(stamped: StampedDetections) -> int:
@@ -560,15 +573,9 @@ def _no_frames(count: int) -> Texts:
     return Texts(np.zeros(count, np.uint32), ("",))
 
 
-def _may_be_json(table_or_parts: Table | PartZones, leaf: Leaf) -> bool | Mask:
-    """Returns whether a text may be JSON, by its zone, or in which parts by their zones."""
-    zone = zone_of(leaf, table_or_parts.zone)
-    return True if zone is None else zone.may_be_json
-
-
 def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     """Yields the detections in texts that are JSON, each of which is parsed once."""
-    if not _may_be_json(values.table, source.leaf):
+    if not may_be_json(values, [source.leaf]):
         return
     texts = values.texts(source.leaf)
     parsed = values.table.remember(

@@ -117,6 +117,10 @@ class DetectionRows:
         """Returns in which parts some message may hold a detection, by their zones."""
         return self._columns.may_match(parts)
 
+    def may_have_any(self, rows: Rows) -> bool:
+        """Returns whether a message in the table of some rows may hold a detection."""
+        return self._columns.may_have_any(rows.table)
+
     def have_labels(self, rows: Rows) -> bool:
         """Returns whether the type of some rows has fields for labels, not only texts."""
         return self._columns.has_labels(rows.table)

@@ -488,7 +488,8 @@ class Watching:
     def _rows(self, window: TimeWindow) -> Iterator[Rows]:
         """Yields the rows in a window that may have detections."""
         for topic in self._topics:
-            yield from scan(self._view, topic, window, may_match=self._placer.rows.may_match)
+            scanned = scan(self._view, topic, window, may_match=self._placer.rows.may_match)
+            yield from filter(self._placer.rows.may_have_any, scanned)
 
 
 def _as_one(

@@ -50,6 +50,7 @@ EXAMPLES = 200 if LONG else 5
 )
 @example(clock="auto", seed=572545084, part=1.0, size=SEGMENT, share=1.0, anew=False, tick=MS)
 @example(clock="stamp", seed=246, part=1.0, size=SEGMENT, share=1.0, anew=False, tick=MS)
+@example(clock="auto", seed=36354, part=1.0, size=1, share=1.0, anew=False, tick=MS)
 @example(clock="auto", seed=11445, part=1.0, size=SEGMENT, share=1.0, anew=False, tick=MS)
 def test_every_question_is_answered_as_without_a_store(
     clock: str,
