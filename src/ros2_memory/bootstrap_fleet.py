@@ -80,7 +80,7 @@ def _secrets_of(path: Path) -> dict[str, str]:
         secrets: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"lake.secrets_file: {path}: {error.strerror}") from None
-    except (ValueError, yaml.YAMLError):
+    except (ValueError, yaml.YAMLError, RecursionError):
         secrets = None
     if not isinstance(secrets, dict) or not all(
         isinstance(text, str) for pair in secrets.items() for text in pair

@@ -28,7 +28,14 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 _LONGEST_VALUE: Final = 80
-_FOREIGN: Final = (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError)
+_FOREIGN: Final = (
+    HydraException,
+    OmegaConfBaseException,
+    YAMLError,
+    OSError,
+    ValueError,
+    RecursionError,  # brackets in brackets, a thousand deep
+)
 _RULES: Final = {
     "tuple_type": "must be a list",
     "path_type": "must be a path",
@@ -99,8 +106,8 @@ def line_of(path: Path, key: str) -> int | None:
     None where the file has none of its keys, or cannot be read.
     """
     line, rest = None, key
-    with suppress(OSError, ValueError, YAMLError):
-        node = yaml.compose(path.read_text(), yaml.SafeLoader)
+    with suppress(OSError, ValueError, YAMLError, RecursionError):
+        node = yaml.compose(path.read_text(encoding="utf-8"), yaml.SafeLoader)
         while isinstance(node, yaml.MappingNode):
             leading = [entry for entry in node.value if f"{rest}.".startswith(f"{entry[0].value}.")]
             if not leading:

@@ -243,7 +243,7 @@ def _sets(path: Path, section: str, key: str) -> bool:
     """Returns whether a file, which holds the keys of a section, sets a key."""
     try:
         content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, YAMLError):
+    except (OSError, ValueError, YAMLError, RecursionError):
         return False
     content = {section: content} if section else content
     for part in key.split("."):

@@ -372,6 +372,7 @@ class TestLabels:
             ("labels: {mug: [' ']}", "empty spelling, as under 'mug'"),
             ("labels: {mug: [], mug: [cup]}", "duplicate key mug"),
             ("labels: [mug]", "labels: ['mug'] is not allowed; must hold keys"),
+            ("labels: " + "[" * 3000, "maximum recursion depth"),
             ("", "labels: missing"),
         ],
     )
@@ -403,7 +404,7 @@ def test_a_preset_that_builds_on_itself_ends(folder: Path) -> None:
     assert Sources(folder, (), {})("data.now") == f"in {folder}"
 
 
-@pytest.mark.parametrize("content", ["[", "- 1", "", "data: 7", "defaults: 7", "\x00"])
+@pytest.mark.parametrize("content", ["[", "[" * 3000, "- 1", "", "data: 7", "defaults: 7", "\0"])
 def test_of_files_that_make_no_sense_the_folder_is_named(folder: Path, content: str) -> None:
     (folder / "config.yaml").write_text(content)
     assert Sources(folder, (), {})("data.now") == f"in {folder}"

@@ -543,12 +543,13 @@ def _unknown_frame(name: str, frames: Sequence[str]) -> NoDataError:
 
 
 def _similar(name: str, frames: Sequence[str]) -> list[str]:
-    """Returns names that contain this one or are part of it, then those spelled alike."""
+    """Returns names that contain this one or are part of it, the nearest first, then like ones."""
     asked = name.casefold()
     by_fold = {frame.casefold(): frame for frame in frames}
-    parts = [frame for fold, frame in by_fold.items() if asked and (asked in fold or fold in asked)]
-    alike = difflib.get_close_matches(asked, list(by_fold), n=3, cutoff=0.6)
-    return list(dict.fromkeys([*parts[:3], *(by_fold[fold] for fold in alike)]))[:3]
+    parts = [fold for fold in by_fold if asked and (asked in fold or fold in asked)]
+    parts.sort(key=lambda fold: abs(len(fold) - len(asked)))
+    near = dict.fromkeys([*parts, *difflib.get_close_matches(asked, by_fold)])
+    return [by_fold[fold] for fold in near][:3]
 
 
 def _unix(moment: Ns) -> str:

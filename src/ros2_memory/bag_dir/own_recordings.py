@@ -163,6 +163,7 @@ class OwnRecordings:
         self._unwritten: dict[str, ListRow] = {}
         self._max_lines = _SPARE_LINES
         self._reported_damaged = 0
+        self._begun = ""
 
     def exists(self) -> bool:
         """Returns whether there is a list.
@@ -303,6 +304,7 @@ class OwnRecordings:
         Raises:
             RecorderError: it cannot be listed: then it must not begin.
         """
+        self._begun = name
         self._append([ListRow(recording=name)])
 
     def complete(self, name: str) -> bool:
@@ -490,8 +492,9 @@ class OwnRecordings:
                     for name, row in self._rows.items()
                     if row.identity or name not in before
                 }
-                gone = self._missing_on_disk(merged)
-                merged = {name: row for name, row in merged.items() if name not in gone}
+                for name in self._missing_on_disk(merged):
+                    if name != self._begun:  # its child has not made it yet
+                        del merged[name]
                 merged |= _by_recording(rows)
                 folder = self._path.parent
                 if not folder.is_dir():
@@ -501,7 +504,8 @@ class OwnRecordings:
                 write_durably(self._path, LIST.text(merged.values()))
                 _give_to_owner(self._path, self._bag_dir)
         except OSError:
-            self._rows = before
+            # What others appended is read again.
+            self._rows, self._stamp = before, None
             raise
         self._max_lines = 2 * len(merged) + _SPARE_LINES
         self._rows, self._stamp = merged, None

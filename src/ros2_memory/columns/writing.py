@@ -164,6 +164,7 @@ class LongBag:
         self._share = budget / max(_messages_of(to_store.bag), 1)
         self._lacks_definitions = False
         self._number = 0
+        self._connection: sqlite3.Connection | None = None
         self._layouts = Layouts()
 
     def begin(self, connection: sqlite3.Connection) -> bool:
@@ -171,6 +172,7 @@ class LongBag:
         if not self._bag.is_current():
             return False
         key = self._bag.key
+        self._connection = connection
         delete_bags(connection, [key.path])
         self._number = insert_bag(connection, self._bag._replace(key=key._replace(size=-1)), "")
         return True
@@ -204,13 +206,16 @@ class LongBag:
 
     def delete_half(self, connection: sqlite3.Connection) -> None:
         """Deletes the parts of it that were written, where it is not stored whole."""
-        rows = connection.execute("SELECT path FROM bag WHERE id = ?", (self._number,))
-        delete_bags(connection, [path for (path,) in rows.fetchall()])
+        if self._is_there(connection):
+            delete_bags(connection, [self._bag.key.path])
 
     def _may_go_on(self, connection: sqlite3.Connection) -> bool:
-        # Meanwhile it may have been deleted, or another program may store it.
+        return self._is_there(connection) and self._bag.is_current()
+
+    def _is_there(self, connection: sqlite3.Connection) -> bool:
+        # Meanwhile the file may have been lost, or another program may have deleted the bag.
         row = connection.execute("SELECT 1 FROM bag WHERE id = ?", (self._number,)).fetchone()
-        return row is not None and self._bag.is_current()
+        return connection is self._connection and row is not None
 
 
 def bytes_of_topics(connection: sqlite3.Connection) -> dict[int, float]:

@@ -87,7 +87,7 @@ def joined(shipped: Snapshot, own: Snapshot, until: Ns) -> Snapshot:
     made = shipped.timeline.memo.of(_JOINED, dict)
     known = made.get(own.timeline)
     if known is None:
-        known = _made(shipped, own.timeline, until)
+        known = _timeline_of_both(shipped, own.timeline, until)
         made.clear()
         made[own.timeline] = known
     timeline, unnamed = known
@@ -101,14 +101,17 @@ def joined(shipped: Snapshot, own: Snapshot, until: Ns) -> Snapshot:
     )
 
 
-def _made(shipped: Snapshot, own: Timeline, until: Ns) -> tuple[Timeline, tuple[SetAside, ...]]:
+def _timeline_of_both(
+    shipped: Snapshot, own: Timeline, until: Ns
+) -> tuple[Timeline, tuple[SetAside, ...]]:
+    """Returns the bags of both, and the own ones whose path another bag has in the lake."""
     after = MIN_NS if shipped.older is None else shipped.older
-    known = shipped.timeline.starts
+    in_lake = shipped.timeline.starts
     bags: list[BagFile] = []
     for segment in own.segments:
         starts = segment.bags.starts
         # Both are in order, so equal ones are found without a hash of them all.
-        is_new = np.searchsorted(known, starts) == np.searchsorted(known, starts, side="right")
+        is_new = np.searchsorted(in_lake, starts) == np.searchsorted(in_lake, starts, "right")
         is_own = is_new & (starts > after) & (starts <= until)
         bags += segment.bags.at(np.flatnonzero(is_own))
     names_in_use = {bag.file for bag in shipped.timeline.named({bag.file for bag in bags})}

@@ -26,7 +26,7 @@ from collections import Counter
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass
-from itertools import chain
+from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
@@ -163,7 +163,7 @@ def excluded_intervals(
     for place, recording in enumerate(recordings, 1):
         later = recordings[place:]
         free_here: Spans = []
-        for run, following in zip(recording.heard, [*recording.heard[1:], None], strict=False):
+        for run, following in zip_longest(recording.heard, recording.heard[1:]):
             stop = _valid_until(run, following, recording, rule.stale)
             if following is None and stop >= recording.stop < MAX_NS:
                 stop = _valid_past_end(run, recording, later, rule.stale)

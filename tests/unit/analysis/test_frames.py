@@ -205,6 +205,7 @@ def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> No
 
 
 LINKS = Tree([edge("odom", "base_link", 5), edge("base_link", "robot1/camera", 5)])
+ARMS = Tree([edge("map", f"{arm}base_link", 5) for arm in ("arm/", "back/", "cart/", "")])
 WHEELS = Tree([edge("odom", f"wheel_{i:02}", 5) for i in range(30)])
 TWO_TREES = Tree([*moving(), edge("map", "goal", 5), edge("goal", "tip", 5)])
 IN_MAP = Tree([*moving(), edge("map", "odom", 0, static=True)])
@@ -219,6 +220,7 @@ RANGE = "100.000000 to 105.000000 (Unix seconds)"
     [
         (LINKS, ("odom", "bas_link"), 5, UNKNOWN, "'bas_link'; similar: base_link"),
         (LINKS, ("Camera", "odom"), 5, UNKNOWN, "robot1/camera"),
+        (ARMS, ("Base_Link", "map"), 5, UNKNOWN, "similar: base_link, arm/base_link"),
         (Tree(moving()), ("odom", "zzz"), 5, UNKNOWN, "there are: base, odom"),
         (WHEELS, ("odom", "zzz"), 5, UNKNOWN, "and 19 more"),
         (Tree(moving()), ("x", "x"), 5, UNKNOWN, "'x'"),

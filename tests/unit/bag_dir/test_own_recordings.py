@@ -31,6 +31,7 @@ from tests.support.log_lines import with_checks
 from tests.support.simulated_recorders import World, events, rotating
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
 A, B, C = "rec_20260921T101320Z", "rec_20260921T102320Z", "rec_20260921T103320Z"
@@ -223,6 +224,40 @@ class TestWhatAKillLeaves:
         own.begin(B)
         assert [each.get("recording") for each in lines(tmp_path)] == [A, A, B]
         assert OwnRecordings(tmp_path).owns(tmp_path / A)
+
+    def test_what_another_program_listed_is_known_where_the_list_cannot_be_written(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(own_recordings, "_SPARE_LINES", 0)
+        own = claimed(tmp_path)
+        own.begin(A)
+        (tmp_path / "old").mkdir()
+        locked = OwnRecordings._locked
+
+        def adopting_first(self: OwnRecordings) -> AbstractContextManager[int | None]:
+            if self is own:  # another program has the lock, so this one waits
+                OwnRecordings(tmp_path).adopt({"old": identity_of(tmp_path / "old")})
+                patch.setattr(own_recordings, "write_durably", failing())
+            return locked(self)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(OwnRecordings, "_locked", adopting_first)
+            with pytest.raises(RecorderError, match="No space left"):
+                own.begin(B)
+        assert own.owns(tmp_path / "old")
+
+    def test_a_recording_that_is_about_to_begin_stays_listed_when_the_list_is_written_again(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(own_recordings, "_SPARE_LINES", 0)
+        own = begun(tmp_path)
+        own.complete(A)
+        own.begin(B)
+        named_in_heartbeat(tmp_path, A, B)
+        for splits in range(10):
+            own.note(A, {f"{A}_{number}.mcap" for number in range(splits)})
+        (tmp_path / B).mkdir()  # by the child; then the power goes
+        assert claimed(tmp_path).owns(tmp_path / B)
 
     @settings(max_examples=examples(100), deadline=None)
     @given(data=st.binary(max_size=300))

@@ -4,6 +4,7 @@ import io
 import os
 from collections import Counter
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,16 +12,16 @@ from mcap.reader import make_reader
 from rich.console import Console
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.cli import output
-from ros2_memory.cli.maintenance.recover import RecoveryOutcome, recover_files
+from ros2_memory.cli.maintenance.recover import RecoveryOutcome, is_foreign, recover_files
+from ros2_memory.core.directories import identity_of
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
 from tests.support.housekeepers import copied, files_in, later, recording_now
 from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tests.support.program import Program
 
 S = 10**9
@@ -55,6 +56,20 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert printed[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
     metadata = f"{tmp_path}/a/metadata.yaml: written to match the files"
     assert printed[1:] == ["b/b_0.mcap: empty, removed", metadata, outcome.summary()]
+
+
+def test_a_recording_is_own_by_whatever_path_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [tmp_path / "old" / name for name in ("run1", "run2")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    own = OwnRecordings(tmp_path)
+    own.claim()
+    own.adopt({f"old/{folder.name}": identity_of(folder) for folder in folders})
+    monkeypatch.chdir(folders[0])
+    assert not is_foreign(Path("../run2"))
+    assert is_foreign(Path("../run3"))
 
 
 class TestMetadata:

@@ -194,8 +194,11 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
         raise RuntimeError("the store refused hunter2hunter2")
     assert "hunter2" not in str(failed.value)
     assert "hunter2" not in exits(0, "config show", "fleet.robots={r1: /r1}", given).out
-    secrets.write_text("[hunter2hunter2]")
-    assert "hunter2" not in ship(2, given).err
+    for text in ("[hunter2hunter2]", f"hunter2hunter2: {'[' * 3000}"):
+        secrets.write_text(text)
+        refused = ship(2, given).err
+        assert "must have lines like" in refused
+        assert "hunter2" not in refused
 
 
 def test_a_select_is_answered_over_the_tables_as_they_are_now(

@@ -304,6 +304,35 @@ def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path:
     assert (count(one, "part"), count(one, "bag")) == (0, 0)
 
 
+@pytest.mark.parametrize("is_asked", [False, True], ids=["", "asked meanwhile"])
+def test_a_bag_is_not_stored_on_in_another_file_that_replaces_the_lost_one(
+    tmp_path: Path, *, is_asked: bool
+) -> None:
+    write_long_bag(tmp_path)
+    one = World.of(tmp_path)
+    [bag] = one.memory.index.snapshot().bags
+    groups = map(Group.tables, undecoded(one.memory.reader, bag.path))
+
+    def replaced_meanwhile() -> Iterator[list[Table]]:
+        yield next(groups)
+        for path in store_file(tmp_path).parent.glob(f"{store_file(tmp_path).name}*"):
+            path.unlink()
+        other_bag = write_mcap(tmp_path / "other" / "other_0.mcap", [odom(T0 + 10**6 * S, 0, 0)])
+        os.utime(other_bag, ns=(T0, T0))
+        other = World.of(tmp_path)
+        other.fill_alone([new for new in other.memory.index.snapshot().bags if new != bag])
+        other.store.close()
+        if is_asked:
+            one.store.read(lambda connection: connection.execute("SELECT 1 FROM bag"), None)
+        yield from groups
+
+    to_store = ReadBag(one.filling._key(bag), bag)
+    assert not one.store.put_long(to_store, replaced_meanwhile(), budget=10**6)
+    again = World.of(tmp_path)
+    assert again.stored() == {"other/other_0.mcap"}
+    check_all(again)
+
+
 def test_a_handover_has_only_those_bags_stored_again_that_it_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

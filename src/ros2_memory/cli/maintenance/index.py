@@ -166,5 +166,5 @@ def _end_with_parent(parent: int) -> bool:
 
     Nothing is lost by the kill: bags are stored whole or not at all.
     """
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent

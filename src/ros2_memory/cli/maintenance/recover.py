@@ -159,7 +159,7 @@ def _repair(file: Path, repairer: Repairer, done: RecoveryOutcome) -> str:
 
 def is_foreign(folder: Path) -> bool:
     """Returns whether a folder is in no recorder's list of its recordings."""
-    path = folder.absolute()
+    path = folder.resolve()
     listing = next((root for root in path.parents if (root / LIST_FILE).exists()), None)
     return listing is None or not OwnRecordings(listing).owns(path)
 

@@ -110,8 +110,12 @@ class TopicsFile:
         Raises:
             ConfigError: see `load_topics`, or the list lacks a topic that it must have.
         """
-        self._read = self._seen = self._content()
-        selection = load_topics(self._path)
+        self._seen = self._content()
+        self._use()
+
+    def _use(self) -> None:
+        self._read = self._seen
+        selection = load_topics(self._path, self._seen)
         for topic, by in self._needed.items():
             if not selection.matches(topic):
                 raise ConfigError(f"{self._path}: it does not list {topic}, which {by} needs")
@@ -128,7 +132,7 @@ class TopicsFile:
             return False
         old = self.selection
         try:
-            self.load()
+            self._use()
         except ConfigError as error:
             self.refused = f"{error}; the recorder keeps the list that it has"
             return False
@@ -142,21 +146,22 @@ class TopicsFile:
             return None
 
 
-def load_topics(path: Path) -> TopicSelection:
-    """Returns the topics that the file lists.
+def load_topics(path: Path, data: bytes | None = None) -> TopicSelection:
+    """Returns the topics that the file lists; `data` is its content where that is known.
 
     Raises:
         ConfigError: the file is missing, is not such a list, lists nothing, or an entry is no
             topic name; the message names the file and the entry.
     """
     try:
-        content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = (path.read_bytes() if data is None else data).decode()
+        content: object = yaml.safe_load(text)
     except OSError as error:
         raise ConfigError(
             f"{path}: the list of topics cannot be read: {error.strerror or error}; "
             "correct recording.topics_file"
         ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: it is not YAML: {' '.join(str(error).split())}") from error
     lists = content if isinstance(content, dict) else {}
     topics, excluded = lists.get("topics"), lists.get("exclude") or []

@@ -127,8 +127,8 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
     channels = _numbers(places[:: INDEX_OFFSET.itemsize], places[1 :: INDEX_OFFSET.itemsize])
     (index_length,) = _INDEX_LENGTH.unpack_from(section, stop)
     # Past the function that takes the fields of a named tuple: it costs as much as all the rest.
-    indexes = (places, index_length)
-    return _new_tuple(Chunk, (offset, length, start, last, channels, *indexes, None, False))
+    fields = (offset, length, start, last, channels, places, index_length, None, False)
+    return _new_tuple(Chunk, fields)
 
 
 @lru_cache(1024)

@@ -100,6 +100,9 @@ def test_an_invalid_name_is_refused_with_file_and_entry(tmp_path: Path, entry: o
         ("", "the key topics"),
         ("topics: [/odom]\ntopic: [/tf]", "the key topics"),
         ("topics: [/odom", "it is not YAML"),
+        ("topics: [2026-02-30]", "it is not YAML: day is out of range for month"),
+        ("topics: [0b_]", "it is not YAML"),
+        (f"topics: {'[' * 3000}", "it is not YAML: maximum recursion depth"),
     ],
 )
 def test_what_is_no_list_of_topics_is_refused(tmp_path: Path, text: str, reason: str) -> None:
@@ -151,3 +154,16 @@ def test_a_changed_list_must_have_what_rules_and_settings_need(tmp_path: Path) -
     path.unlink()
     assert [topics.look() for _ in range(3)] == [False] * 3
     assert "cannot be read" in str(topics.refused)
+
+
+def test_a_list_is_used_as_two_looks_have_found_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = listed(tmp_path, "topics: [/odom]\n")
+    topics = TopicsFile(path)
+    topics.load()
+    whole, half = b"topics: [/tf, /scan]\n", b"topics: [/tf]\n"
+    contents = iter([whole, whole, half])  # who looks again finds it being written
+    monkeypatch.setattr(Path, "read_bytes", lambda _: next(contents))
+    assert [topics.look() for _ in range(2)] == [False, True]
+    assert topics.selection.entries == ("/tf", "/scan")
