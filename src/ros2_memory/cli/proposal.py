@@ -87,14 +87,14 @@ class Disk:
         )
 
     @property
-    def files_per_day(self) -> float:
+    def file_bytes_per_day(self) -> float:
         """The bytes that files take in a day which record all the time, whatever is in them."""
         in_each = self.fixed_bytes + LISTED_BYTES * self.session_s / self.split_s / 2
         return DAY_S / self.split_s * in_each * (1 + self.columns_share)
 
     def days(self, topics: Iterable[Offered]) -> float:
         """Estimates the days of recording that the budget holds."""
-        return self.budget_bytes / (self.bytes_per_day(topics) + self.files_per_day)
+        return self.budget_bytes / (self.bytes_per_day(topics) + self.file_bytes_per_day)
 
     def _rate(self, topic: Offered) -> float:
         # Of a latched topic each recording has the newest message.

@@ -289,7 +289,7 @@ def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], measu
         daily = f"{format_size(disk.bytes_per_day([topic]))} a day" if topic.messages else ""
         detail = f"{topic.type}{f': {reason}' if reason and topic not in recorded else ''}"
         print_line(escape(f"  {sign:<7}{topic.topic:<{width}}{rate:<21}{daily:>17}  {detail}"))
-    files = disk.files_per_day
+    files = disk.file_bytes_per_day
     silent = [topic.topic for topic in recorded if not topic.messages]
     takes = (
         f"about {format_size(disk.bytes_per_day(recorded) + files)} a day"

@@ -232,11 +232,13 @@ class TestWhatAKillLeaves:
         own = claimed(tmp_path)
         own.begin(A)
         (tmp_path / "old").mkdir()
+        old = identity_of(tmp_path / "old")
+        assert old
         locked = OwnRecordings._locked
 
         def adopting_first(self: OwnRecordings) -> AbstractContextManager[int | None]:
             if self is own:  # another program has the lock, so this one waits
-                OwnRecordings(tmp_path).adopt({"old": identity_of(tmp_path / "old")})
+                OwnRecordings(tmp_path).adopt({"old": old})
                 patch.setattr(own_recordings, "write_durably", failing())
             return locked(self)
 

@@ -129,8 +129,8 @@ def test_a_message_takes_its_payload_and_what_mcap_adds() -> None:
 
 def test_files_take_their_definitions_and_a_list_of_those_before() -> None:
     # 8,640 files of 20,000 bytes; a recording has 60, each of which lists 30 others on average.
-    assert DISK.files_per_day == pytest.approx(8640 * (20_000 + 30 * 342))
-    assert replace(DISK, split_s=20).files_per_day < DISK.files_per_day / 2
+    assert DISK.file_bytes_per_day == pytest.approx(8640 * (20_000 + 30 * 342))
+    assert replace(DISK, split_s=20).file_bytes_per_day < DISK.file_bytes_per_day / 2
 
 
 def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> None:

@@ -66,7 +66,8 @@ def test_a_recording_is_own_by_whatever_path_it_is_named(
         folder.mkdir(parents=True)
     own = OwnRecordings(tmp_path)
     own.claim()
-    own.adopt({f"old/{folder.name}": identity_of(folder) for folder in folders})
+    known = {f"old/{folder.name}": identity_of(folder) for folder in folders}
+    own.adopt({name: identity for name, identity in known.items() if identity})
     monkeypatch.chdir(folders[0])
     assert not is_foreign(Path("../run2"))
     assert is_foreign(Path("../run3"))
