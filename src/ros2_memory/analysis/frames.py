@@ -18,7 +18,6 @@ and a time that went through a float of seconds is granted the slack of `timebas
 
 from __future__ import annotations
 
-import difflib
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import reduce
@@ -31,7 +30,7 @@ from ros2_memory.core.arrays import row_maxima, row_sums, stacked
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.geometry import multiply, rotate, slerp
 from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
-from ros2_memory.core.text import listed
+from ros2_memory.core.text import listed, similar
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -534,22 +533,12 @@ def _inverted(poses: FramePoses) -> FramePoses:
 def _unknown_frame(name: str, frames: Sequence[str]) -> NoDataError:
     if not frames:
         detail = f"frame '{name}' is unknown: no transforms are recorded there"
-    elif similar := _similar(name, frames):
-        detail = f"no transform names a frame '{name}'; similar: {listed(similar)}"
+    elif near := similar(name, frames):
+        detail = f"no transform names a frame '{name}'; similar: {listed(near)}"
     else:
         names = listed(frames, at_most=_MAX_NAMES)
         detail = f"no transform names a frame '{name}'; there are: {names}"
     return NoDataError(NoDataReason.FRAME_UNKNOWN, detail)
-
-
-def _similar(name: str, frames: Sequence[str]) -> list[str]:
-    """Returns names that contain this one or are part of it, the nearest first, then like ones."""
-    asked = name.casefold()
-    by_fold = {frame.casefold(): frame for frame in frames}
-    parts = [fold for fold in by_fold if asked and (asked in fold or fold in asked)]
-    parts.sort(key=lambda fold: abs(len(fold) - len(asked)))
-    near = dict.fromkeys([*parts, *difflib.get_close_matches(asked, by_fold)])
-    return [by_fold[fold] for fold in near][:3]
 
 
 def _unix(moment: Ns) -> str:

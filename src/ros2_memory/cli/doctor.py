@@ -8,7 +8,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from difflib import get_close_matches
 from enum import IntEnum
 from functools import partial
 from pathlib import Path
@@ -35,7 +34,7 @@ from ros2_memory.columns.store import relative
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
 from ros2_memory.core.model import BagState, SetAside
-from ros2_memory.core.text import counted, listed, match_topics
+from ros2_memory.core.text import counted, listed, match_topics, similar
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
@@ -548,8 +547,8 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
         yield ok(f"{file} lists {counted(len(selection.entries), 'entry', 'entries')}; {so_far}")
         return
     for entry in missing:
-        similar = get_close_matches(entry, recorded, n=2)
-        hint = f"is it {' or '.join(similar)}? " if similar else ""
+        near = similar(entry, recorded, 2)
+        hint = f"is it {' or '.join(near)}? " if near else ""
         do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
         yield warning(f"{entry} is in {file}, and was never recorded", f"{hint}{do}")
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
-from difflib import get_close_matches
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from io import StringIO
@@ -29,7 +28,7 @@ from ros2_memory.config_sources import GROUPS, Sources, quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
 from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
 from ros2_memory.core.model import BAG_KINDS, TimeWindow
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import counted, listed, similar
 from ros2_memory.core.timebase import (
     MAX_NS,
     MIN_NS,
@@ -291,7 +290,7 @@ def open_memory(
     if settings.data.recording is not None and snapshot.problem:
         bag_dir = memory.index.bag_dir
         names = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
-        near = get_close_matches(settings.data.recording, names, n=3)
+        near = similar(settings.data.recording, names)
         which = f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
         raise InvalidArgumentsError(f"{snapshot.problem}; {which}")
     return memory

@@ -14,6 +14,7 @@ import json
 import re
 import unicodedata
 from dataclasses import dataclass
+from difflib import get_close_matches
 from fnmatch import translate
 from itertools import islice
 from typing import TYPE_CHECKING, Final
@@ -28,6 +29,8 @@ MAX_LABEL_CHARS: Final = 256
 MAX_NAMED: Final = 3
 """How many names a sentence lists before it counts the rest."""
 _MAX_NAME_CHARS: Final = 160
+_LONGEST_COMPARED: Final = 256
+_SHORTEST_PART: Final = 3
 _MAX_DEPTH: Final = 3
 _MAX_ITEMS: Final = 8
 _MAX_TEXT_CHARS: Final = 80
@@ -61,6 +64,20 @@ def caseless(text: str) -> str:
     """Returns a text as it is compared: without regard to case, and to how accents are written."""
     folded = text.casefold()
     return folded if folded.isascii() else unicodedata.normalize("NFC", folded)
+
+
+def similar(name: str, names: Iterable[str], at_most: int = 3) -> list[str]:
+    """Returns names that contain one or are part of it, the nearest first, then those like it.
+
+    Without regard to case.
+    """
+    asked = caseless(name[:_LONGEST_COMPARED])
+    by_folded = {caseless(other): other for other in names}
+    parts = [other for other in by_folded if asked in other or other in asked]
+    parts = [other for other in parts if min(len(asked), len(other)) >= _SHORTEST_PART]
+    parts.sort(key=lambda other: abs(len(other) - len(asked)))
+    near = dict.fromkeys([*parts, *get_close_matches(asked, by_folded, at_most)])
+    return [by_folded[other] for other in near][:at_most]
 
 
 def dotted(path: str, name: str) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
-from difflib import get_close_matches
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -15,7 +14,7 @@ from ros2_memory.bag_dir.state_files import excluded_between, read_losses
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import overlaps_any
-from ros2_memory.core.text import counted, listed, match_topics
+from ros2_memory.core.text import counted, listed, match_topics, similar
 from ros2_memory.core.timebase import (
     MAX_NS,
     MIN_NS,
@@ -280,11 +279,9 @@ def not_recorded(view: View, name: str) -> NoDataError:
         detail = f"{name} is declared in the bags, but no message of it was recorded"
     else:
         detail = f"no topic {name} is recorded"
-    close = get_close_matches(name, snapshot.timeline.topics(), n=5, cutoff=0.6)
-    if not close:
-        stem = name.rstrip("/").rpartition("/")[2].strip("*")
-        close = [topic for topic in snapshot.timeline.topics() if stem and stem in topic][:5]
-    hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics lists all"
+    topics, stem = snapshot.timeline.topics(), name.rstrip("/").rpartition("/")[2].strip("*")
+    near = similar(name, topics, 5) or similar(stem, topics, 5)
+    hint = f"similar: {', '.join(near)}" if near else "list_recorded_topics lists all"
     error = NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{detail}; {hint}")
     return with_notes(view, TimeWindow.everything(), error)
 

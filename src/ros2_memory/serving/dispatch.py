@@ -12,7 +12,6 @@ import time
 import uuid
 from collections import deque
 from contextlib import contextmanager
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -29,7 +28,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.malloc import return_free_memory
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
-from ros2_memory.core.text import abbreviate, shortened
+from ros2_memory.core.text import abbreviate, shortened, similar
 from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.fair_queue import STOPPING, FairQueue
@@ -95,7 +94,6 @@ _WRITES: Final = (
     "it needs a recorder, which alone saves and deletes bags, and server.write_tools=true; with "
     "recorder=none nothing is deleted"
 )
-_LONGEST_NAME: Final = 64
 MAX_VALUES: Final = 10_000
 """Keys and values in the arguments of one call, which are some dozen short ones."""
 MAX_DEPTH: Final = 64
@@ -364,7 +362,7 @@ def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
         if name in {variant.name for variant in declaration.names}:
             why = _WRITES if declaration.writes else "server.tools is spec"
             raise InvalidArgumentsError(f"{name} is not offered here: {why}")
-    near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
+    near = similar(name, tools)
     hint = f"do you mean {' or '.join(near)}?" if near else f"the tools are: {', '.join(tools)}"
     raise InvalidArgumentsError(f"unknown tool {abbreviate(name)}; {hint}")
 

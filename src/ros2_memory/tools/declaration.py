@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from functools import cache, cached_property, partial
 from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
@@ -13,7 +12,7 @@ from pydantic import ValidationError
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import abbreviate, similar
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.at_each import at_each, in_each
 from ros2_memory.tools.arguments import (
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
 
 _MAX_UNKNOWN_NAMED: Final = 5
 _MAX_PROBLEMS_NAMED: Final = 10
-_MAX_NAME_CHARS: Final = 64
 _KINDS: Final = {
     "string": "a text",
     "number": "a number",
@@ -153,7 +151,7 @@ class Signature:
         unknown = (name for name in given if name not in self._properties)
         lacks_hint = False
         for name in islice(unknown, _MAX_UNKNOWN_NAMED):
-            near = get_close_matches(name[:_MAX_NAME_CHARS], self._properties, n=1)
+            near = similar(name, self._properties, 1)
             hint = f"; do you mean {near[0]}?" if near else ""
             yield f"unknown argument {abbreviate(name)}{hint}"
             lacks_hint = lacks_hint or not near

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import lru_cache, partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final, cast
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Final, cast
 from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Memo
-from ros2_memory.core.text import shortened
+from ros2_memory.core.text import shortened, similar
 from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.robots import (
     ADVICE,
@@ -53,9 +52,9 @@ class Recordings:
         alone = self._narrowed(name)
         snapshot = alone.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
-            near = get_close_matches(name, [str(row["name"]) for row in self._list()], n=3)
-            similar = f"; similar: {', '.join(near)}" if near else ""
-            raise InvalidArgumentsError(f"no recording is named {shortened(name)}{similar}")
+            near = similar(name, [str(row["name"]) for row in self._list()])
+            hint = f"; similar: {', '.join(near)}" if near else ""
+            raise InvalidArgumentsError(f"no recording is named {shortened(name)}{hint}")
         return alone
 
     def shown(self, chosen: Memory, call: Call) -> JsonObject:
