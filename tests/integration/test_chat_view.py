@@ -12,7 +12,7 @@ from mcp.types import TextResourceContents
 
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
-from ros2_memory.serving.mcp_server import TOOLS_WITH_VIEW, VIEW_URI, EpisodicServer
+from ros2_memory.serving.mcp_server import VIEW_URI, EpisodicServer
 from tests.integration.browser import Browser, browsing, needs_chromium
 from tests.integration.chat_host import ChatHost, chat_host
 from tests.integration.test_page import ATTACK, painted, write_history
@@ -117,7 +117,7 @@ def drawn(page: Browser) -> None:
     assert page.run("return performance.getEntriesByType('resource').length") == 0
 
 
-@pytest.mark.parametrize("tool", sorted(TOOLS_WITH_VIEW))
+@pytest.mark.parametrize("tool", sorted(CALLS))
 def test_each_reply_is_drawn(robot: Robot, host: ChatHost, chromium: Browser, tool: str) -> None:
     robot.ask(host, tool, CALLS[tool])
     drawn(chromium)

@@ -49,9 +49,6 @@ if TYPE_CHECKING:
 
 
 VIEW_URI: Final = "ui://episodic/memory"
-TOOLS_WITH_VIEW: Final = frozenset(
-    {"recap", "visits", "find_things", "find_matches", "trajectory_summary", "compare"}
-)
 _STYLES: Final = ("page.css", "chat.css")
 _SCRIPTS: Final = ("text.js", "map.js", "timeline.js", "reply.js", "chat.js")
 
@@ -326,5 +323,5 @@ def _listed(tool: Tool) -> ListedTool:
         description=tool.description,
         input_schema=dict(tool.schema),
         annotations=annotations,
-        _meta={"ui": {"resourceUri": VIEW_URI}} if tool.name in TOOLS_WITH_VIEW else None,
+        _meta={"ui": {"resourceUri": VIEW_URI}} if tool.drawn else None,
     )

@@ -266,7 +266,8 @@ class Tool:
     """One tool as clients see it.
 
     `describe` returns the description and the JSON schema of the arguments. `question` checks a
-    call's arguments and binds them to the query. `writes`: it changes what is stored.
+    call's arguments and binds them to the query. `writes`: it changes what is stored. `drawn` is as
+    in `ToolName`.
     """
 
     name: str
@@ -275,6 +276,7 @@ class Tool:
     blocking: bool
     question: Callable[[Mapping[str, object]], Question]
     writes: bool = False
+    drawn: bool = False
 
     @property
     def description(self) -> str:
@@ -311,11 +313,15 @@ def _span_of(arguments: Mapping[str, object]) -> TimeRange:
 
 @dataclass(frozen=True, slots=True)
 class ToolName:
-    """One name of a query, and the arguments that replace its moment or span."""
+    """One name of a query, and the arguments that replace its moment or span.
+
+    `drawn`: chats that can do so show its reply as a map and a timeline (MCP Apps).
+    """
 
     name: str
     title: str
     when: type[TimeArgument] | None = None
+    drawn: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,6 +356,7 @@ class ToolDeclaration:
                 self.blocking,
                 partial(self._question, signature),
                 self.writes,
+                tool_name.drawn,
             )
 
     def _compose_description(

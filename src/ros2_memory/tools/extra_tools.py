@@ -27,7 +27,7 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 _SIGHTINGS = ToolDeclaration(
-    (ToolName("find_matches", "Sightings"),),
+    (ToolName("find_matches", "Sightings", drawn=True),),
     "When, where, how often and how long a condition was true, newest first. "
     "Consecutive matches are one sighting; in a log each message is one, on /_action/status each "
     "goal: failed, aborted, "
@@ -44,7 +44,7 @@ _SIGHTINGS = ToolDeclaration(
     instead={"by": count_matches},
 )
 _RECAP = ToolDeclaration(
-    (ToolName("recap", "What happened", RecapTime),),
+    (ToolName("recap", "What happened", RecapTime, drawn=True),),
     "What happened {when}: path, stops, speed drops, things in view, toggled booleans, goals, "
     "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
     "duration_s, text, in, score, before: changes 10 s before}}], counts}}. With "
@@ -61,7 +61,7 @@ _STATUS = ToolDeclaration(
     memory_status,
 )
 _VISITS = ToolDeclaration(
-    (ToolName("visits", "Visits"),),
+    (ToolName("visits", "Visits", drawn=True),),
     "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
     "{map_frame} if transforms lead there, else {pose_topic}'s; without one, "
     "all named. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
@@ -73,7 +73,7 @@ _VISITS = ToolDeclaration(
     instead={"by": count_visits},
 )
 _THINGS = ToolDeclaration(
-    (ToolName("find_things", "Things"),),
+    (ToolName("find_things", "Things", drawn=True),),
     "Which things there are and where: how many chairs, what is in a place or near X, where X is, "
     "since when, where before, likely now; as of end. Reply: {{things: [{{label, place, in, "
     "first_seen, last_seen, ago_s, count, seen_from, still_there, moved: [{{from, to, place, "
@@ -83,7 +83,7 @@ _THINGS = ToolDeclaration(
     blocking=True,
 )
 _COMPARE = ToolDeclaration(
-    (ToolName("compare", "Differences"),),
+    (ToolName("compare", "Differences", drawn=True),),
     "Between two windows: things moved, appeared, not seen again; "
     "path, standstills, minutes in places, errors, silences. Things go from the earlier "
     "to the later. Within a tenth is equal. Reply: "

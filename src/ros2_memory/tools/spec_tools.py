@@ -130,7 +130,7 @@ DECLARATIONS = (
     ),
     ToolDeclaration(
         (
-            ToolName("trajectory_summary", "Driven path", Between),
+            ToolName("trajectory_summary", "Driven path", Between, drawn=True),
             ToolName("recent_trajectory_summary", "Recent path", Last),
         ),
         "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, "

@@ -25,7 +25,7 @@ from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.serving.mcp_server import TOOLS_WITH_VIEW, VIEW_URI, EpisodicServer, view
+from ros2_memory.serving.mcp_server import VIEW_URI, EpisodicServer, view
 from ros2_memory.tools.build import build_tools, readable_tools
 from tests.support.robot_run import CALLS, write_run
 
@@ -153,6 +153,7 @@ async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path
 
 
 MOST_BYTES = 300_000
+DRAWN = {"recap", "visits", "find_things", "find_matches", "trajectory_summary", "compare"}
 LOADS = re.compile(
     r"\b(src|href)\s*=|@import|url\(|\bfetch\(|XMLHttpRequest|WebSocket|importScripts"
 )
@@ -165,8 +166,8 @@ async def test_six_tools_name_the_view_which_is_read_and_not_listed(tmp_path: Pa
         [content] = (await client.read_resource(VIEW_URI)).contents
         assert EXTENSION_ID in (client.server_capabilities.extensions or {})
     named = {tool.name: tool.meta for tool in tools if tool.meta is not None}
-    assert named == {name: {"ui": {"resourceUri": VIEW_URI}} for name in TOOLS_WITH_VIEW}
-    assert len(TOOLS_WITH_VIEW) == 6
+    assert set(named) == DRAWN
+    assert all(meta == {"ui": {"resourceUri": VIEW_URI}} for meta in named.values())
     assert VIEW_URI not in {resource.uri for resource in resources}
     assert isinstance(content, TextResourceContents)
     assert (content.uri, content.mime_type) == (VIEW_URI, APP_MIME_TYPE)
