@@ -19,9 +19,9 @@ from itertools import chain, starmap
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.text import abbreviate, caseless
+from ros2_memory.core.text import abbreviate, caseless, looks_like_json
 from ros2_memory.messages.conversions import Summary
-from ros2_memory.messages.detections import detections_of, looks_like_json, without_low_scores
+from ros2_memory.messages.detections import detections_of, without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -32,14 +32,13 @@ from ros2_memory.columns.values import (
 )
 from ros2_memory.columns.walk import entries_of_codes
 from ros2_memory.core.arrays import Floats, places_among
-from ros2_memory.core.text import LISTS_OF_LABELS
+from ros2_memory.core.text import LISTS_OF_LABELS, looks_like_json
 from ros2_memory.messages.detections import (
     MAX_DEPTH,
     POSITIONS,
     SCORES,
     Detection,
     detections_of,
-    looks_like_json,
     naming,
 )
 

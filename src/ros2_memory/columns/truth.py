@@ -42,7 +42,8 @@ from ros2_memory.columns.values import (
     unknown,
     zone_of,
 )
-from ros2_memory.messages.detections import looks_like_json, without_low_scores
+from ros2_memory.core.text import looks_like_json
+from ros2_memory.messages.detections import without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -55,15 +55,36 @@ NAMES_IN_MESSAGES: Final = LISTS_OF_LABELS.union(
 """Fields of messages that hold names."""
 _NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")
 """One word, or two: `map`, `traffic light`."""
+_JSON: Final = frozenset("[{")
+_WITH_ESCAPES: Final = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)+"', re.DOTALL)
+"""Strings of JSON that have escapes; between strings it has no backslash."""
 _MOST_KEYS: Final = 12
 _MOST_KEYS_CHARS: Final = 300
 """Of more places, or longer ones, a reply lists its own keys above them."""
 
 
+def looks_like_json(text: str) -> bool:
+    """Returns whether a text begins as a JSON array or object does."""
+    return text.lstrip()[:1] in _JSON
+
+
 def caseless(text: str) -> str:
-    """Returns a text as it is compared: without regard to case, and to how accents are written."""
+    """Returns a text as it is compared: without regard to case, and to how letters are written.
+
+    That is to accents, and in JSON to escapes, as of all letters that are not ASCII.
+    """
+    if "\\" in text and looks_like_json(text):
+        text = _WITH_ESCAPES.sub(_unescaped, text)
     folded = text.casefold()
     return folded if folded.isascii() else unicodedata.normalize("NFC", folded)
+
+
+def _unescaped(match: re.Match[str]) -> str:
+    """Returns a string of JSON as it is meant, in quotes."""
+    try:
+        return f'"{json.loads(match[0], strict=False)}"'
+    except ValueError:
+        return match[0]
 
 
 def similar(name: str, names: Iterable[str], at_most: int = 3) -> list[str]:

@@ -17,7 +17,7 @@ from itertools import product
 from operator import is_, itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES
+from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES, looks_like_json
 from ros2_memory.messages.conversions import number, triple, xyz
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ _NAMED_BY: Final = frozenset(LABELS).union(("name", "category", "id"), *NAMED_IN
 _MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 7
 """Lists, objects and texts that are JSON around a detection, and it."""
-_JSON: Final = frozenset("[{")
 
 
 class Detection(NamedTuple):
@@ -194,11 +193,6 @@ def _is_alone(value: JsonObject) -> bool:
     others = [part for name, part in value.items() if name not in _NAMED_BY]
     lists = [part for part in others if isinstance(part, list)]
     return not others or any(isinstance(part[0], int | float | list) for part in lists if part)
-
-
-def looks_like_json(text: str) -> bool:
-    """Returns whether a text begins as a JSON array or object does."""
-    return text.lstrip()[:1] in _JSON
 
 
 def _label(value: JsonObject) -> str | None:

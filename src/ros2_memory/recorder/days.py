@@ -41,9 +41,16 @@ from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES, caseless, match_topics
+from ros2_memory.core.text import (
+    LABELS,
+    LISTS_OF_LABELS,
+    NAMED_IN_TYPES,
+    caseless,
+    looks_like_json,
+    match_topics,
+)
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_since
-from ros2_memory.messages.detections import detections_of, looks_like_json
+from ros2_memory.messages.detections import detections_of
 from ros2_memory.recorder.thinning import (
     MINUTE_NS,
     TopicThinning,

@@ -35,10 +35,10 @@ from ros2_memory.columns.steps import Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
 from ros2_memory.core.arrays import numbered
 from ros2_memory.core.model import BagState
-from ros2_memory.core.text import NAMES_IN_MESSAGES
+from ros2_memory.core.text import NAMES_IN_MESSAGES, looks_like_json
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.index.clock_faults import FaultyClock
-from ros2_memory.messages.detections import detections_of, looks_like_json
+from ros2_memory.messages.detections import detections_of
 from ros2_memory.storage.base import Definition
 
 if TYPE_CHECKING:
