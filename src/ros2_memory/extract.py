@@ -41,6 +41,7 @@ from ros2_memory.messages.conversions import (
     euler,
     field_table_of_class,
     kind_of,
+    names_beside,
     names_of,
     nanoseconds,
     number,
@@ -396,7 +397,22 @@ class SchemaExtractor:
             node = descend(_converted(segments[0], _at(message, mapped)), segments[1:], view)
         elif not plan.fields:
             node = descend(message, segments, view)
-        return _plain(_at(message, segments)) if node is ABSENT else node
+        if node is ABSENT:
+            node = _plain(_at(message, segments))
+        return self._named(message, type_name, path) if node is ABSENT else node
+
+    def _named(self, message: object, type_name: str, path: str) -> object:
+        """Returns what an array has for a name in the list beside it, as `positions.elbow`.
+
+        Null where the list has other names, `ABSENT` where there is none.
+        """
+        head, _, name = path.partition(".")
+        value = self._whole(ExactJson(self.limit), message, type_name)
+        names = names_beside(value, path)
+        array = value.get(head) if isinstance(value, dict) and names else None
+        if not isinstance(array, list):
+            return ABSENT
+        return dict(zip(names[::-1], array[: len(names)][::-1], strict=False)).get(name)
 
 
 def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:

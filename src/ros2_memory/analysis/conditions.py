@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate, caseless, looks_like_json
-from ros2_memory.messages.conversions import Summary
+from ros2_memory.messages.conversions import INDEX, Summary, names_beside
 from ros2_memory.messages.detections import detections_of, without_low_scores
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ POSITION_KEYS: Final = ("position", "point", "translation")
 _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
 _DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LISTED_PATHS: Final = 16
-_INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
-ELEMENT_NAMES: Final = ("names", "name", "joint_names")
 """Keys of a list that names the elements of the arrays beside it, as in joint states."""
 _AXES: Final = {"0": "x", "1": "y", "2": "z"}
 """An array of three numbers may be shown as a point."""
@@ -255,6 +253,19 @@ class Condition:
         path = extractor.own_path(self.field, type_name)
         return self if path == self.field else replace(self, field=path)
 
+    def is_unstated(self, value: JsonValue) -> bool:
+        """Returns whether a value says nothing of the field: it names other elements.
+
+        So it is of joint states where several nodes publish those of some joints each.
+        """
+        names = names_beside(value, self.field or "")
+        return bool(names) and self.element not in names
+
+    @property
+    def element(self) -> str:
+        """The name of an element that the field asks for, where it asks for one."""
+        return (self.field or "").partition(".")[2]
+
     def matches(self, value: JsonValue) -> bool:
         """Returns whether the value, or any target of the field in it, passes the test."""
         if not self._passes(value):
@@ -414,18 +425,6 @@ def along(
     return nodes
 
 
-def names_beside(value: object, dot_path: str) -> list[object]:
-    """Returns the names of an array's elements where a path has one instead of a number."""
-    head, _, name = dot_path.partition(".")
-    if not isinstance(value, dict) or not name or _INDEX.fullmatch(name):
-        return []
-    array = value.get(head)
-    if not isinstance(array, list) or isinstance(next(iter(array), 0), dict):
-        return []
-    lists = (value.get(key) for key in ELEMENT_NAMES if key != head)
-    return next((names for names in lists if isinstance(names, list)), [])
-
-
 def positions(value: JsonValue) -> Iterator[Vector3]:
     """Yields the positions (m) in a value, with NaN for a coordinate that is missing or null.
 
@@ -533,7 +532,7 @@ def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> 
         elif segment in _AXES and node.keys() == _POINT:
             yield node[_AXES[segment]]
     elif isinstance(node, list):
-        if _INDEX.fullmatch(segment):
+        if INDEX.fullmatch(segment):
             yield from pick(node, int(segment))
         else:
             for element in node:

@@ -40,7 +40,14 @@ from ros2_memory.columns.values import (
 )
 from ros2_memory.core.text import dotted
 from ros2_memory.extract import POINTS, SchemaExtractor
-from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, Summary, ValueKind, kind_of_type
+from ros2_memory.messages.conversions import (
+    ANGLES,
+    SUMMARIZED,
+    Summary,
+    ValueKind,
+    kind_of_type,
+    names_beside,
+)
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import SEQUENCE, Definition
 
@@ -166,6 +173,8 @@ class Shape:
         if node is not None:
             return node
         node = self.at([name, *inner])
+        if node is None and names_beside(self.value, path):
+            return at_field(self.value, path)
         if node is not None and any(leaf.conversion in _TURNS for leaf in leaves_of(node)):
             raise UnknownShapeError(f"{path} is a rotation, or has one")  # shown as x, y, z, w
         return node
@@ -368,7 +377,7 @@ def at_field(root: Node, dot_path: str) -> list[Node]:
     Raises:
         UnknownShapeError: it depends on the message.
     """
-    names = conditions.names_beside(root, dot_path)
+    names = names_beside(root, dot_path)
     head, _, name = dot_path.partition(".")
     array = root.get(head) if isinstance(root, dict) else None
     leaf = names.element if isinstance(names, Listing) else None

@@ -10,6 +10,7 @@ What is known without unpacking a column (its zone) is looked at first.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from itertools import compress
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -24,7 +25,7 @@ from ros2_memory.analysis.conditions import (
     points,
 )
 from ros2_memory.columns.detections import may_be_json, without_low
-from ros2_memory.columns.shown import NOTHING, ByType, Node, Shape, at_field, leaves_of
+from ros2_memory.columns.shown import NOTHING, ByType, Listing, Node, Shape, at_field, leaves_of
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import MAX_NUMBERS, as_float
 from ros2_memory.columns.values import (
@@ -43,6 +44,7 @@ from ros2_memory.columns.values import (
     zone_of,
 )
 from ros2_memory.core.text import looks_like_json
+from ros2_memory.messages.conversions import names_beside
 from ros2_memory.messages.detections import without_low_scores
 
 if TYPE_CHECKING:
@@ -99,6 +101,22 @@ class ColumnCondition:
         met = _any_of(whole, values)
         return TruthValues(counted.surely & met.surely, counted.perhaps & met.perhaps)
 
+    def unstated(self, table: Table) -> Mask:
+        """Returns which rows say nothing of the field; see `Condition.is_unstated`.
+
+        None of them where the columns do not show it.
+        """
+        plan, values = self._plans.of(table), Values(table)
+        if plan is not None and plan.names is not None:
+            with suppress(UnknownShapeError):
+                names, elements = values.texts(plan.names), values.elements(plan.names.level)
+                is_named = np.array([word == plan.element for word in names.words], np.bool_)
+                counts = np.bincount(elements.owners, minlength=values.rows)
+                own = np.bincount(elements.owners[is_named[names.codes]], minlength=values.rows)
+                is_other: Mask = (counts > 0) & (own == 0)
+                return is_other
+        return np.zeros(values.rows, np.bool_)
+
     def may_match(self, parts: PartZones) -> bool | Mask:
         """Returns which parts may have a row that meets the condition, by their zones.
 
@@ -122,10 +140,18 @@ class ColumnCondition:
 
 
 class _Plan(NamedTuple):
-    """What is tested on a value, and on the value without detections of a low score."""
+    """What is tested on a value, and on the value without detections of a low score.
+
+    Attributes:
+        whole: on the value.
+        counted: on the value without these; None where all detections count.
+        names: of the elements where the field asks for an `element` by its name.
+    """
 
     whole: Sequence[_Test]
     counted: Sequence[_Test] | None
+    names: Leaf | None
+    element: str
 
     @classmethod
     def of(cls, condition: Condition, shape: Shape) -> _Plan:
@@ -134,10 +160,13 @@ class _Plan(NamedTuple):
         Raises:
             UnknownShapeError: it depends on the message.
         """
-        whole = _tests(condition, shape.value)
-        if condition.min_score <= 0:
-            return cls(whole, None)
-        return cls(whole, _tests(condition, without_low(shape.value, condition.least_score)))
+        whole, counted = _tests(condition, shape.value), None
+        if condition.min_score > 0:
+            counted = _tests(condition, without_low(shape.value, condition.least_score))
+        listing = names_beside(shape.value, condition.field or "")
+        names = listing.element if isinstance(listing, Listing) else None
+        leaf = names if isinstance(names, Leaf) and names.kind is Kind.TEXT else None
+        return cls(whole, counted, leaf, condition.element)
 
 
 def _possible(tests: Sequence[_Test], values: Values) -> list[_Test]:

@@ -504,6 +504,7 @@ def count_range(
     binned.add_last(last, int(last.max()))
     for field, cells in zip(names, cells_of_fields, strict=True):
         if cells[-1] is None:
+            _require_field(view, name, field)
             view.notes.add(f"{field} holds no number in the window")
             continue
         for nth, (column, kind) in enumerate(_CELL):
@@ -511,6 +512,18 @@ def count_range(
             binned.add(f"{field}.{column}", kind, of_bins, of_window)
     note_robots(view, name, binned.counted)
     return binned.answer()
+
+
+def _require_field(view: View, topic: str, field: str) -> None:
+    """Checks that messages of a topic have a field, by the newest one.
+
+    Raises:
+        InvalidArgumentsError: it has none.
+    """
+    newest = view.stream.last(topic)
+    message = None if newest is None else view.bags.decode(newest)
+    if newest is not None and message is not None:
+        view.extractor.shown(message, newest.type, (field,))
 
 
 def _cells_of_fields(

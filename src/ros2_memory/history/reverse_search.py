@@ -339,6 +339,10 @@ class RowCondition:
         """Returns which parts may have a row that meets it, as known without reading a column."""
         return self._test.may_match(parts)
 
+    def unstated(self, rows: Rows) -> Mask:
+        """Returns which rows of a table say nothing of the field, as far as columns show it."""
+        return self._test.unstated(rows.table)
+
     def truth(self, rows: Rows) -> TruthValues:
         """Returns which rows of a table meet the condition.
 
@@ -616,7 +620,7 @@ class ReverseSearch:
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
 
     def matches(self, stored: StoredMessage) -> bool | None:
-        """Whether a message meets the condition; None where it cannot be decoded."""
+        """Whether a message meets the condition; None where it does not say, or is not decoded."""
         failures: list[UndecodableError] = []
         with self._view.call.stages.timed("extract"):
             message = self._view.bags.decode(stored, failures)
@@ -624,7 +628,7 @@ class ReverseSearch:
                 self._has_decoded = True
                 value = self._view.extractor.exact(message, stored.type)
                 own = self.condition.of_type(stored.type, self._view.extractor)
-                return own.matches(value)
+                return None if own.is_unstated(value) else own.matches(value)
         key = stored.topic, stored.type
         # The newest is reported, in whatever order messages are tested.
         if key not in self._failures or self._failures[key][1] < stored.time:

@@ -143,6 +143,7 @@ class MatchTester:
         source = self._source_numbers(topic)[rows.recording, rows.table.channel.type]
         sources = np.full(len(rows), source)
         met = surely.astype(np.uint8)
+        met[self._test.unstated(rows)[counting] & ~surely] = UNKNOWN
         undecided = np.flatnonzero(perhaps & ~surely)
         if undecided.size:
             # Messages that lie close together are read at once.

@@ -31,6 +31,9 @@ V = TypeVar("V")
 
 ABSENT: Final = object()
 """The result of a step or a path where there is no such field."""
+ELEMENT_NAMES: Final = ("names", "name", "joint_names")
+INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
+"""The place of an element in a path; a negative one counts from the end."""
 
 Segments: TypeAlias = tuple[str, ...]
 
@@ -116,6 +119,18 @@ def descend(
         else:
             return _each(node, segments[at:], step)
     return node
+
+
+def names_beside(value: object, dot_path: str) -> list[object]:
+    """Returns the names of an array's elements where a path has one instead of a number."""
+    head, _, name = dot_path.partition(".")
+    if not isinstance(value, dict) or not name or INDEX.fullmatch(name):
+        return []
+    array = value.get(head)
+    if not isinstance(array, list) or isinstance(next(iter(array), 0), dict):
+        return []
+    lists = (value.get(key) for key in ELEMENT_NAMES if key != head)
+    return next((names for names in lists if isinstance(names, list)), [])
 
 
 def _each(

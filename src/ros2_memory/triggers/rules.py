@@ -335,7 +335,7 @@ class SplitSearch:
     ) -> bool | None:
         """Returns whether a value meets a rule's condition; None where it has none.
 
-        None, too, where the value could not be decoded.
+        None, too, where the value could not be decoded, or does not say.
 
         Notes why messages cannot make the rule fire; whether any could, once for each topic.
         """
@@ -346,6 +346,8 @@ class SplitSearch:
             record.problem = f"not all could be searched: {value}"
             return None
         condition = rule.condition.of_type(channel.type, self.extractor)
+        if condition.is_unstated(value):
+            return None
         matches = condition.matches(value)
         topic = channel.topic
         if (rule.name, topic) not in self._tested:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 from itertools import count
 from typing import TYPE_CHECKING
@@ -34,6 +35,8 @@ SCENE: JsonValue = {
     ],
     "ids": [3, 7.5, True],
 }
+ESCAPED = json.dumps([{"label": "größer"}, 'say "hi"', "a\\b"])
+"""As most programs write it: what is not ASCII is escaped, too."""
 asked_scalars: st.SearchStrategy[Scalar] = st.one_of(
     st.booleans(),
     st.integers(-5, 5),
@@ -67,6 +70,8 @@ asked_coordinates = st.floats(-10, 10)
         *((word, None, {"data": False}, False) for word in ("true", "True", True)),
         (True, None, [1, 1.0], False),
         (1, None, [True], False),
+        *((word, None, ESCAPED, True) for word in ("größer", "GRÖSSER", 'say "hi"', "a\\b")),
+        ("größer", None, f"x{ESCAPED}", False),  # no JSON
     ],
     ids=count(),
 )
@@ -118,6 +123,8 @@ def test_what_a_value_contains_is_in_all_that_it_is_in(
         (" 7 ", 7, True),
         *((text, {"data": text}, True) for text in ("true", "3", "9" * 5000)),
         *((text, leaf, False) for text, leaf in (("yes", True), ("inf", math.inf))),
+        ("Größer", ESCAPED, True),
+        ("groß", ESCAPED, False),
     ],
     ids=count(),
 )

@@ -138,6 +138,7 @@ _WORDS: Final = (
     *("rgb8", "8UC4", "yuv422", "map", "[]", "{}"),
     '[{"label": "cup", "score": 0.2}, {"label": "fork", "score": 0.9}]',
     '{"detections": [{"class": "cup", "confidence": 0.5}], "text": "fork"}',
+    '{"label": "gr\\u00f6\\u00dfer", "text": "say \\"hi\\""}',
     '{"label": "cup", "score": 0.3, "point": {"x": 1, "y": 2, "z": 0}}',
 )
 _REALS: Final = (0.0, -0.0, 1.0, -1.0, 0.5, 0.3, 0.1, 0.7071067811865476, 2.5, 1e9, 1e-300, 1e200)
