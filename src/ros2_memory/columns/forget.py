@@ -88,23 +88,19 @@ def _delete_bags_and_unused(
         raise ValueError("it is of another version")
     for pragma in PRAGMAS:
         base.execute(f"PRAGMA {pragma}")
-    base.execute("BEGIN IMMEDIATE")
-    try:
-        stored = base.execute("SELECT path, first_ns, last_ns FROM bag").fetchall()
-        gone = [
-            path
-            for path, first, last in stored
-            if any(time.overlaps(first, last) for time in times) or not (bag_dir / path).exists()
-        ]
-        delete_bags(base, [*bags, *gone])
-        # Without those beside them another part of the same ten minutes may lack a bag.
-        while beside := _beside_deleted(base):
-            delete_bags(base, beside)
-        _delete_unused(base)
-        base.execute("COMMIT")
-    except BaseException:
-        base.execute("ROLLBACK")
-        raise
+    base.execute("BEGIN IMMEDIATE")  # closing the connection rolls back
+    stored = base.execute("SELECT path, first_ns, last_ns FROM bag").fetchall()
+    gone = [
+        path
+        for path, first, last in stored
+        if any(time.overlaps(first, last) for time in times) or not (bag_dir / path).exists()
+    ]
+    delete_bags(base, [*bags, *gone])
+    # Without those beside them another part of the same ten minutes may lack a bag.
+    while beside := _beside_deleted(base):
+        delete_bags(base, beside)
+    _delete_unused(base)
+    base.execute("COMMIT")
 
 
 def _beside_deleted(base: sqlite3.Connection) -> list[str]:

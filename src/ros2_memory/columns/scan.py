@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
@@ -136,7 +136,7 @@ class Scan:
     check: Callable[[Ns], None] = lambda _: None
 
     def __post_init__(self) -> None:
-        self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
+        self._decoded: dict[str, list[BagUnit]] = {}
         # Rows that do not count, by the keys of their units: found when they are asked for.
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
@@ -392,7 +392,7 @@ class Scan:
         return self._units_of_bag(source.bag)
 
     def _units_of_bag(self, bag: BagFile) -> list[BagUnit]:
-        """Returns the tables of a bag, which is decoded unless it was one of the last."""
+        """Returns the tables of a bag, which is decoded unless it is one of those at hand."""
         if bag.file not in self._decoded:
             hashed = bool(self.shared) or self.repeats_latched
             tables = self.decode(bag, self.topic, hashed)
@@ -402,11 +402,18 @@ class Scan:
             while len(self._decoded) > _MOST_DECODED or (
                 len(self._decoded) > 1 and self._decoded_bytes() > _MOST_BYTES
             ):
-                self._decoded.popitem(last=False)
+                # What lies farthest away is done with; a long bag serves all beside it.
+                others = [*self._decoded][:-1]
+                del self._decoded[max(others, key=lambda file: self._apart(file, bag))]
         return self._decoded[bag.file]
 
+    def _apart(self, file: str, bag: BagFile) -> Ns:
+        """Returns how far the rows of a decoded bag lie from another bag (ns); less, the longer."""
+        units = self._decoded[file]
+        return min((max(u.first - bag.end, bag.start - u.last) for u in units), default=MAX_NS)
+
     def _decoded_bytes(self) -> int:
-        return sum(unit.table.memory_bytes for units in self._decoded.values() for unit in units)
+        return sum(unit.memory_bytes for units in self._decoded.values() for unit in units)
 
     def _counting(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None: all do."""

@@ -111,6 +111,11 @@ class BagUnit(Unit):
         key, span = (bag.file, nth), (int(times[0]), int(times[-1]))
         super().__init__(key, table, *span, columns.get, zeros[:1], lambda _: bag)
 
+    @cached_property
+    def memory_bytes(self) -> int:
+        """As that of its table, counted once: that goes through all of its texts."""
+        return self.table.memory_bytes
+
 
 @dataclass(eq=False)
 class Rows:

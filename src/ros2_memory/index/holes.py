@@ -3,7 +3,8 @@
 From one bag to the next, or within a bag, as its summary states. What explains a pause is how often
 topics have a message that usually have one: the second most frequent of them, since one may fall
 silent by itself. Between bags a longer pause is a gap however rare topics are: from one split of a
-recording to the next, in which the recorder ran on, twice the longer one, or 20 s.
+recording to the next, in which the recorder ran on, twice the longer one, or 20 s; 20 s where they
+have rare topics alone.
 """
 
 from __future__ import annotations
@@ -103,6 +104,8 @@ class Rhythm:
         if len(pause.bags) == 1:
             return False
         longer = max(bag.end - bag.start for bag in pause.bags)
+        if not any(self._periods.keys() & bag.summary.schema.positions for bag in pause.bags):
+            longer = _LONGEST_LEAST_NS  # how long a split was, rare topics do not show
         least = min(_GAP_SPLITS * longer, _LONGEST_LEAST_NS) if pause.ran_on else 0
         return pause.length > max(least, self.shortest_gap)
 

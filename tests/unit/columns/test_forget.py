@@ -18,6 +18,7 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import battery, odom, text, write_mcap
 from tests.support.column_worlds import World, check_all, store_file
+from tests.support.fakes import files_limited_to
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -163,6 +164,17 @@ def test_a_store_of_another_version_is_named(tmp_path: Path) -> None:
         forget(file, tmp_path, [])
     forget(file.with_name("none.sqlite"), tmp_path, [])
     assert not file.with_name("none.sqlite").exists()
+
+
+def test_a_full_disk_is_named_and_nothing_is_lost(tmp_path: Path) -> None:
+    for number in range(8):
+        write_bag(tmp_path, number)
+    world = World.of(tmp_path)
+    world.fill()
+    world.store.close()
+    with files_limited_to(100_000), pytest.raises(BagError, match="disk I/O error"):
+        forget(store_file(tmp_path), tmp_path, ["rec/rec_3.mcap"])
+    assert len(World.of(tmp_path).stored()) == 8
 
 
 def test_servers_notice_what_was_forgotten(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import groupby
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
@@ -119,14 +120,19 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
     kind, random, bent = f"acme_msgs/msg/Arm{count}", Random(count), list[float]()
     typestore().register(get_types_from_msg(f"string[] names\nfloat64[{count}] positions\n", kind))
     joints, messages = ["elbow", "gripper.left", *map("joint_{}".format, range(count - 1))], []
+    elbows: list[float | None] = []
     for nth in range(40):
         # Where one is missing, another node publishes it.
         names = random.sample(joints[1:] if nth % 4 == 3 or nth == 39 else joints, count)
         angles = {name: random.random() for name in names}
         messages.append(made(nth, names, [*angles.values()]))
+        elbows.append(angles.get("elbow"))
         if angles.get("elbow", 0.0) > 0.5:
             bent.append(T0 / NS_PER_S + nth)
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    stated = [angle for angle in elbows if angle is not None]
+    states = [is_bent for is_bent, _ in groupby(angle > 0.5 for angle in stated)]
+    window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40}
     elbow = {"condition_type": "above", "value": 0.5, "field": "positions.elbow"}
     left = {**elbow, "field": "positions.gripper.left", "value": 2.0}
     for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
@@ -134,6 +140,14 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
         assert ask(name="find_last_match", **elbow)["timestamp"] == bent[-1]
         runs = ask(name="find_matches", **elbow, limit=100)["sightings"]
         assert sum(run["count"] for run in runs) == len(bent)
+        assert len(runs) == states.count(True)
+        of_elbow = partial(ask, name="get_topic_in_range", fields=["positions.elbow"], **window)
+        shown = [angle for _, angle in of_elbow(max_samples=40)["rows"]]
+        assert shown == pytest.approx(elbows, abs=1e-6)
+        of_hour = of_elbow(by="hour")
+        ends = dict(zip(of_hour["columns"][1:], of_hour["all"], strict=True))
+        assert ends["positions.elbow.min"] == pytest.approx(min(stated), abs=1e-6)
+        assert ends["positions.elbow.max"] == pytest.approx(max(stated), abs=1e-6)
         assert ask(name="find_last_match", **left) is None
         refused = ask(name="find_last_match", **{**elbow, "field": "positions.knee"})
         assert refused["detail"].startswith("/joints: the values have no field 'positions.knee'")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
@@ -179,3 +179,11 @@ def test_the_least_and_greatest_of_whole_numbers_are_exact(
     row = table(asked(memory, tmp_path, "get_topic_in_range", **given, by="hour"))["all"]
     assert (row["value.min"], row["value.max"]) == (min(numbers), max(numbers))
     assert row["value.max_at_unix"] == extremes["max_at"]
+
+
+def test_a_field_that_there_is_not_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, [battery(BEGIN, 0.9)], split=60)
+    with pytest.raises(InvalidArgumentsError, match="has no field 'percentge'"):
+        count_range(
+            memory_of(tmp_path), Call(), "/battery_state", span(), "hour", fields=["percentge"]
+        )

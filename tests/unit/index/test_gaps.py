@@ -130,6 +130,11 @@ def test_what_is_published_seldom_leaves_no_gap() -> None:
     assert gaps([*seldom, bag("c/c_0", beats(5, 150, 200))]) == [(130.0, 150.0)]
 
 
+def test_rare_topics_alone_leave_no_gap_at_each_split() -> None:
+    assert gaps([bag(f"a/a_{n}", [12 * n]) for n in range(9)]) == []
+    assert gaps([bag("a/a_0", [0]), bag("a/a_1", [12]), bag("a/a_2", [40])]) == [(12.0, 40.0)]
+
+
 @given(
     st.lists(
         st.tuples(st.integers(0, 400), st.integers(2, 60), st.booleans()), min_size=1, max_size=12
