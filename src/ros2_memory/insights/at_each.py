@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import replace
-from datetime import date, datetime, time, timedelta
+from datetime import datetime, time, timedelta
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import (
@@ -18,7 +18,14 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import START_SLACK_NS, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import (
+    NS_PER_S,
+    START_SLACK_NS,
+    Ns,
+    Span,
+    ns_from_unix,
+    unix_from_ns,
+)
 from ros2_memory.counts.bins import local_offset
 from ros2_memory.history.coverage import recorded_reach
 from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_window
@@ -135,19 +142,35 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
     # The hours of the day before may go on after midnight.
     days = [first + timedelta(days=nth) for nth in range(-1, (last - first).days + 1)]
     hours = (
-        window.intersect(TimeWindow(_local_time_ns(day, begins), _local_time_ns(day + over, ends)))
+        window.intersect(TimeWindow(*bounds))
         for day in days
+        for bounds in _times_between(
+            datetime.combine(day, begins), datetime.combine(day + over, ends)
+        )
     )
     return [part for part in hours if not part.empty]
 
 
-def _local_time_ns(day: date, at: time) -> Ns:
-    """Returns when it is a local time on a day; for one that clocks skip, when they skip it."""
-    local = datetime.combine(day, at)
+def _times_between(begin: datetime, end: datetime) -> list[Span]:
+    """Returns when it is between two local times: twice where clocks put back repeat one of them."""
+    (first, again), (stop, stop_again) = _moments(begin), _moments(end)
+    if (first, stop) == (again, stop_again):
+        return [(first, stop)]
+    back = _change_between(first, again) if first < again else _change_between(stop, stop_again)
+    return [(first, min(stop, back)), (max(again, back), stop_again)]
+
+
+def _moments(local: datetime) -> Span:
+    """Returns when it is a local time first and last; for one that clocks skip, when they do."""
+    first, last = (ns_from_unix(local.replace(fold=fold).timestamp()) for fold in (0, 1))
     # By the time before clocks are put forward, what is skipped is later than by that after.
-    after_s, at_s = (local.replace(fold=fold).timestamp() for fold in (1, 0))
-    if at_s <= after_s:
-        return ns_from_unix(at_s)
-    skipped = range(int(after_s), int(at_s))
-    passed_s = bisect_left(skipped, local_offset(skipped.stop), key=local_offset)
-    return ns_from_unix(skipped.start + passed_s)
+    return (first, last) if first <= last else (_change_between(last, first),) * 2
+
+
+def _change_between(before: Ns, after: Ns) -> Ns:
+    """Returns when clocks are put forward or back between two moments, to a second."""
+    seconds = range(before // NS_PER_S, after // NS_PER_S)
+    passed_s = bisect_left(
+        seconds, True, key=lambda at: local_offset(at) != local_offset(seconds.start)
+    )
+    return (seconds.start + passed_s) * NS_PER_S

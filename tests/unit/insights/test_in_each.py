@@ -175,6 +175,22 @@ def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("days", "hours", "expected"),
     [
+        ((25, 26), "02:15-02:45", ["02:15-02:45", "02:15-02:45"]),
+        ((25, 26), "01:00-02:30", ["01:00-02:30", "02:00-02:30"]),
+        ((25, 26), "02:15-04:00", ["02:15-02:00", "02:15-04:00"]),
+        ((25, 26), "01:00-04:00", ["01:00-04:00"]),
+        ((25, 26), "03:00-02:30", ["00:00-02:30", "02:00-02:30", "03:00-00:00"]),
+    ],
+)
+def test_hours_that_clocks_repeat_count_twice(
+    days: tuple[int, int], hours: str, expected: list[str]
+) -> None:
+    assert local_hours(10, days, hours) == expected
+
+
+@pytest.mark.parametrize(
+    ("days", "hours", "expected"),
+    [
         ((28, 31), "22:00-04:00", ["00:00-04:00", "22:00-04:00", "22:00-04:00", "22:00-00:00"]),
         ((29, 30), "02:30-03:30", ["03:00-03:30"]),
         ((29, 30), "01:30-02:15", ["01:30-03:00"]),
@@ -187,10 +203,15 @@ def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None
 def test_hours_are_local_and_those_that_clocks_skip_are_left_out(
     days: tuple[int, int], hours: str, expected: list[str]
 ) -> None:
+    assert local_hours(3, days, hours) == expected
+
+
+def local_hours(month: int, days: tuple[int, int], hours: str) -> list[str]:
+    """What lies between two times in Berlin, from the begin of one day to that of another one."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("TZ", "Europe/Berlin")
         time.tzset()
-        begin, end = (int(datetime(2026, 3, at).timestamp()) for at in days)  # noqa: DTZ001
+        begin, end = (int(datetime(2026, month, at).timestamp()) for at in days)  # noqa: DTZ001
         found = hours_of_days(TimeWindow(begin * S, end * S), *_as_hours(hours))  # type: ignore[misc]
         shown = [
             "-".join(
@@ -199,4 +220,4 @@ def test_hours_are_local_and_those_that_clocks_skip_are_left_out(
             for each in found
         ]
     time.tzset()
-    assert shown == expected
+    return shown
