@@ -8,6 +8,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from dataclasses import replace
 from datetime import datetime, time, timedelta
+from itertools import chain, starmap
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import (
@@ -141,18 +142,14 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
     over = timedelta(days=ends <= begins)
     # The hours of the day before may go on after midnight.
     days = [first + timedelta(days=nth) for nth in range(-1, (last - first).days + 1)]
-    hours = (
-        window.intersect(TimeWindow(*bounds))
-        for day in days
-        for bounds in _times_between(
-            datetime.combine(day, begins), datetime.combine(day + over, ends)
-        )
-    )
+    bounds = ((datetime.combine(day, begins), datetime.combine(day + over, ends)) for day in days)
+    times = chain.from_iterable(starmap(_times_between, bounds))
+    hours = (window.intersect(TimeWindow(*span)) for span in times)
     return [part for part in hours if not part.empty]
 
 
 def _times_between(begin: datetime, end: datetime) -> list[Span]:
-    """Returns when it is between two local times: twice where clocks put back repeat one of them."""
+    """Returns when it is between two local times: twice where clocks that go back repeat one."""
     (first, again), (stop, stop_again) = _moments(begin), _moments(end)
     if (first, stop) == (again, stop_again):
         return [(first, stop)]
@@ -170,7 +167,6 @@ def _moments(local: datetime) -> Span:
 def _change_between(before: Ns, after: Ns) -> Ns:
     """Returns when clocks are put forward or back between two moments, to a second."""
     seconds = range(before // NS_PER_S, after // NS_PER_S)
-    passed_s = bisect_left(
-        seconds, True, key=lambda at: local_offset(at) != local_offset(seconds.start)
-    )
+    offset = local_offset(seconds.start)
+    passed_s = bisect_left(seconds, True, key=lambda at: local_offset(at) != offset)
     return (seconds.start + passed_s) * NS_PER_S
