@@ -1,13 +1,9 @@
 """What the program replied before its store was rebuilt, so that later versions are held to it.
 
-`worlds` makes folders of bags, the same ones each time; `calls` draws what is asked of each;
-`asking` answers a call, through the dispatcher, the page's routes or the command line; `fixture`
-keeps calls and replies in tests/data/replies; `comparison` tells which differences matter.
+`worlds` makes folders of bags, the same ones each time; `asking` answers a call, through the
+dispatcher, the page's routes or the command line; `fixture` keeps calls, which were drawn from what
+the topics of each world are, and replies in tests/data/replies; `comparison` tells which
+differences matter. Where replies are right, record them and commit the result:
 
-    python -m tests.oracle.replies record [--world NAME] [--long]
-    python -m tests.oracle.replies compare [--world NAME] [--long] [--store]
-
-`record` is run where the replies are right, and its result committed; `compare` prints each
-difference and exits with 1 where there is any. Where today's reply is known to be wrong,
-`comparison.KNOWN_WRONG` says so, and brute force (`tests.oracle.truth`) is the judge instead.
+    UPDATE_REPLIES=1 EPISODIC_LONG=1 uv run pytest -n0 --no-cov tests/oracle/test_replies.py -k bags
 """

@@ -40,7 +40,6 @@ from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
 from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.triggers.rules import SplitSearch, chains_to_search
-from tests.support.composed import composed_once
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -110,7 +109,6 @@ def still_time(cache: Path) -> Iterator[None]:
         # Parts of an answer have limits of their own, after which it would be partial.
         patch.object(Deadline, "expired", lambda _: False),
         patch.object(Deadline, "left_s", lambda _: math.inf),
-        patch("ros2_memory.config.compose", composed_once),
     ):
         for name in others:
             del os.environ[name]
@@ -177,10 +175,6 @@ class Asked:
             "rules": self._rules,
         }
         return self._anywhere(ways[call.way](call))
-
-    def tool(self, name: str, **given: Any) -> Any:
-        """The reply to a tool call."""
-        return self.answer(Call("tool", name, given))
 
     def _loaded(self, *more: str) -> Settings:
         looking = ["recorder=none", "storage=rosbag2", "data.now=latest"]

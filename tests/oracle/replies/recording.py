@@ -1,22 +1,20 @@
-"""Recording a world's replies, asking it again, and choosing a sample of its calls."""
+"""Asking a world again what was recorded of it, and choosing a sample of its calls."""
 
 from __future__ import annotations
 
 import tempfile
 from collections import defaultdict
-from contextlib import contextmanager
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from tests.oracle.replies.asking import Asked, Call, still_time
-from tests.oracle.replies.calls import Calls, Facts
+from tests.oracle.replies.asking import Asked, still_time
 from tests.oracle.replies.comparison import Comparison
 from tests.oracle.replies.fixture import Record, Replied
 from tests.oracle.replies.worlds import WORLDS, ReplyWorld
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Mapping
 
 
 _SAMPLE_SEED: Final = "sample 2"
@@ -24,48 +22,31 @@ _SLOW: Final = frozenset({"plot plot", "parquet export", "cli info", "cli forget
 """Ways that take long: of each, one call in a kind of worlds is enough for a sample."""
 
 
-@contextmanager
-def made(world: ReplyWorld) -> Iterator[Path]:
-    """A folder with the bags of a world in `bags`, in which time stands still."""
+def renew(world: ReplyWorld, record: Record) -> None:
+    """Writes what is replied today; with a store, ways that take long are not asked."""
+    comparison = Comparison()
+    for row, reply in zip(record.replies, answers(world, record, record.replies), strict=True):
+        row.reply, row.stored = reply, None
+    quick = [row for row in record.replies if row.call.what not in _SLOW]
+    for row, reply in zip(quick, answers(world, record, quick, stored=True), strict=True):
+        if not comparison.compare(world.name, row.call, row.reply, reply):
+            row.stored = reply
+    record.write()
+
+
+def answers(
+    world: ReplyWorld, record: Record, rows: Collection[Replied], *, stored: bool = False
+) -> list[Any]:
+    """The replies of today, in a folder of the world's bags in which time stands still."""
     with tempfile.TemporaryDirectory(prefix="replies-") as place:
         folder = Path(place).resolve()
         with still_time(folder / "cache"):
             world.make(folder / "bags")
-            yield folder
-
-
-def record(world: ReplyWorld, comparison: Comparison) -> Record:
-    """Draws calls, and returns their replies; differences with a store are collected.
-
-    With a store, ways that take long are not asked: they show what tools reply.
-    """
-    with made(world) as folder:
-        looked = Asked(folder, world.settings, {}, stored=False)
-        facts = Facts(looked, Random(f"places {world.name}"))
-        looked.stop()
-        drawn = Calls(facts, Random(f"calls {world.name}"), shows_messages=world.shows_messages)
-        found = Record(world.name, world.settings, facts.places)
-        calls = [*drawn.drawn(world.calls), *(Call("tool", *given) for given in world.also)]
-        found.replies = [Replied(*answered) for answered in asked_all(folder, found, calls)]
-        quick = [replied for replied in found.replies if replied.call.what not in _SLOW]
-        calls = [replied.call for replied in quick]
-        again = asked_all(folder, found, calls, stored=True)
-        for replied, (call, reply) in zip(quick, again, strict=True):
-            if not comparison.compare(world.name, call, replied.reply, reply):
-                replied.stored = reply
-    return found
-
-
-def asked_all(
-    folder: Path, record: Record, calls: Collection[Call], *, stored: bool = False
-) -> Iterator[tuple[Call, object]]:
-    """Yields the reply to each call."""
-    asked = Asked(folder, record.settings, record.places, stored=stored)
-    try:
-        for call in calls:
-            yield call, asked.answer(call)
-    finally:
-        asked.stop()
+            asked = Asked(folder, record.settings, record.places, stored=stored)
+            try:
+                return [asked.answer(row.call) for row in rows]
+            finally:
+                asked.stop()
 
 
 def compare(
@@ -75,16 +56,13 @@ def compare(
     *,
     stored: bool = False,
     chosen: Collection[int] | None = None,
-) -> int:
-    """Asks what was recorded again; `chosen` are numbers of calls. Returns how many were asked."""
+) -> None:
+    """Asks again what was recorded; `chosen` are numbers of calls."""
     replies = record.replies
-    asked = replies if chosen is None else [replies[number] for number in sorted(chosen)]
-    with made(world) as folder:
-        again = asked_all(folder, record, [row.call for row in asked], stored=stored)
-        for row, (call, reply) in zip(asked, again, strict=True):
-            noted = stored and row.stored is not None
-            comparison.compare(world.name, call, row.stored if noted else row.reply, reply)
-    return len(asked)
+    rows = replies if chosen is None else [replies[number] for number in sorted(chosen)]
+    for row, reply in zip(rows, answers(world, record, rows, stored=stored), strict=True):
+        noted = stored and row.stored is not None
+        comparison.compare(world.name, row.call, row.stored if noted else row.reply, reply)
 
 
 def sample(records: Mapping[str, Record], for_each_world: int) -> dict[str, set[int]]:

@@ -1,4 +1,4 @@
-"""Hours of a noisy robot in splits of 10 s: a drifting map, detections everywhere, many changes."""
+"""24 minutes of a noisy robot in splits of 10 s: a drifting map, detections, many changes."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ BEGIN: Final = 1_784_591_400 * S
 """2026-07-20, 23:50 UTC: the day ends after ten minutes."""
 SPLIT_S: Final = 10
 SPLITS_OF_A_RECORDING: Final = 60
+LENGTH_S: Final = 1440
+POSES_HZ: Final = 4
 SPEED_MPS: Final = 0.4
 _SPOTS: Final = ((0.0, 0.0), (5.0, 0.5), (5.5, 4.0), (0.5, 4.5), (8.0, 2.0))
 _THINGS: Final = (
@@ -46,17 +48,6 @@ _TEXTS: Final = ("Ünder way", "docked", "level 20 reached", "no path to the kit
 _EXECUTING, _SUCCEEDED, _ABORTED = 2, 4, 6
 
 
-class Rates(NamedTuple):
-    """How long the robot is recorded, and how many poses there are in a second."""
-
-    hours: float
-    poses_hz: int
-
-
-SHORT: Final = Rates(0.4, 4)
-FULL: Final = Rates(6.0, 20)
-
-
 class _Second(NamedTuple):
     """Where the robot was (in the map) in one second, and where it went."""
 
@@ -66,10 +57,10 @@ class _Second(NamedTuple):
     speed: float
 
 
-def write_robot_day(folder: Path, seed: int, rates: Rates) -> None:
+def write_robot_day(seed: int, folder: Path) -> None:
     """Writes recordings of ten minutes, each pause between two of them 0.05, 2 or 8 s long."""
     draw = Random(f"robot day {seed}")
-    seconds = [*_way(draw, round(rates.hours * 3600))]
+    seconds = [*_way(draw, LENGTH_S)]
     count = math.ceil(len(seconds) / (SPLITS_OF_A_RECORDING * SPLIT_S))
     drift = [0.4, -0.2, 0.1]
     late_ns = 0
@@ -82,7 +73,7 @@ def write_robot_day(folder: Path, seed: int, rates: Rates) -> None:
                 break
             begin = BEGIN + first * S + late_ns
             messages = sorted(
-                _split(draw, begin, first, part, rates, drift), key=lambda message: message.log_time
+                _split(draw, begin, first, part, drift), key=lambda message: message.log_time
             )
             write_mcap(folder / name / f"{name}_{split}.mcap", messages)
         late_ns += draw.choice((50 * MS, 2 * S, 8 * S))
@@ -111,7 +102,6 @@ def _split(
     begin: int,
     first: int,
     part: list[_Second],
-    rates: Rates,
     drift: list[float],
 ) -> Iterator[Msg]:
     """Yields the messages of a split; `drift` (x, y, yaw of odom in the map) goes on from it."""
@@ -126,19 +116,19 @@ def _split(
             drift[0] += draw.uniform(-0.8, 0.8)
         correction = transform(at, "map", "odom", (drift[0], drift[1], 0.0), drift[2])
         yield tf(at, correction, log_time=at + 3 * MS)
-        yield from _poses(draw, at, second, rates.poses_hz, drift)
+        yield from _poses(draw, at, second, drift)
         yield from _seen(draw, at + 40 * MS, second)
         yield from _changes(draw, at, number)
 
 
-def _poses(draw: Random, at: int, second: _Second, rate: int, drift: list[float]) -> Iterator[Msg]:
+def _poses(draw: Random, at: int, second: _Second, drift: list[float]) -> Iterator[Msg]:
     cos, sin = math.cos(drift[2]), math.sin(drift[2])
-    for step in range(rate):
-        gone = second.speed * step / rate
+    for step in range(POSES_HZ):
+        gone = second.speed * step / POSES_HZ
         x = second.x + gone * math.cos(second.yaw) - drift[0] + draw.gauss(0, 0.01)
         y = second.y + gone * math.sin(second.yaw) - drift[1] + draw.gauss(0, 0.01)
         own_x, own_y = x * cos + y * sin, y * cos - x * sin
-        yaw, now = second.yaw - drift[2], at + step * S // rate
+        yaw, now = second.yaw - drift[2], at + step * S // POSES_HZ
         yield odom(now, own_x, own_y, yaw, vx=second.speed, log_time=now + MS)
         base = transform(now, "odom", "base_link", (own_x, own_y, 0.0), yaw)
         yield tf(now, base, log_time=now + 2 * MS)

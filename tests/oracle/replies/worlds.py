@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from tests.home import recording as home
 from tests.home.days import Scale
 from tests.oracle import worlds as odd
-from tests.oracle.replies.robot_day import FULL, SHORT, write_robot_day
+from tests.oracle.replies.robot_day import write_robot_day
 from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.moving_map import write_moving_map
@@ -48,24 +48,18 @@ class ReplyWorld:
         name: of the file of its replies, too.
         kind: worlds of one kind are alike.
         write: writes the bags into an empty folder.
-        calls: about how many calls are drawn.
         settings: besides those of every world.
         long: whether it is asked in long runs alone.
         needs: what it is a copy of, which may be absent; None where all is written.
-        shows_messages: whether replies may repeat whole messages.
-        also: arguments of `find_matches` and `visits` that it is made for, and that are not drawn.
         is_slow: whether calls take so long that a short run asks few.
     """
 
     name: str
     kind: str
     write: Callable[[Path], object]
-    calls: int
     settings: Sequence[str] = ()
     long: bool = False
     needs: Path | None = None
-    shows_messages: bool = True
-    also: Sequence[tuple[str, Mapping[str, Any]]] = ()
     is_slow: bool = False
 
     @property
@@ -110,9 +104,9 @@ def _copied(sources: Sequence[Path], folder: Path) -> None:
         shutil.copytree(source, folder / source.name, copy_function=shutil.copyfile)
 
 
-def _shared(kind: str, name: str, paths: Sequence[str], calls: int, **given: Any) -> ReplyWorld:
+def _shared(kind: str, name: str, paths: Sequence[str]) -> ReplyWorld:
     sources = [BAGS / path for path in paths]
-    return ReplyWorld(name, kind, partial(_copied, sources), calls, needs=sources[0], **given)
+    return ReplyWorld(name, kind, partial(_copied, sources), needs=sources[0])
 
 
 _SESSIONS: Final = (
@@ -135,51 +129,50 @@ _EXTRA: Final = (
     "gc",
     "full_truncated",
 )
-_REAL: Final[Mapping[str, int]] = {
-    "ait_time0_images_db3": 30,
-    "bagel_filezstd_db3": 30,
-    "cougars_auv_mcap": 150,
-    "evo_tf_example_db3": 90,
-    "lichtblick_json_rosout_mcap": 60,
-    "mcap_conformance_2022": 40,
-    "mobrob_odom_mcap": 100,
-    "novatel_customtypes_nometa_db3": 60,
-    "philips_empty_db3": 25,
-    "plotjuggler_pose_db3": 90,
-    "rerun_json_protobuf_mcap": 40,
-    "rerun_sensors_mcap": 80,
-    "rosbag2_3split_nometa_mcap": 40,
-    "rosbag2_msgzstd_nometa_db3": 40,
-    "rosbag2_service_events_mcap": 30,
-    "rosbag2_time0_mcap": 40,
-    "rosbag2_v1_2018_db3": 25,
-    "rosbag2_wbag_5split_mcap": 50,
-    "rosbags_rs_94types_db3": 90,
-    "rosbags_rs_94types_mcap": 90,
-    "tiryoh_small_and_truncated": 50,
-}
+_REAL: Final = (
+    "ait_time0_images_db3",
+    "bagel_filezstd_db3",
+    "cougars_auv_mcap",
+    "evo_tf_example_db3",
+    "lichtblick_json_rosout_mcap",
+    "mcap_conformance_2022",
+    "mobrob_odom_mcap",
+    "novatel_customtypes_nometa_db3",
+    "philips_empty_db3",
+    "plotjuggler_pose_db3",
+    "rerun_json_protobuf_mcap",
+    "rerun_sensors_mcap",
+    "rosbag2_3split_nometa_mcap",
+    "rosbag2_msgzstd_nometa_db3",
+    "rosbag2_service_events_mcap",
+    "rosbag2_time0_mcap",
+    "rosbag2_v1_2018_db3",
+    "rosbag2_wbag_5split_mcap",
+    "rosbags_rs_94types_db3",
+    "rosbags_rs_94types_mcap",
+    "tiryoh_small_and_truncated",
+)
 _NOT_REPEATED: Final = frozenset({"evo_tf_example_db3"})
 """Their licence is no permissive one: what is kept of them is what is calculated, no message."""
 
 
 def _bags_of_others() -> Iterator[ReplyWorld]:
     committed = COMMITTED / "session_zstd"
-    yield ReplyWorld("session_zstd", RECORDED, partial(_copied, [committed]), 150)
+    yield ReplyWorld("session_zstd", RECORDED, partial(_copied, [committed]))
     for name in _SESSIONS:
-        yield _shared(RECORDED, name, [f"recorded/{name}"], 120)
+        yield _shared(RECORDED, name, [f"recorded/{name}"])
     for name in _EXTRA:
-        yield _shared(RECORDED, f"extra_{name}", [f"recorded/extra/{name}"], 40)
+        yield _shared(RECORDED, f"extra_{name}", [f"recorded/extra/{name}"])
     sessions = [f"recorded/{name}" for name in _SESSIONS]
-    yield _shared(RECORDED, "sessions_together", sessions, 150)
+    yield _shared(RECORDED, "sessions_together", sessions)
     extra = [f"recorded/extra/{name}" for name in _EXTRA]
-    yield _shared(RECORDED, "extra_together", extra, 120)
-    for name, calls in _REAL.items():
-        repeats = name not in _NOT_REPEATED
-        yield _shared(REAL, name, [f"real/{name}"], calls, shows_messages=repeats)
+    yield _shared(RECORDED, "extra_together", extra)
+    for name in _REAL:
+        yield _shared(REAL, name, [f"real/{name}"])
     robots = ("cougars_auv_mcap", "mobrob_odom_mcap", "plotjuggler_pose_db3")
-    yield _shared(REAL, "real_robots_together", [f"real/{name}" for name in robots], 120)
+    yield _shared(REAL, "real_robots_together", [f"real/{name}" for name in robots])
     others = [f"real/{name}" for name in _REAL if name not in {*robots, *_NOT_REPEATED}]
-    yield _shared(REAL, "real_others_together", others, 100)
+    yield _shared(REAL, "real_others_together", others)
 
 
 # -- odd worlds --------------------------------------------------------------------------------
@@ -273,43 +266,29 @@ def _damaged(folder: Path) -> None:
     files[9].write_bytes(files[9].read_bytes()[:-40])
 
 
-_PRESSED: Final = {"topic": "/bumper", "condition_type": "equals", "value": True, "limit": 50}
-_MOVES: Final = {"topic": "/odom", "field": "linear_velocity.x", "condition_type": "above"}
-_ON_THE_WAY: Final = {"x": 9.0, "y": 0.0, "radius_m": 4.0}
-_UNKNOWN: Final = (
-    ("find_matches", {**_PRESSED, "while": {**_MOVES, "value": 0.1}}),
-    ("find_matches", {**_PRESSED, "where": _ON_THE_WAY}),
-    ("visits", {"where": _ON_THE_WAY}),
-)
-"""Where the robot was, and whether it moved, is not known all the time."""
-
-
 def _odd_world(name: str, seed: int, folder: Path) -> None:
     made = odd.WORLDS[name](folder / name, Random(seed))
     assert made.folder == folder / name
 
 
 def _own_worlds() -> Iterator[ReplyWorld]:
-    for seed, days, calls in ((7, 2, 100), (11, 1, 140)):
+    for seed, days in ((7, 2), (11, 1)):
         write = partial(_write_home, Scale(seed, days, 60.0))
-        yield ReplyWorld(f"home_{seed}", HOME, write, calls, is_slow=days > 1)
-    whole_days = partial(_write_home, Scale(13, 2, 1.0))
-    yield ReplyWorld("home_13_whole_days", HOME, whole_days, 80, long=True)
+        yield ReplyWorld(f"home_{seed}", HOME, write, is_slow=days > 1)
     for seed in (1, 2):
-        write = partial(_write_day, seed, SHORT)
-        yield ReplyWorld(f"robot_day_{seed}", HOME, write, 150, long=seed > 1)
-    yield ReplyWorld("robot_day_3_six_hours", HOME, partial(_write_day, 3, FULL), 80, long=True)
+        write = partial(write_robot_day, seed)
+        yield ReplyWorld(f"robot_day_{seed}", HOME, write, long=seed > 1)
     pose_topics = {"two_robots": ("data.pose_topic=/boat/odom",)}
     for name in odd.WORLDS:
         for seed in (1, 2):
             settings = pose_topics.get(name, ())
             write = partial(_odd_world, name, seed)
-            yield ReplyWorld(f"{name}_{seed}", ODD, write, 70, settings)
+            yield ReplyWorld(f"{name}_{seed}", ODD, write, settings)
     for seed in range(1, 9):
         write = partial(_write_history, seed)
-        yield ReplyWorld(f"history_{seed}", ODD, write, 60, long=seed > 4)
-    yield ReplyWorld("noisy_robot", ODD, partial(write_noisy_robot, "replies"), 90)
-    yield ReplyWorld("moving_map", ODD, lambda folder: write_moving_map(folder, 3), 80)
+        yield ReplyWorld(f"history_{seed}", ODD, write, long=seed > 4)
+    yield ReplyWorld("noisy_robot", ODD, partial(write_noisy_robot, "replies"))
+    yield ReplyWorld("moving_map", ODD, lambda folder: write_moving_map(folder, 3))
     made: Mapping[str, Callable[[Path], None]] = {
         "wrong_clocks": _wrong_clocks,
         "stepped_clock": _stepped_clock,
@@ -319,17 +298,12 @@ def _own_worlds() -> Iterator[ReplyWorld]:
         "damaged": _damaged,
     }
     for name, write_it in made.items():
-        also = _UNKNOWN if name in {"silent_odometry", "two_at_once"} else ()
-        yield ReplyWorld(name, ODD, write_it, 80, also=also)
+        yield ReplyWorld(name, ODD, write_it)
 
 
 def _write_home(scale: Scale, folder: Path) -> None:
     folder.rmdir()
     home.write(scale, folder)
-
-
-def _write_day(seed: int, rates: Any, folder: Path) -> None:
-    write_robot_day(folder, seed, rates)
 
 
 def _write_history(seed: int, folder: Path) -> None:
