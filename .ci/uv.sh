@@ -9,15 +9,3 @@ if ! command -v uv >/dev/null; then
   build/uv/bin/python -m pip install --quiet uv
   PATH="$PWD/build/uv/bin:$PATH"
 fi
-
-# ros_wheels GROUP: ROS's wheels of this group (pyproject.toml) in build/GROUP, made anew where uv.lock
-# has changed.
-ros_wheels() {
-  local key
-  key=$(sha256sum <uv.lock)
-  if [[ $(cat "build/$1.key" 2>/dev/null) != "$key" ]]; then
-    rm -rf "build/$1"
-  fi
-  UV_PROJECT_ENVIRONMENT=build/$1 uv sync --locked --inexact --no-default-groups --group "$1" &&
-    echo "$key" >"build/$1.key"
-}

@@ -100,7 +100,6 @@ class Campaign:
 
     terms: Terms
     robot_late_s: float = 0.0
-    recorder_late_s: float = 0.0
     t0: int = 0
     faults: list[Fault] = field(default_factory=list)
     subscribed: dict[str, int] = field(default_factory=dict)
@@ -167,11 +166,8 @@ class Campaign:
         ]
 
 
-def run_campaign(terms: Terms, folder: Path, real: RealRecorder | None) -> Campaign:
-    """Records a robot, kills `terms.kills` times, and looks at what is left.
-
-    `real` is as for `ros_environment`.
-    """
+def run_campaign(terms: Terms, folder: Path, real: RealRecorder) -> Campaign:
+    """Records a robot, kills `terms.kills` times, and looks at what is left."""
     folder.mkdir()
     campaign, chance = Campaign(terms), random.Random(terms.seed)
     with ros_environment(folder, real=real) as env, machine(folder, env) as site:
@@ -202,7 +198,6 @@ def run_campaign(terms: Terms, folder: Path, real: RealRecorder | None) -> Campa
             recorder = _record(site, terms)
             recorder.wait_for_state(RecorderState.RECORDING)
             recorder.stop()
-            campaign.recorder_late_s = max(each.late_s for each in site.recorders)
             _look_back(campaign, site, served)
     return campaign
 

@@ -26,9 +26,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.ros_processes import (
-    RECORDERS,
     Robot,
-    installation,
     publishing_robot,
     ros_environment,
     wait_for,
@@ -38,18 +36,20 @@ from tests.timing import in_time
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from tests.support.real_recorder import RealRecorder
+
 HZ: Final = 20.0
 DISK_BYTES: Final = 8_000_000
 TOLD_WITHIN_S: Final = 10.0
 HEARD: Final = {"/odom", "/bumper", "/clock"}
 
 
-@pytest.fixture(scope="module", params=RECORDERS)
+@pytest.fixture(scope="module")
 def site(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+    real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Machine]:
     folder = tmp_path_factory.mktemp("conditions")
-    with ros_environment(folder, real=installation(request)) as env, machine(folder, env) as site:
+    with ros_environment(folder, real=real_recorder) as env, machine(folder, env) as site:
         yield site
 
 

@@ -17,11 +17,12 @@ import pytest
 
 from tests.integration.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
 from tests.support.examples import LONG
-from tests.support.ros_processes import real_or_double
 from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tests.support.real_recorder import RealRecorder
 
 KILLS: Final = 50 if LONG else 6
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))
@@ -44,15 +45,16 @@ class Campaigns:
 
 
 @pytest.fixture(scope="module")
-def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Campaigns:
-    found = driven(lambda watch: _run(tmp_path_factory.mktemp("faults"), watch), _judge)
+def campaigns(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory) -> Campaigns:
+    found = driven(
+        lambda watch: _run(tmp_path_factory.mktemp("faults"), watch, real_recorder), _judge
+    )
     for campaign in found.found.values():
         _log_losses(campaign)
     return found
 
 
-def _run(folder: Path, watch: Watch) -> Campaigns:
-    real = real_or_double()
+def _run(folder: Path, watch: Watch, real: RealRecorder) -> Campaigns:
     with ThreadPoolExecutor(len(TERMS)) as pool:
         running = {
             name: pool.submit(run_campaign, terms, folder / name, real)
@@ -61,7 +63,6 @@ def _run(folder: Path, watch: Watch) -> Campaigns:
         found = {name: future.result() for name, future in running.items()}
     for name, campaign in found.items():
         watch.report(f"the robot of {name}", campaign.robot_late_s)
-        watch.report(f"the recorders of {name}", campaign.recorder_late_s)
     return Campaigns(watch, found)
 
 

@@ -35,7 +35,6 @@ from tests.support.live_recorder import (
 from tests.support.ros_processes import (
     Robot,
     publishing_robot,
-    real_or_double,
     ros_environment,
 )
 from tests.timing import Watch, driven
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.integration.test_server_process import Served
+    from tests.support.real_recorder import RealRecorder
 
 HZ: Final = 50.0
 AGO_S: Final = 10
@@ -74,8 +74,10 @@ class Drive:
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    return driven(lambda watch: drive_once(tmp_path_factory.mktemp("live"), watch), judge)
+def drive(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return driven(
+        lambda watch: drive_once(tmp_path_factory.mktemp("live"), watch, real_recorder), judge
+    )
 
 
 def judge(drive: Drive) -> None:
@@ -89,10 +91,10 @@ def judge(drive: Drive) -> None:
         all_answers(drive, name)
 
 
-def drive_once(folder: Path, watch: Watch) -> Drive:
+def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
     options = ("--hz", f"{HZ:g}", "--subscribers", "3")
     with (
-        ros_environment(folder, real=real_or_double()) as env,
+        ros_environment(folder, real=real) as env,
         machine(folder, env) as site,
         # It is there, and silent, before any of them rotates.
         publishing_robot(env, folder / "truth.json", *options) as robot,
@@ -152,7 +154,6 @@ def _drive(drive: Drive, site: Machine, served: dict[str, Served], robot: Robot)
     drive.watch.report("the robot", robot.late_s)
     for recorder in (drive.rotating, drive.killed, drive.ten):
         recorder.stop()
-        drive.watch.report("a recorder", recorder.late_s)
     _look_back(drive, served)
 
 

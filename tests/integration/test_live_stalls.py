@@ -25,15 +25,12 @@ from tests.support.live_recorder import (
     machine,
     ticks,
 )
-from tests.support.ros_processes import (
-    RECORDERS,
-    installation,
-    publishing_robot,
-    ros_environment,
-)
+from tests.support.ros_processes import publishing_robot, ros_environment
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tests.support.real_recorder import RealRecorder
 
 
 ROTATIONS: Final = 100 if LONG else 3
@@ -52,12 +49,11 @@ class Rotated(NamedTuple):
     compared: int
 
 
-@pytest.fixture(scope="module", params=RECORDERS)
-def rotated(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Rotated:
-    real = installation(request)
+@pytest.fixture(scope="module")
+def rotated(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory) -> Rotated:
     folder = tmp_path_factory.mktemp("stalls")
     with (
-        ros_environment(folder, real=real) as env,
+        ros_environment(folder, real=real_recorder) as env,
         machine(folder, env) as site,
         publishing_robot(env, folder / "truth.json", "--topics", "/odom", "--hz", str(HZ)) as robot,
     ):

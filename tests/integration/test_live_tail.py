@@ -29,12 +29,7 @@ from tests.support.live_recorder import (
     machine,
     ticks,
 )
-from tests.support.ros_processes import (
-    RECORDERS,
-    installation,
-    publishing_robot,
-    ros_environment,
-)
+from tests.support.ros_processes import publishing_robot, ros_environment
 from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
@@ -68,10 +63,11 @@ class Drive:
     files: dict[str, int] = field(default_factory=dict)
 
 
-@pytest.fixture(scope="module", params=RECORDERS)
-def drive(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    real = installation(request)
-    return driven(lambda watch: drive_once(tmp_path_factory.mktemp("tail"), watch, real), judge)
+@pytest.fixture(scope="module")
+def drive(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return driven(
+        lambda watch: drive_once(tmp_path_factory.mktemp("tail"), watch, real_recorder), judge
+    )
 
 
 def judge(drive: Drive) -> None:
@@ -83,7 +79,7 @@ def judge(drive: Drive) -> None:
         is_recorded(drive, name)
 
 
-def drive_once(folder: Path, watch: Watch, real: RealRecorder | None) -> Drive:
+def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
     options = ("--hz", f"{HZ:g}", "--subscribers", "2")
     with (
         ros_environment(folder, real=real) as env,
@@ -115,7 +111,6 @@ def drive_once(folder: Path, watch: Watch, real: RealRecorder | None) -> Drive:
         watch.report("the robot", robot.late_s)
         for name, recorder in drive.recorders.items():
             recorder.stop()
-            watch.report(f"the recorder of {name}", recorder.late_s)
             files = bag_files(recorder.bag_dir)
             drive.files[name] = len(files)
             drive.recorded[name] = ticks(files, drive.t0, HZ)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import re
 import shutil
 import signal
 import struct
@@ -57,7 +56,6 @@ RECORDED_TOPICS: Final = (
 )
 NS_PER_S: Final = 10**9
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION")
-_TAKEN_LATE: Final = re.compile(r"Messages were taken late, by ([0-9.]+) s")
 _OF_THE_MACHINE: Final = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOG_DIR")
 
 
@@ -132,12 +130,6 @@ class LiveRecorder:
             for name, topics in times.items()
             if topics.keys() >= set(RECORDED_TOPICS)
         }
-
-    @property
-    def late_s(self) -> float:
-        """How late its recorders took messages at worst, where they are the double."""
-        said = (_TAKEN_LATE.search(str(each)) for each in self.events("recorder_warning"))
-        return max((float(late[1]) for late in said if late), default=0.0)
 
     @property
     def heartbeat(self) -> HeartbeatReading:

@@ -5,8 +5,6 @@ tests that need it skip and say why; with EPISODIC_REQUIRE_REAL=1 they fail inst
 
     def test_of_the_real_one(real_recorder: RealRecorder, tmp_path: Path) -> None:
         with ros_environment(tmp_path, real=real_recorder) as env:
-
-`tests/support/ros_processes.py` has what runs a test with the real one and with the double.
 """
 
 from __future__ import annotations
@@ -59,29 +57,17 @@ def env_without_ros() -> dict[str, str]:
     }
 
 
-def find_real_recorder() -> RealRecorder | str:
-    """The real recorder of this machine, or why there is none; the first call may set it up.
-
-    With EPISODIC_REQUIRE_REAL=1 the test fails where there is none.
-    """
-    found = _found()
-    if isinstance(found, str) and os.environ.get("EPISODIC_REQUIRE_REAL") == "1":
-        pytest.fail(f"EPISODIC_REQUIRE_REAL=1, but there is no real recorder: {found}")
-    return found
-
-
-def require_real_recorder() -> RealRecorder:
-    """The real recorder, as `find_real_recorder`; skips the test where there is none."""
-    found = find_real_recorder()
-    if isinstance(found, str):
-        pytest.skip(f"no real recorder: {found}")
-    return found
-
-
 @pytest.fixture(scope="session")
 def real_recorder() -> RealRecorder:
-    """The real recorder; see `require_real_recorder`."""
-    return require_real_recorder()
+    """The real recorder of this machine; the first call may set it up.
+
+    Where there is none the test skips, or fails with EPISODIC_REQUIRE_REAL=1.
+    """
+    found = _found()
+    if isinstance(found, str):
+        say = pytest.fail if os.environ.get("EPISODIC_REQUIRE_REAL") == "1" else pytest.skip
+        say(f"no real recorder: {found}")
+    return found
 
 
 @cache

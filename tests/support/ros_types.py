@@ -1,4 +1,4 @@
-"""Publishers and subscriptions of serialized messages, also of types that PyPI has no wheel of.
+"""Publishers of serialized messages, also of types that PyPI has no wheel of.
 
 rclpy hands the type support of a message class to the middleware: a C struct that names the type
 and knows how to serialize it. Whoever publishes and receives serialized bytes alone needs no more
@@ -18,7 +18,6 @@ from importlib import import_module
 from typing import Any, Final
 
 from nav_msgs.msg import Path as Lender
-from rclpy.event_handler import SubscriptionEventCallbacks
 
 _SERIALIZER: Final = b"rosidl_typesupport_fastrtps_c"
 # What describes the fields. Jazzy's middleware refuses a type without it; of a type that has no
@@ -69,22 +68,6 @@ _capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
 def publisher(node: Any, topic: str, kind: tuple[str, str], qos: Any) -> Any:
     """An rclpy publisher of bytes; `kind` is as for `message_class`."""
     made = node.create_publisher(message_class(*kind), topic, qos)
-    _reset_error()
-    return made
-
-
-def subscription(
-    node: Any, topic: str, kind: tuple[str, str], qos: Any, take: Any, *, incompatible: Any
-) -> Any:
-    """An rclpy subscription.
-
-    `take` is called with the bytes and with the info on each message, `incompatible` with the event
-    that a publisher offers less than `qos`.
-    """
-    events = SubscriptionEventCallbacks(incompatible_qos=incompatible)
-    made = node.create_subscription(
-        message_class(*kind), topic, take, qos, raw=True, event_callbacks=events
-    )
     _reset_error()
     return made
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TESTS: Final = Path(__file__).parents[1]
 GROUPS: Final[Mapping[str, Sequence[str]]] = {
-    "live": ("integration/test_live_*.py", "integration/test_ros2_double*.py"),
+    "live": ("integration/test_live_*.py",),
     "stalls": (
         "integration/test_recorder_exclusion.py",
         "integration/test_recorder_stalls.py",

@@ -1,1 +1,0 @@
-"""A test double of `ros2 bag record`; see README.md."""
