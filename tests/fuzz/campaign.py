@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any, Final
 from tests.fuzz.classes import Job
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
 HANG_S: Final = 60.0
 """After so long without a word a child hangs: it asks seven questions, of 10 s each at most."""
 _ROOT: Final = Path(__file__).resolve().parents[2]
-_MOST_FAULTS: Final = 200
 _MOST_LEFT_MB: Final = 260
 
 
@@ -31,40 +30,17 @@ class Tally:
 
     name: str
     mutants: int = 0
-    served: int = 0
     held: int = 0
-    reasons: int = 0
     questions: int = 0
-    crashes: int = 0
-    hangs: int = 0
-    faults: int = 0
-    peak_mb: float = 0.0
-    slowest_s: float = 0.0
-    cpu_s: float = 0.0
-    store_s: float = 0.0
-    recover_s: float = 0.0
-    found: list[dict[str, Any]] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
 
     def add(self, verdict: dict[str, Any]) -> None:
         """Counts one verdict in."""
         self.mutants += 1
-        if verdict.get("died"):
-            self.crashes += verdict["died"] == "crash"
-            self.hangs += verdict["died"] == "hang"
-        else:
-            self.served += verdict["served"]
-            self.held += verdict["told_apart"] and verdict["served"]
-            self.reasons += not verdict["served"]
-            self.questions += verdict["asked"]
-            self.peak_mb = max(self.peak_mb, verdict["peak_mb"])
-            self.slowest_s = max(self.slowest_s, verdict["seconds"])
-            self.cpu_s = max(self.cpu_s, verdict["cpu_s"])
-            self.store_s = max(self.store_s, verdict["store_s"])
-            self.recover_s = max(self.recover_s, verdict["recover_s"])
-        if verdict["faults"]:
-            self.faults += 1
-            if len(self.found) < _MOST_FAULTS:
-                self.found.append(verdict)
+        self.held += verdict.get("told_apart", False) and verdict["served"]
+        self.questions += verdict.get("asked", 0)
+        made = [str(verdict.get(key)) for key in ("number", "mutation", "good", "told")]
+        self.faults += [f"{' '.join(made)}: {fault}" for fault in verdict["faults"]]
 
 
 class Child:
@@ -101,15 +77,13 @@ class Child:
             self._process.stdin.flush()
         except BrokenPipeError:
             return self._died(job, "crash")
-        while True:
-            line = self._line()
-            if line is None:
-                return self._died(job, "hang")
-            if not line:
-                return self._died(job, "crash")
-            told: dict[str, Any] = json.loads(line)
-            if "begun" not in told:
-                return told
+        line = self._line()
+        if line is None:
+            return self._died(job, "hang")
+        if not line:
+            return self._died(job, "crash")
+        told: dict[str, Any] = json.loads(line)
+        return told
 
     def _died(self, job: Job, how: str) -> dict[str, Any]:
         self.close()
@@ -166,24 +140,10 @@ def _folder(root: str, number: int) -> Path:
     return folder
 
 
-def campaign(
-    mutants: Mapping[str, int],
-    seed: int,
-    *,
-    first: int = 0,
-    tell: Callable[[Tally], None] = lambda _tally: None,
-) -> list[Tally]:
-    """Tries so many mutants of each class; `tell` hears of each class when it is done."""
-    jobs = (
-        Job(name, number, seed)
-        for name, count in mutants.items()
-        for number in range(first, first + count)
-    )
-    tallies: list[Tally] = []
+def campaign(mutants: Mapping[str, int], seed: int) -> dict[str, Tally]:
+    """Tries so many mutants of each class."""
+    jobs = [Job(name, number, seed) for name, count in mutants.items() for number in range(count)]
+    tallies = {name: Tally(name) for name in mutants}
     for verdict in run(jobs):
-        if not tallies or tallies[-1].name != verdict["name"]:
-            tallies.append(Tally(verdict["name"]))
-        tallies[-1].add(verdict)
-        if tallies[-1].mutants == mutants[verdict["name"]]:
-            tell(tallies[-1])
+        tallies[verdict["name"]].add(verdict)
     return tallies

@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 import traceback
-from contextlib import redirect_stderr, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -29,7 +29,7 @@ from tests.fuzz.mutant import LONG_AGO_S, Mutant
 from tests.fuzz.traps import sprung
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, MutableMapping
+    from collections.abc import Iterator, Mapping, MutableMapping
 
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.mcp_server import EpisodicServer
@@ -51,20 +51,11 @@ class Verdict:
     """What became of one mutant. `faults` are what must not happen.
 
     `told_apart`: what of it can be read is known, and its answers were held to that.
-
-    `seconds` are of the slowest question by the clock on the wall; the others are of the processor,
-    since a machine that is busy otherwise is no fault.
     """
 
     served: bool = False
     told_apart: bool = False
-    state: str = ""
     asked: int = 0
-    seconds: float = 0.0
-    cpu_s: float = 0.0
-    store_s: float = 0.0
-    recover_s: float = 0.0
-    peak_mb: float = 0.0
     left_mb: float = 0.0
     faults: list[str] = field(default_factory=list)
 
@@ -141,15 +132,15 @@ def tried(world: World, job: Job, mutant: Mutant, good: Good) -> Verdict:
         try:
             asyncio.run(_asked(world, job, known, bag, verdict, truth, trapped=trapped))
             if job.number % _RECOVERED_EVERY == 0:
-                _recovered(world, verdict)
+                with in_time("recovering", verdict), suppress(EpisodicError):
+                    recover_files(world.bag_dir, force=True)
             if job.number % _INDEXED_EVERY == 0:
                 _indexed(world)
         except Exception:  # noqa: BLE001  whatever it is, it is what is looked for
             verdict.faults.append(f"raised: {traceback.format_exc()[-1500:]}")
-    verdict.peak_mb = peak_mb()
     verdict.left_mb = resident_mb()
-    if verdict.peak_mb > MOST_MB:
-        verdict.faults.append(f"memory: {verdict.peak_mb:.0f} MB")
+    if (peak_mb := _status_mb("VmHWM:")) > MOST_MB:
+        verdict.faults.append(f"memory: {peak_mb:.0f} MB")
     world.clear()
     return verdict
 
@@ -164,11 +155,8 @@ async def _asked(
     *,
     trapped: bool,
 ) -> None:
-    begun, busy = time.monotonic(), time.process_time()
-    memory, server = world.serving()
-    verdict.seconds, verdict.cpu_s = time.monotonic() - begun, time.process_time() - busy
-    if verdict.cpu_s > MOST_S:
-        verdict.faults.append(f"slow: looking into the bag took {verdict.cpu_s:.1f} s")
+    with in_time("looking into the bag", verdict):
+        memory, server = world.serving()
     rng = job.rng
     if world.stored and job.number % 2:
         _fill(world, memory, verdict)
@@ -192,18 +180,13 @@ async def _asked(
 
 
 async def _timed(server: EpisodicServer, name: str, given: dict[str, Any], verdict: Verdict) -> Any:
-    begun, busy = time.monotonic(), time.process_time()
-    try:
-        answer = await ask(server, name, given)
-    except Exception as error:  # noqa: BLE001
-        verdict.faults.append(f"no reply: {name}: {error!r}"[:500])
-        answer = None
-    spent = time.process_time() - busy
+    answer = None
+    with in_time(f"{name} {given}", verdict):
+        try:
+            answer = await ask(server, name, given)
+        except Exception as error:  # noqa: BLE001
+            verdict.faults.append(f"no reply: {name}: {error!r}"[:500])
     verdict.asked += 1
-    verdict.seconds = max(verdict.seconds, time.monotonic() - begun)
-    verdict.cpu_s = max(verdict.cpu_s, spent)
-    if spent > MOST_S:
-        verdict.faults.append(f"slow: {name} {given} took {spent:.1f} s")
     if isinstance(answer, dict) and answer.get("error") == "internal":
         verdict.faults.append(f"internal: {name} {given}")
     if isinstance(answer, dict) and "error" in answer and not answer.get("detail"):
@@ -218,7 +201,6 @@ def _look_for(memory: Memory, bag: Path, told: Any, verdict: Verdict, *, trapped
     aside = {each.path: each for each in (*snapshot.active, *snapshot.damaged, *snapshot.unread)}
     if bag in served:
         verdict.served = True
-        verdict.state = served[bag].state.value
         if not trapped:
             _count(memory, bag, served[bag].summary.notes, verdict)
         incomplete = isinstance(told, dict) and told.get("incomplete")
@@ -226,7 +208,6 @@ def _look_for(memory: Memory, bag: Path, told: Any, verdict: Verdict, *, trapped
             verdict.faults.append("an incomplete bag is not listed")
         return
     if bag in aside:
-        verdict.state = aside[bag].reason[:160]
         if not aside[bag].reason:
             verdict.faults.append("set aside without a reason")
         if not isinstance(told, dict) or not any(
@@ -234,7 +215,6 @@ def _look_for(memory: Memory, bag: Path, told: Any, verdict: Verdict, *, trapped
         ):
             verdict.faults.append(f"set aside, and not listed: {str(told)[:300]}")
         return
-    verdict.state = "empty" if snapshot.empty else "absent"
     # A folder may be called as it likes, and what lies in a hidden one is not looked at.
     hidden = any(name.startswith(".") for name in bag.parts)
     if trapped or hidden or bag.is_dir() or not (bag.exists() or bag.is_symlink()):
@@ -262,20 +242,17 @@ def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) 
 
 
 def _fill(world: World, memory: Memory, verdict: Verdict) -> None:
-    begun = time.process_time()
-    fill_store(build_backfill(world.settings, memory))
-    verdict.store_s = time.process_time() - begun
-    if verdict.store_s > MOST_S:
-        verdict.faults.append(f"slow: storing took {verdict.store_s:.1f} s")
+    with in_time("storing", verdict):
+        fill_store(build_backfill(world.settings, memory))
 
 
-def _recovered(world: World, verdict: Verdict) -> None:
+@contextmanager
+def in_time(what: str, verdict: Verdict) -> Iterator[None]:
+    """Seconds of the processor: a machine that is busy otherwise is no fault."""
     begun = time.process_time()
-    with suppress(EpisodicError):
-        recover_files(world.bag_dir, force=True)
-    verdict.recover_s = time.process_time() - begun
-    if verdict.recover_s > MOST_S:
-        verdict.faults.append(f"slow: recovering took {verdict.recover_s:.1f} s")
+    yield
+    if (spent := time.process_time() - begun) > MOST_S:
+        verdict.faults.append(f"slow: {what} took {spent:.1f} s")
 
 
 def _indexed(world: World) -> None:
@@ -292,25 +269,20 @@ def _indexed(world: World) -> None:
         raise AssertionError(f"ros2-memory index ended with {code}")
 
 
-class _failures_in:  # noqa: N801  reads as the statement that it is
+@contextmanager
+def _failures_in(faults: list[str]) -> Iterator[None]:
     """Within the block what the program logs as its own failure is a fault."""
 
-    def __init__(self, faults: list[str]) -> None:
-        self._faults = faults
-
-    def __enter__(self) -> None:
-        structlog.configure(processors=[self._heard], cache_logger_on_first_use=False)
-
-    def __exit__(self, *_: object) -> None:
-        structlog.reset_defaults()
-
-    def _heard(
-        self, _logger: object, _method: str, event: MutableMapping[str, Any]
-    ) -> Mapping[str, Any]:
+    def hear(_logger: object, _method: str, event: MutableMapping[str, Any]) -> Mapping[str, Any]:
         if event.get("exc_info"):
-            told = traceback.format_exc()
-            self._faults.append(f"{event['event']}: {told[-1500:]}")
+            faults.append(f"{event['event']}: {traceback.format_exc()[-1500:]}")
         raise structlog.DropEvent
+
+    structlog.configure(processors=[hear], cache_logger_on_first_use=False)
+    try:
+        yield
+    finally:
+        structlog.reset_defaults()
 
 
 def _remove(path: Path) -> None:
@@ -323,11 +295,6 @@ def _remove(path: Path) -> None:
 def reset_peak() -> None:
     """Has the peak of this process's memory measured anew (proc(5), clear_refs)."""
     Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak_mb() -> float:
-    """The most memory that this process had since the last reset, in MB of 2^20 bytes."""
-    return _status_mb("VmHWM:")
 
 
 def resident_mb() -> float:

@@ -39,7 +39,6 @@ def main() -> None:
     worlds = {key: World(root, key[0], stored=key[1]) for key in _COMBINATIONS}
     for line in sys.stdin:
         job = Job(**json.loads(line))
-        out.write(json.dumps({"begun": job.number}) + "\n")
         out.write(json.dumps(_verdict(worlds, job)) + "\n")
 
 
