@@ -12,6 +12,7 @@ from structlog.testing import capture_logs
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process import installation
 from ros2_memory.recorder.process.installation import (
+    advice_on_silence,
     find_ros2,
     robot_environment,
     without_ours,
@@ -27,135 +28,151 @@ def setup_file(folder: Path, name: str, text: str) -> Path:
     return path
 
 
-def refusal(*files: Path) -> str:
+@pytest.mark.parametrize(
+    ("texts", "found"),
+    [
+        pytest.param(
+            ["export WAY=distro PYTHONPATH=/ros\n", 'export WAY="$WAY:ws"\n'],
+            {"WAY": "distro:ws", "PYTHONPATH": "/ros"},
+            id="in order",
+        ),
+        pytest.param(
+            ["export ODD=$'a\\nB=b \\xff end'\n"],
+            {"ODD": os.fsdecode(b"a\nB=b \xff end"), "B": None},
+            id="newlines and bytes of any kind",
+        ),
+        pytest.param(["export COUNT=$#\n"] * 3, {"COUNT": "0"}, id="no arguments"),
+        pytest.param(
+            ["file=x files=y; export A=1\n", "export B=2\n"],
+            {"A": "1", "B": "2"},
+            id="variables named as the helpers",
+        ),
+        pytest.param(
+            ['export SEEN="${PYTHONPATH-none}"\n'], {"SEEN": "none"}, id="nothing of ours"
+        ),
+    ],
+)
+def test_what_setup_files_set_is_there(
+    tmp_path: Path, texts: list[str], found: dict[str, str | None]
+) -> None:
+    files = [setup_file(tmp_path, f"{nth}.bash", text) for nth, text in enumerate(texts)]
+    uninvited = setup_file(tmp_path, "env.bash", "export UNINVITED=1\n")
+    base = {**BASE, "PYTHONPATH": "/of/ours", "BASH_ENV": str(uninvited)}
+    env = robot_environment(files, LOGS, base)
+    assert {name: env.get(name) for name in (*found, "UNINVITED")} == {**found, "UNINVITED": None}
+
+
+def test_a_path_is_never_read_as_shell_text(tmp_path: Path) -> None:
+    folder = tmp_path / "a b; touch 'x' $(touch y) `touch z`"
+    folder.mkdir()
+    file = setup_file(folder, "-e.bash", "export WAY=odd\n")
+    assert robot_environment([file], LOGS, BASE)["WAY"] == "odd"
+    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+
+
+def test_what_setup_files_print_is_told_and_harms_nothing(tmp_path: Path) -> None:
+    file = setup_file(tmp_path, "a.bash", "echo WAY=wrong; echo oh >&2; export WAY=right\n")
+    with capture_logs() as logs:
+        assert robot_environment([file], LOGS, BASE)["WAY"] == "right"
+    assert [each["text"] for each in logs] == ["WAY=wrong", "oh"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "{bad} is not there; correct recorder.setup_files"),
+        ("echo 'no such way' >&2\nexit 3\n", "{bad} failed with status 3 (no such way)"),
+        ("return 3\n", "{bad} failed with status 3"),
+        ("( exit 3 )\n", "{bad} failed with status 3"),
+        ("exit 0\n", "{bad} failed"),
+        ("sleep 600\n", "did not come to an end"),
+    ],
+)
+def test_a_setup_file_that_is_missing_or_fails_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None, said: str
+) -> None:
+    monkeypatch.setattr(installation, "SETUP_TIMEOUT_S", 0.3 if "sleep" in str(text) else 60)
+    good = setup_file(tmp_path, "good.bash", "export A=1\n")
+    bad = tmp_path / "bad.bash"
+    if text is not None:
+        bad.write_text(text)
     with pytest.raises(RecorderError) as caught:
-        robot_environment(files, LOGS, BASE)
-    return str(caught.value)
+        robot_environment([good, bad, good], LOGS, BASE)
+    assert said.format(bad=bad) in str(caught.value)
 
 
-class TestSetupFiles:
-    def test_are_sourced_in_order(self, tmp_path: Path) -> None:
-        distro = setup_file(tmp_path, "distro.bash", "export WAY=distro PYTHONPATH=/ros\n")
-        workspace = setup_file(tmp_path, "ws.bash", 'export WAY="$WAY:ws" AMENT_PREFIX_PATH=/ws\n')
-        env = robot_environment([distro, workspace], LOGS, BASE)
-        assert (env["WAY"], env["AMENT_PREFIX_PATH"], env["PYTHONPATH"]) == (
-            "distro:ws",
-            "/ws",
-            "/ros",
-        )
-
-    def test_values_with_newlines_and_bytes_of_any_kind_survive(self, tmp_path: Path) -> None:
-        file = setup_file(tmp_path, "a.bash", "export ODD=$'a\\nB=b \\xff end'\n")
-        env = robot_environment([file], LOGS, BASE)
-        assert os.fsencode(env["ODD"]) == b"a\nB=b \xff end"
-        assert "B" not in env
-
-    def test_a_path_is_never_read_as_shell_text(self, tmp_path: Path) -> None:
-        folder = tmp_path / "a b; touch 'x' $(touch y) `touch z`"
-        folder.mkdir()
-        file = setup_file(folder, "-e.bash", "export WAY=odd\n")
-        assert robot_environment([file], LOGS, BASE)["WAY"] == "odd"
-        assert [path.name for path in tmp_path.iterdir()] == [folder.name]
-
-    def test_do_not_see_the_names_of_the_others_as_arguments(self, tmp_path: Path) -> None:
-        files = [setup_file(tmp_path, f"{n}.bash", "export COUNT=$#\n") for n in range(3)]
-        assert robot_environment(files, LOGS, BASE)["COUNT"] == "0"
-
-    def test_may_use_variables_named_as_the_helpers(self, tmp_path: Path) -> None:
-        first = setup_file(tmp_path, "1.bash", "file=x files=y; export A=1\n")
-        second = setup_file(tmp_path, "2.bash", "export B=2\n")
-        env = robot_environment([first, second], LOGS, BASE)
-        assert (env["A"], env["B"]) == ("1", "2")
-
-    def test_what_they_print_is_told_and_harms_nothing(self, tmp_path: Path) -> None:
-        file = setup_file(tmp_path, "a.bash", "echo WAY=wrong; echo oh >&2; export WAY=right\n")
-        with capture_logs() as logs:
-            assert robot_environment([file], LOGS, BASE)["WAY"] == "right"
-        assert [each["text"] for each in logs] == ["WAY=wrong", "oh"]
-
-    def test_one_that_is_missing_is_named(self, tmp_path: Path) -> None:
-        message = refusal(setup_file(tmp_path, "a.bash", ""), tmp_path / "gone.bash")
-        assert str(tmp_path / "gone.bash") in message
-        assert "recorder.setup_files" in message
-
-    @pytest.mark.parametrize("end", ["exit 3", "return 3", "( exit 3 )"])
-    def test_one_that_fails_is_named_with_what_it_said(self, tmp_path: Path, end: str) -> None:
-        good = setup_file(tmp_path, "good.bash", "export A=1\n")
-        bad = setup_file(tmp_path, "bad.bash", f"echo 'no such distribution' >&2\n{end}\n")
-        message = refusal(good, bad, good)
-        assert message.startswith(f"{bad} failed with status 3")
-        assert "no such distribution" in message
-
-    def test_one_that_exits_as_if_all_were_well_is_named(self, tmp_path: Path) -> None:
-        bad = setup_file(tmp_path, "bad.bash", "exit 0\n")
-        assert refusal(bad).startswith(f"{bad} failed")
-
-    def test_one_that_never_ends_is_given_up(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(installation, "SETUP_TIMEOUT_S", 0.3)
-        assert "did not come to an end" in refusal(setup_file(tmp_path, "a.bash", "sleep 600\n"))
-
-    def test_bash_reads_nothing_that_it_was_not_given(self, tmp_path: Path) -> None:
-        uninvited = setup_file(tmp_path, "env.bash", "export UNINVITED=1\n")
-        file = setup_file(tmp_path, "a.bash", "export A=1\n")
-        env = robot_environment([file], LOGS, {**BASE, "BASH_ENV": str(uninvited)})
-        assert "UNINVITED" not in env
-
-
-class TestOurs:
-    def test_the_virtual_environment_stays_here(self) -> None:
-        mine = f"{sys.prefix}/bin"
-        env = without_ours(
+@pytest.mark.parametrize(
+    ("given", "left"),
+    [
+        (
             {
                 "VIRTUAL_ENV": "/venv",
                 "VIRTUAL_ENV_PROMPT": "x",
                 "PYTHONHOME": "/venv",
-                "PATH": f"{mine}:/venv/bin:/usr/bin:/venvs/bin",
-            }
-        )
-        assert env == {"PATH": "/usr/bin:/venvs/bin"}
-
-    def test_a_python_path_of_the_robot_stays_where_no_file_sets_it(self) -> None:
-        given = {"PATH": "/usr/bin", "VIRTUAL_ENV": "/venv", "PYTHONPATH": "/venv/lib:/opt/ros/lib"}
-        assert without_ours(given)["PYTHONPATH"] == "/opt/ros/lib"
-        assert "PYTHONPATH" not in without_ours(given | {"PYTHONPATH": "/venv/lib"})
-
-    def test_a_python_path_from_before_does_not_reach_the_setup_files(self, tmp_path: Path) -> None:
-        file = setup_file(tmp_path, "a.bash", 'export SEEN="${PYTHONPATH-none}"\n')
-        env = robot_environment([file], LOGS, {**BASE, "PYTHONPATH": "/of/ours"})
-        assert env["SEEN"] == "none"
-
-    def test_the_service_managers_channels_stay_here(self) -> None:
-        given = {"NOTIFY_SOCKET": "/run/x", "WATCHDOG_USEC": "1", "WATCHDOG_PID": "2", "HOME": "/h"}
-        assert without_ours(given) == {"HOME": "/h"}
-
-
-class TestOutputOfRos:
-    def test_its_form_is_ours_whatever_the_robot_is_set_to(self) -> None:
-        given = {
-            **BASE,
-            "RCUTILS_COLORIZED_OUTPUT": "1",
-            "RCUTILS_CONSOLE_OUTPUT_FORMAT": "{message}",
-            "RCUTILS_LOGGING_USE_STDOUT": "1",
-        }
-        env = robot_environment([], LOGS, given)
-        assert env["RCUTILS_COLORIZED_OUTPUT"] == "0"
-        assert env["RCUTILS_CONSOLE_OUTPUT_FORMAT"] == "[{severity}] [{time}] [{name}]: {message}"
-        assert env["RCUTILS_LOGGING_USE_STDOUT"] == "0"
-
-    def test_its_logs_go_where_they_are_told_unless_the_robot_names_a_place(self) -> None:
-        assert robot_environment([], LOGS, BASE)["ROS_LOG_DIR"] == str(LOGS)
-        named = {**BASE, "ROS_LOG_DIR": "/var/log/ros"}
-        assert robot_environment([], LOGS, named)["ROS_LOG_DIR"] == "/var/log/ros"
+                "PATH": f"{sys.prefix}/bin:/venv/bin:/usr/bin:/venvs/bin",
+            },
+            {"PATH": "/usr/bin:/venvs/bin"},
+        ),
+        (
+            {"VIRTUAL_ENV": "/venv", "PYTHONPATH": "/venv/lib:/opt/ros/lib"},
+            {"PYTHONPATH": "/opt/ros/lib"},
+        ),
+        ({"VIRTUAL_ENV": "/venv", "PYTHONPATH": "/venv/lib"}, {}),
+        (
+            {"NOTIFY_SOCKET": "/run/x", "WATCHDOG_USEC": "1", "WATCHDOG_PID": "2", "HOME": "/h"},
+            {"HOME": "/h"},
+        ),
+    ],
+    ids=["virtual environment", "PYTHONPATH", "nothing else in PYTHONPATH", "service manager"],
+)
+def test_what_is_ours_stays_here(given: dict[str, str], left: dict[str, str]) -> None:
+    assert without_ours({"PATH": "/usr/bin", **given}) == {"PATH": "/usr/bin", **left}
 
 
-class TestRos2:
-    def test_it_is_found_on_the_path_of_the_environment(self, tmp_path: Path) -> None:
-        program = setup_file(tmp_path, "ros2", "")
-        program.chmod(0o755)
-        assert find_ros2({"PATH": f"/nowhere:{tmp_path}"}) == str(program)
+def test_the_form_of_its_output_is_ours_whatever_the_robot_is_set_to() -> None:
+    ours = {
+        "RCUTILS_COLORIZED_OUTPUT": "0",
+        "RCUTILS_CONSOLE_OUTPUT_FORMAT": "[{severity}] [{time}] [{name}]: {message}",
+        "RCUTILS_LOGGING_USE_STDOUT": "0",
+        "ROS_LOG_DIR": str(LOGS),
+    }
+    assert robot_environment([], LOGS, BASE).items() >= ours.items()
+    theirs = dict.fromkeys(ours, "1")
+    kept = {"ROS_LOG_DIR": "1"}  # the robot names a place
+    assert robot_environment([], LOGS, BASE | theirs).items() >= (ours | kept).items()
 
-    def test_where_it_is_not_the_setup_files_are_asked_for(self) -> None:
-        with pytest.raises(RecorderError, match=r"recorder\.setup_files"):
-            find_ros2({"PATH": "/nowhere"})
+
+def test_ros2_is_found_on_the_path_of_the_environment_or_setup_files_are_asked_for(
+    tmp_path: Path,
+) -> None:
+    program = setup_file(tmp_path, "ros2", "")
+    program.chmod(0o755)
+    assert find_ros2({"PATH": f"/nowhere:{tmp_path}"}) == str(program)
+    with pytest.raises(RecorderError, match=r"recorder\.setup_files"):
+        find_ros2({"PATH": "/nowhere"})
+
+
+@pytest.mark.parametrize(
+    ("env", "advice"),
+    [
+        ({}, "set FASTDDS_BUILTIN_TRANSPORTS=UDPv4"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "set FASTDDS_BUILTIN_TRANSPORTS=UDPv4"),
+        ({"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}, "firewall"),
+        (
+            {
+                "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+                "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+            },
+            "docs/how-to/systemd.md",
+        ),
+        ({"ROS_LOCALHOST_ONLY": "1"}, "docs/how-to/systemd.md"),
+        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, "CYCLONEDDS_URI"),
+        ({"RMW_IMPLEMENTATION": "rmw_connextdds"}, "RMW_IMPLEMENTATION"),
+    ],
+)
+def test_the_advice_on_silence_is_never_what_is_set_already(
+    env: dict[str, str], advice: str
+) -> None:
+    said = advice_on_silence(env)
+    assert advice in said
+    assert not ("set FASTDDS_BUILTIN" in said and "FASTDDS_BUILTIN_TRANSPORTS" in env)

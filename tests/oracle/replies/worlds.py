@@ -19,7 +19,6 @@ from mcap.reader import make_reader
 from tests.home import recording as home
 from tests.home.days import Scale
 from tests.oracle import worlds as odd
-from tests.oracle.replies.robot_day import write_robot_day
 from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.moving_map import write_moving_map
@@ -275,9 +274,6 @@ def _own_worlds() -> Iterator[ReplyWorld]:
     for seed, days in ((7, 2), (11, 1)):
         write = partial(_write_home, Scale(seed, days, 60.0))
         yield ReplyWorld(f"home_{seed}", HOME, write, is_slow=days > 1)
-    for seed in (1, 2):
-        write = partial(write_robot_day, seed)
-        yield ReplyWorld(f"robot_day_{seed}", HOME, write, long=seed > 1)
     pose_topics = {"two_robots": ("data.pose_topic=/boat/odom",)}
     for name in odd.WORLDS:
         for seed in (1, 2):
