@@ -9,12 +9,11 @@ import hashlib
 import json
 import os
 import subprocess
-import sys
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import pytest
 from mcp import Client
@@ -28,7 +27,7 @@ from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.integration.split_writer import DOCK
+from tests.integration.split_writer import DOCK, SplitWriter
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_mcap
@@ -125,64 +124,36 @@ class Asker:
             self.wrong.append(f"{reply.transform}")
 
 
-@contextmanager
-def writer(bag_dir: Path, begin: int) -> Iterator[Callable[[], dict[str, Any]]]:
-    """A process that records; each call takes it a split further."""
-    module = "tests.integration.split_writer"
-    command = [sys.executable, "-m", module, str(bag_dir), f"--begin={begin}"]
-    with subprocess.Popen(
-        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        orders, answers = process.stdin, process.stdout
-        assert orders is not None
-        assert answers is not None
-
-        def step() -> dict[str, Any]:
-            orders.write("\n")
-            orders.flush()
-            reply: dict[str, Any] = json.loads(answers.readline())
-            return reply
-
-        try:
-            yield step
-            orders.close()
-            assert process.wait(timeout=PATIENCE_S) == 0
-        finally:
-            process.kill()
-
-
 def test_the_budget_is_held_while_it_is_recorded_and_asked(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     bag_dir.mkdir()
     begin = WallClock().now() - (SPLITS + 10) * 10 * NS_PER_S
-    asker = Asker(bag_dir, begin)
-    with writer(bag_dir, begin) as step:
-        split = max(step()["size"], step()["size"])
-        budget = KEPT_SPLITS * split
-        keeper = keeper_of(
-            bag_dir,
-            max_bytes=budget,
-            clock=WallClock(),
-            grace_s=2.0,
-            monotonic=lambda: float(asker.rounds),
-        )
-        deleted: set[str] = set()
-        seen: set[str] = set()
-        with asker.asking():
-            for _ in range(SPLITS - 2):
-                seen.add(step()["opened"])
-                assert size_of(bag_dir) <= budget + split + SLACK
-                keeper.apply()
-                assert size_of(bag_dir) <= budget + SLACK
-                asker.wait_for_a_round()
-                deleted = {path for path in seen if not Path(path).exists()}
-        assert asker.wrong == []
-        assert asker.rounds > 0
+    asker, writer = Asker(bag_dir, begin), SplitWriter(bag_dir, begin)
+    split = max(writer.step(), writer.step())
+    budget = KEPT_SPLITS * split
+    keeper = keeper_of(
+        bag_dir,
+        max_bytes=budget,
+        clock=WallClock(),
+        grace_s=2.0,
+        monotonic=lambda: float(asker.rounds),
+    )
+    with asker.asking():
+        for _ in range(SPLITS - 2):
+            writer.step()
+            assert size_of(bag_dir) <= budget + split + SLACK
+            keeper.apply()
+            assert size_of(bag_dir) <= budget + SLACK
+            asker.wait_for_a_round()
+        deleted = [path for path in writer.opened if not path.exists()]
+    assert asker.wrong == []
+    writer.close()
+    writer.tell()
     keeper.apply()
     left = sorted(path for path in bag_dir.rglob("*.mcap") if not is_carried(path))
     assert len(deleted) > SPLITS // 2
     assert len(left) >= KEPT_SPLITS - 2
-    assert str(left[-1]) == max(seen)
+    assert left[-1] == writer.opened[-1]
     assert {path.parent for path in left} == {
         path for path in bag_dir.iterdir() if path.is_dir() and path.name.startswith("rec_")
     }
@@ -293,51 +264,6 @@ def state(folder: Path) -> dict[str, tuple[object, ...]]:
     return found
 
 
-@pytest.fixture
-def old_bags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """What somebody recorded long ago, some of it cut short; caches lie elsewhere."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    bag_dir = tmp_path / "bags"
-    write_run(bag_dir)
-    long_ago = 1_700_000_000 * NS_PER_S
-    messages = [odom(long_ago + n, 1.0, 2.0) for n in range(200)]
-    write_mcap(bag_dir / "old/old_0.mcap", messages)
-    write_mcap(bag_dir / "old/old_1.mcap", messages, McapLayout(chunk_size=999, finish=False))
-    (bag_dir / "old/old_2.mcap").write_bytes(b"")
-    (bag_dir / "old/metadata.yaml").write_text("")
-    return bag_dir
-
-
-GREEDY: Final = (
-    "recorder=none",
-    "retention.max_total_gb=0.000001",
-    "retention.max_age_h=0.001",
-    "reader.index_refresh_s=0.01",
-)
-"""Limits that nothing there would keep, if anybody applied them."""
-
-
-async def test_where_nothing_is_recorded_nothing_is_written_or_deleted(
-    old_bags: Path, tmp_path: Path
-) -> None:
-    before = state(old_bags)
-    with serving(old_bags, tmp_path / "log", *GREEDY) as served:
-        async with Client(served.url("/mcp")) as client:
-            await ask_everything(client)
-    assert state(old_bags) == before
-
-
-def test_a_recorder_that_records_nothing_touches_nothing(old_bags: Path) -> None:
-    before = state(old_bags)
-    command = [sys.executable, "-m", "ros2_memory.recorder", *GREEDY]
-    env = os.environ | {"MEMORY_BAG_DIR": str(old_bags)}
-    ran = subprocess.run(
-        [*command, "recording.clear_on_startup=true"], env=env, timeout=PATIENCE_S, check=False
-    )
-    assert ran.returncode == 0
-    assert state(old_bags) == before
-
-
 @contextmanager
 def read_only(folder: Path, at: Path) -> Iterator[Path]:
     """The folder mounted so that nobody can write, which rights alone do not do for root."""
@@ -357,15 +283,19 @@ def read_only(folder: Path, at: Path) -> Iterator[Path]:
         subprocess.run(["umount", str(at)], capture_output=True, check=False)
 
 
-async def test_bags_on_a_read_only_mount_are_served(old_bags: Path, tmp_path: Path) -> None:
-    before = state(old_bags)
-    with read_only(old_bags, tmp_path / "mount") as mount:
+async def test_bags_on_a_read_only_mount_are_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_run(tmp_path / "bags")
+    before = state(tmp_path / "bags")
+    with read_only(tmp_path / "bags", tmp_path / "mount") as mount:
         with pytest.raises(OSError, match="Read-only"):
             (mount / "probe").write_text("x")
-        with serving(mount, tmp_path / "log", *GREEDY) as served:
+        with serving(mount, tmp_path / "log", "recorder=none") as served:
             async with Client(served.url("/mcp")) as client:
                 await ask_everything(client)
-    assert state(old_bags) == before
+    assert state(tmp_path / "bags") == before
 
 
 def test_days_are_kept_by_the_recorder_and_go_with_the_setting(tmp_path: Path) -> None:
