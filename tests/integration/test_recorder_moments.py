@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,10 +10,11 @@ import pytest
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
-from tests.integration.test_recorder_daemon import Site, at_a_site, sited
+from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import Served, serving
 from tests.support.live_recorder import answer
 from tests.support.processes import until
+from tests.timing import each_in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -67,13 +67,10 @@ def about(served: Served, reply: dict[str, Any]) -> list[Any]:
     return [{key: each[key] for key in each if key != "notes"} for each in answers]
 
 
+@each_in_time
 def test_a_moment_is_answered_from_when_its_bags_have_long_been_deleted(tmp_path: Path) -> None:
     """They are deleted after 11 s, and until then the moment must be kept and looked at."""
-    at_a_site(tmp_path, moment_outlives_its_bags)
-
-
-def moment_outlives_its_bags(site: Site) -> None:
-    with asked_about(site) as served:
+    with sited(tmp_path) as site, asked_about(site) as served:
         keeps_a_moment(site, served)
 
 
@@ -93,7 +90,7 @@ def keeps_a_moment(site: Site, served: Served) -> None:
     [listed] = answer(served, "memory_status")["moments"]
     assert (listed["label"], listed["bags"], listed["complete"]) == ("Küche", len(recorded), True)
     assert list((site.bag_dir / REQUESTS_FOLDER).iterdir()) == []
-    assert daemon.stop() == 0
+    daemon.stop()
 
 
 def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_is_back(
@@ -103,9 +100,7 @@ def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_
     daemon.wait_for("split_closed", 2)
     reply = answer(served, "remember_moment", label="fall", seconds_before=1, seconds_after=1)
     assert reply["pending"], reply
-    child = daemon.child
-    daemon.stop(signal.SIGKILL)
-    until(lambda: not Path(f"/proc/{child}").exists())
+    daemon.kill(with_children=False)
     refused = answer(served, "remember_moment", label="later")
     assert refused["error"] == "refused", refused
     following = site.run()
@@ -113,7 +108,7 @@ def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_
     assert held.moment.missing == ()
     kept = {path.name for path in held.folder.rglob("*.mcap")}
     assert len(kept) == len(held.files) > reply["bags"]
-    assert following.stop() == 0
+    following.stop()
 
 
 def _whole(answers: list[Any]) -> list[Any] | None:

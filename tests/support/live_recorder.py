@@ -165,9 +165,17 @@ class LiveRecorder:
         wait_for(lambda: not any(_is_running(child.pid) for child in children), "their end")
         return Killed(at, time.time_ns(), tuple(child.recording for child in children))
 
-    def stop(self) -> None:
+    @property
+    def child(self) -> int:
+        """The process number of its newest recorder."""
+        return int(self.wait_for("recorder_started")[-1]["pid"])
+
+    def recordings(self) -> list[Path]:
+        return sorted(path for path in self.bag_dir.glob("rec_*") if path.is_dir())
+
+    def stop(self, number: int = signal.SIGTERM) -> None:
         """Has it end, as a service manager does."""
-        self.process.send_signal(signal.SIGTERM)
+        self.process.send_signal(number)
         code = self.process.wait(timeout=PATIENCE_S)
         assert code == 0, f"the recorder ended with {code}:\n{self.log.read_text()}"
 
