@@ -21,11 +21,10 @@ if TYPE_CHECKING:
 
 TESTS: Final = Path(__file__).parents[1]
 GROUPS: Final[Mapping[str, Sequence[str]]] = {
-    "live": ("integration/test_live_*.py",),
+    "live": ("integration/test_live_*.py", "integration/test_recorder_triggers.py"),
     "stalls": (
         "integration/test_recorder_exclusion.py",
         "integration/test_recorder_stalls.py",
-        "integration/test_recorder_triggers.py",
     ),
     "recorder": ("integration/test_recorder_*.py", "integration/test_retention_*.py"),
     "heavy": ("fuzz/*.py", "soak/*.py", "faults/*.py"),
