@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.oracle.replies.comparison import Comparison
 from tests.oracle.replies.fixture import Record
 from tests.oracle.replies.recording import compare, renew, sample
 from tests.oracle.replies.worlds import WORLDS
@@ -48,12 +47,12 @@ def _forgotten_afterwards() -> Iterator[None]:
 
 
 def held(name: str, *, stored: bool) -> None:
-    world, record, comparison = WORLDS[name], records()[name], Comparison()
+    world, record = WORLDS[name], records()[name]
     if os.environ.get("UPDATE_REPLIES"):
         renew(world, record)
     chosen = None if LONG else short_sample()[name]
-    compare(world, record, comparison, stored=stored, chosen=chosen)
-    assert not comparison.differences, "\n".join(map(str, comparison.differences[:10]))
+    different = compare(world, record, stored=stored, chosen=chosen)
+    assert not different, "\n".join(different[:10])
 
 
 @pytest.mark.parametrize("name", ASKED)

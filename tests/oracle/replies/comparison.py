@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -21,32 +20,12 @@ _NUMBER: Final = re.compile(r"(?<![\w:.])-?\d+\.\d+(?![\w:.]*[-:])")
 """A number with decimals in a sentence, and no part of a time or a version."""
 
 
-@dataclass(frozen=True)
-class Difference:
-    """One difference that matters."""
-
-    world: str
-    call: Call
-    path: str
-    recorded: Any
-    got: Any
-
-    def __str__(self) -> str:
-        shown = [_short(value) for value in (self.recorded, self.got)]
-        return f"{self.world}: {self.call}\n  {self.path}: recorded {shown[0]}, got {shown[1]}"
-
-
-@dataclass
-class Comparison:
-    """Collects differences that matter."""
-
-    differences: list[Difference] = field(default_factory=list)
-
-    def compare(self, world: str, call: Call, recorded: Any, got: Any) -> bool:
-        """Compares two replies to a call; returns whether they are the same."""
-        found = [Difference(world, call, *each) for each in differing(recorded, got)]
-        self.differences += found
-        return not found
+def differences(call: Call, recorded: Any, got: Any) -> list[str]:
+    """What differs that matters, with both values."""
+    return [
+        f"{call}\n  {path}: recorded {_short(one)}, got {_short(other)}"
+        for path, one, other in differing(recorded, got)
+    ]
 
 
 def differing(recorded: Any, got: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:

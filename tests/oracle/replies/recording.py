@@ -9,7 +9,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
 from tests.oracle.replies.asking import Asked, still_time
-from tests.oracle.replies.comparison import Comparison
+from tests.oracle.replies.comparison import differences
 from tests.oracle.replies.fixture import Record, Replied
 from tests.oracle.replies.worlds import WORLDS, ReplyWorld
 
@@ -24,12 +24,11 @@ _SLOW: Final = frozenset({"plot plot", "parquet export", "cli info", "cli forget
 
 def renew(world: ReplyWorld, record: Record) -> None:
     """Writes what is replied today; with a store, ways that take long are not asked."""
-    comparison = Comparison()
     for row, reply in zip(record.replies, answers(world, record, record.replies), strict=True):
         row.reply, row.stored = reply, None
     quick = [row for row in record.replies if row.call.what not in _SLOW]
     for row, reply in zip(quick, answers(world, record, quick, stored=True), strict=True):
-        if not comparison.compare(world.name, row.call, row.reply, reply):
+        if differences(row.call, row.reply, reply):
             row.stored = reply
     record.write()
 
@@ -52,17 +51,18 @@ def answers(
 def compare(
     world: ReplyWorld,
     record: Record,
-    comparison: Comparison,
     *,
     stored: bool = False,
     chosen: Collection[int] | None = None,
-) -> None:
-    """Asks again what was recorded; `chosen` are numbers of calls."""
+) -> list[str]:
+    """Asks again what was recorded; `chosen` are numbers of calls. Returns what differs."""
     replies = record.replies
     rows = replies if chosen is None else [replies[number] for number in sorted(chosen)]
+    found = []
     for row, reply in zip(rows, answers(world, record, rows, stored=stored), strict=True):
         noted = stored and row.stored is not None
-        comparison.compare(world.name, row.call, row.stored if noted else row.reply, reply)
+        found += differences(row.call, row.stored if noted else row.reply, reply)
+    return found
 
 
 def sample(records: Mapping[str, Record], for_each_world: int) -> dict[str, set[int]]:

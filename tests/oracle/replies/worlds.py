@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from tests.home import recording as home
 from tests.home.days import Scale
 from tests.oracle import worlds as odd
-from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, write_mcap
+from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.moving_map import write_moving_map
 from tests.support.noisy_robots import write_noisy_robot
@@ -199,24 +199,13 @@ def math_sign(turn: float) -> float:
     return 1.0 if turn % 2 == 0 else -1.0
 
 
-def _splits(folder: Path, name: str, messages: Sequence[Msg], split_s: int = 10) -> None:
-    """Writes one recording; its first split begins with its first message."""
-    ordered = sorted(messages, key=lambda message: message.log_time)
-    parts: dict[int, list[Msg]] = {}
-    for message in ordered:
-        nth = (message.log_time - ordered[0].log_time) // (split_s * S)
-        parts.setdefault(nth, []).append(message)
-    for number, part in enumerate(parts.values()):
-        write_mcap(folder / name / f"{name}_{number}.mcap", part)
-
-
 def _wrong_clocks(folder: Path) -> None:
     """Three days of a robot, and recordings of it while its clock said 1970 and 2036."""
     for day in range(3):
         begin = T0 + day * 86_400 * S
-        _splits(folder, f"day_{day}", _driving(begin, 60))
+        odd.written(folder / f"day_{day}", _driving(begin, 60))
     for name, begin in (("unset", 30 * S), ("ahead", 2_092_000_000 * S)):
-        _splits(folder, name, _driving(begin, 60, x=50.0))
+        odd.written(folder / name, _driving(begin, 60, x=50.0))
 
 
 def _stepped_clock(folder: Path) -> None:
@@ -225,14 +214,14 @@ def _stepped_clock(folder: Path) -> None:
     for message in _driving(T0, 120):
         ahead = 2 * S if message.log_time >= T0 + 61 * S else 0
         messages.append(Msg(message.topic, message.type, message.log_time + ahead, message.body))
-    _splits(folder, "stepped", messages)
+    odd.written(folder / "stepped", messages)
 
 
 def _resets(folder: Path) -> None:
     """Odometry begins anew with each recording, after pauses of 0.05, 2 and 8 s."""
     begin = T0
     for number, pause_ns in enumerate((50 * MS, 2 * S, 8 * S, 0)):
-        _splits(folder, f"run_{number}", _driving(begin, 50, x=0.5 * number))
+        odd.written(folder / f"run_{number}", _driving(begin, 50, x=0.5 * number))
         begin += 50 * S + pause_ns
 
 
@@ -244,18 +233,18 @@ def _silent_odometry(folder: Path) -> None:
         for message in _driving(T0, 220)
         if message.topic not in {"/odom", "/tf"} or message.log_time not in quiet
     ]
-    _splits(folder, "quiet", messages)
+    odd.written(folder / "quiet", messages)
 
 
 def _two_at_once(folder: Path) -> None:
     """Two robots record the same topics at the same time, far from each other."""
-    _splits(folder, "left", _driving(T0, 90))
-    _splits(folder, "right", _driving(T0 + 3 * S + 70 * MS, 90, x=30.0))
+    odd.written(folder / "left", _driving(T0, 90))
+    odd.written(folder / "right", _driving(T0 + 3 * S + 70 * MS, 90, x=30.0))
 
 
 def _damaged(folder: Path) -> None:
     """A split is cut, one has a flipped bit, one is empty, one a text, one has no end."""
-    _splits(folder, "hurt", _driving(T0, 100))
+    odd.written(folder / "hurt", _driving(T0, 100))
     files = [folder / "hurt" / f"hurt_{number}.mcap" for number in range(10)]
     whole = files[2].read_bytes()
     files[2].write_bytes(whole[: len(whole) * 3 // 5])
