@@ -10,7 +10,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from itertools import cycle
 from pathlib import Path
@@ -172,11 +171,6 @@ def record(bag_dir: Path, messages: Iterable[Msg]) -> Path:
     return write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", ordered)
 
 
-def of_topic(bag_dir: Path, topic: str) -> list[Record]:
-    """What the day has of a topic."""
-    return [one for one in messages_in(bag_dir / DAY_FILE) if one.channel.topic == topic]
-
-
 def bags_left(bag_dir: Path, name: str = "rec_A") -> int:
     return len([*bag_dir.glob(f"{name}/*.mcap")])
 
@@ -187,16 +181,6 @@ def topics_in(bag_dir: Path) -> Counter[str]:
 
 def days_in(bag_dir: Path) -> list[str]:
     return sorted(path.name for path in bag_dir.glob("memory/*.mcap"))
-
-
-def labels_in(path: Path) -> set[str]:
-    reader = McapReader()
-    return {
-        seen.label
-        for record in messages_in(path)
-        if record.channel.topic == "/vision/scene/scene_objects"
-        for seen in reader.decode(record).detections  # type: ignore[attr-defined]
-    }
 
 
 @pytest.fixture
@@ -215,83 +199,6 @@ def test_a_day_has_what_changes_and_what_was_seen_and_no_text(bag_dir: Path) -> 
     assert found["/vision/scene/scene_objects"] == 180
     assert b"4711" not in (bag_dir / DAY_FILE).read_bytes()
     assert McapReader().summarize(bag_dir / DAY_FILE).complete
-
-
-def test_people_are_taken_out_by_words_of_several_languages_unless_their_label_is_named(
-    bag_dir: Path,
-) -> None:
-    people = ("Person", "alte Frau", "niño", "行人", "TrackedPerson", "PERSON_2", "Anna")
-    things = {"mug", "drill", "surface", "Manometer"}
-    split(bag_dir, 0, labels=(*people, *things))
-    keep_all(bag_dir, limits=MemoryLimits(people=("anna",)))
-    assert labels_in(bag_dir / DAY_FILE) == things
-    assert b"Person" not in (bag_dir / DAY_FILE).read_bytes()
-    (bag_dir / DAY_FILE).unlink()
-    limits = MemoryLimits(labels=("Person",), people=("anna",))
-    keep_all(bag_dir, limits=limits)
-    assert labels_in(bag_dir / DAY_FILE) == {*things, "Person"}
-
-
-def camera(at: int, *frames: str) -> Msg:
-    return tf(at, *(transform(at, "map", frame, (0.1, 0, 0.3)) for frame in frames))
-
-
-def test_people_are_looked_for_in_frames_topics_and_numbers(bag_dir: Path) -> None:
-    """Of models that say numbers 0 is mostly a person."""
-    at = [T0 + n * S for n in range(60)]
-    messages = [
-        *(detections(each, ("0", "mug")) for each in at),
-        *(camera(each, "base_link", "person_1") for each in at[::2]),
-        *(camera(each, "base_link") for each in at[1::2]),
-        tf(T0, transform(T0, "map", "child", (0.1, 0, 0.3)), topic="/tf_static"),
-        *(boolean(each, each % 2 == 0, topic="/face/is_seen") for each in at),
-    ]
-    record(bag_dir, messages)
-    keep_all(bag_dir)
-    reader = McapReader()
-    stays = [(one.channel.topic, reader.decode(one)) for one in messages_in(bag_dir / DAY_FILE)]
-    assert {topic for topic, _ in stays} == {"/vision/scene/scene_objects", "/tf"}
-    assert "person" not in repr(stays)
-    assert "label='0'" not in repr(stays)
-    assert "base_link" in repr([one for topic, one in stays if topic == "/tf"])
-
-
-def test_people_are_looked_for_in_json_that_is_no_detection(bag_dir: Path) -> None:
-    states = (
-        {"state": "held", "object": "mug"},
-        {"state": "held", "object": "person"},
-        {"class": "EVT", "of": [{"label": "child"}, {"class_id": 0}]},
-    )
-    every = zip(range(T0, T0 + 60 * S, S), cycle(map(json.dumps, states)), strict=False)
-    record(bag_dir, [text(at, state, topic="/arm") for at, state in every])
-    keep_all(bag_dir, limits=MemoryLimits(texts=("/arm",)))
-    said = {McapReader().decode(one).data for one in of_topic(bag_dir, "/arm")}  # type: ignore[attr-defined]
-    assert said == {json.dumps(states[0])}
-
-
-def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> None:
-    begin = T0
-    spectrum = [
-        Msg(
-            "/spectrum",
-            "std_msgs/msg/Float32MultiArray",
-            begin + n * S,
-            make(
-                "std_msgs/msg/Float32MultiArray",
-                layout=make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0),
-                data=np.ones(65, np.float32),
-            ),
-        )
-        for n in range(30)
-    ]
-    states = [goals(begin + n * S // 2, {1: 2 if n < 21 else 4}) for n in range(60)]
-    record(bag_dir, [*spectrum, *states])
-    keep_all(bag_dir)
-    status = "/drive/_action/status"
-    found = {(one.log_time - begin) / S for one in of_topic(bag_dir, status)}
-    assert found >= {10.0, 10.5}
-    assert len(found) < 20
-    assert {*topics_in(bag_dir)} == {status}
 
 
 def test_days_that_nobody_wants_go_after_a_day_of_running_and_not_before(bag_dir: Path) -> None:
@@ -402,7 +309,7 @@ def drive_and_stand(bag_dir: Path, name: str, start: int) -> Path:
     """Half a minute of driving, a minute of standing, and half a minute of driving on."""
     begin = T0 + start * S
     messages: list[Msg] = []
-    for at in range(begin, begin + 120 * S, S // 20):
+    for at in range(begin, begin + 120 * S, S // 5):
         seconds = (at - begin) / S
         driven = min(seconds, 30.0) + max(seconds - 90.0, 0.0)
         messages.append(odom(at, start + driven / 4, 1.0))
@@ -419,12 +326,12 @@ def test_what_was_not_recorded_is_not_answered_from_memory(bag_dir: Path, pause:
     drive_and_stand(bag_dir, "rec_C", 4000)
     own_all(bag_dir)
     whole: dict[str, dict[str, Any]] = {
-        "recap": {"start": T0_S, "end": T0_S + 119.9},
+        "recap": {"start": T0_S, "end": T0_S + 119.8},
         "get_topic_in_range": {
             "topic": "/bumper",
             "by": "value",
             "start": T0_S,
-            "end": T0_S + 119.9,
+            "end": T0_S + 119.8,
         },
     }
     recap, values = (reply_over(bag_dir, tool, **given) for tool, given in whole.items())
@@ -507,7 +414,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
     return Undisturbed(before, after, whole, poses_in(after))
 
 
-@pytest.mark.parametrize("steps", range(7) if LONG else (0, 2, 3, 5, 6))
+@pytest.mark.parametrize("steps", range(7) if LONG else (0, 3, 5))
 def test_a_kill_at_any_step_counts_no_message_twice_and_loses_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: Undisturbed, steps: int
 ) -> None:
@@ -565,64 +472,6 @@ def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
     assert [path.name for path in (bag_dir / "memory").iterdir()] == ["mine.mcap"]
 
 
-def test_after_a_month_numbers_have_one_message_a_minute(bag_dir: Path) -> None:
-    splits(bag_dir, range(10))
-    own_all(bag_dir)
-    days = days_of(bag_dir)
-    keep_all(bag_dir, days=days)
-    before = topics_in(bag_dir)
-    days.limit(T0 + 2 * 86_400 * S)
-    assert topics_in(bag_dir) == before
-    days.limit(T0 + MONTH_NS + 2 * 86_400 * S)
-    after = topics_in(bag_dir)
-    assert before["/battery_state"] > 80
-    assert after["/battery_state"] <= 10 + 2 * 8 + 1
-    assert before - Counter({"/battery_state": before["/battery_state"]}) == after - Counter(
-        {"/battery_state": after["/battery_state"]}
-    )
-
-
-def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    split(bag_dir, 0)
-    keep_all(bag_dir)
-    now, path = T0 + MONTH_NS + 2 * 86_400 * S, bag_dir / DAY_FILE
-    unthinned = path.stat().st_ino
-    days_of(bag_dir).limit(now)
-    thinned, status = path.stat().st_ino, path.stat()
-    assert thinned != unthinned
-    # The bag that could not be deleted yet counts no more than before.
-    assert read_superseded(bag_dir).days == {DAY_FILE: (status.st_size, status.st_mtime_ns)}
-    read: list[object] = []
-
-    def batches(_: BagDirReader, *of: object, **__: object) -> Iterator[object]:
-        read.append(of)
-        return iter(())
-
-    with monkeypatch.context() as patched:
-        patched.setattr(BagDirReader, "batches", batches)
-        days_of(bag_dir).limit(now)
-    assert not read
-    assert path.stat().st_ino == thinned
-    split(bag_dir, 60, name="rec_B")
-    keep_all(bag_dir, "rec_B")
-    before = topics_in(bag_dir)["/battery_state"]
-    days_of(bag_dir).limit(now)
-    after = [one.log_time for one in of_topic(bag_dir, "/battery_state")]
-    assert len({*after}) == len(after) < before
-
-
-def test_a_damaged_day_is_not_thinned_so_that_it_still_says_so(bag_dir: Path) -> None:
-    split(bag_dir, 0)
-    keep_all(bag_dir)
-    path = bag_dir / DAY_FILE
-    whole = path.read_bytes()
-    path.write_bytes(damaged := whole[:300] + bytes(100) + whole[400:])
-    days_of(bag_dir).limit(T0 + MONTH_NS + 2 * 86_400 * S)
-    assert path.read_bytes() == damaged
-
-
 def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     """Splits of 13:20 to 14:40; at 14:10 plus a day the hour from 13:00 is too old."""
     splits(bag_dir, range(0, 80, 10))
@@ -678,51 +527,6 @@ def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
     assert any("only some messages stayed" in note for note in never["notes"])
 
 
-def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_dir: Path) -> None:
-    splits(bag_dir, range(0, 80, 10))
-    split(bag_dir, 86_400 + 3000, name="rec_B")
-    own_all(bag_dir)
-    monotonic = SettableClock(0)
-    keeper = house(
-        bag_dir,
-        T0 + (86_400 + 3060) * S,
-        max_age_h=24,
-        memory=days_of(bag_dir, writer=Failing(0)),
-        monotonic=lambda: monotonic.now() / S,
-    )
-    keeper.apply()
-    assert bags_left(bag_dir) == 8
-    monotonic.at = 90_000 * S
-    keeper.apply()
-    assert bags_left(bag_dir) == 4
-
-
-def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_dir: Path) -> None:
-    splits(bag_dir, range(10))
-    split(bag_dir, 7200, name="rec_B")
-    own_all(bag_dir)
-    sizes = [path.stat().st_size for path in bag_dir.rglob("*.mcap")]
-    memory = days_of(bag_dir, writer=Failing(0))
-    max_bytes = sum(sizes) - min(sizes) // 2
-    house(bag_dir, T0 + 7300 * S, max_bytes=max_bytes, memory=memory).apply()
-    assert bags_left(bag_dir, "rec_*") == 10
-
-
-def test_where_a_day_cannot_be_written_what_the_limits_need_goes_the_oldest_first(
-    bag_dir: Path,
-) -> None:
-    """The hour from 13:00 is too old, that from 14:00 is not."""
-    splits(bag_dir, range(0, 80, 10))
-    split(bag_dir, 86_400 + 3000, name="rec_B")
-    own_all(bag_dir)
-    sizes = [path.stat().st_size for path in bag_dir.rglob("rec_*/*.mcap")]
-    memory, now = days_of(bag_dir, writer=Failing(0)), T0 + (86_400 + 3060) * S
-    max_bytes = sum(sizes) - min(sizes) // 2
-    house(bag_dir, now, max_age_h=24, max_bytes=max_bytes, memory=memory).apply()
-    left = {path.name for path in (bag_dir / "rec_A").glob("*.mcap")}
-    assert left == {f"rec_A_{minute}.mcap" for minute in range(10, 80, 10)}
-
-
 def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
     bag_dir: Path,
 ) -> None:
@@ -750,48 +554,6 @@ def unreachable(path: Path) -> BagError | None:
     return BagUnreachableError(str(path), reason) if path.parent.name == "rec_A" else None
 
 
-@pytest.mark.parametrize("way", ["records", "batches"])
-def test_age_waits_while_the_disk_fails_and_then_all_of_it_stays(bag_dir: Path, way: str) -> None:
-    split(bag_dir, 0)
-    split(bag_dir, 72_000, name="rec_B")
-    own_all(bag_dir)
-    keeper = house(bag_dir, T0 + 72_100 * S, max_age_h=12, memory=days_of(bag_dir))
-    with pytest.MonkeyPatch.context() as patched:
-        fail_reading(patched, way, unreachable)
-        keeper.apply()
-    assert bags_left(bag_dir) == 1
-    assert not days_in(bag_dir)
-    keeper.apply()
-    assert not bags_left(bag_dir)
-    assert len(days_in(bag_dir)) == 1
-
-
-@pytest.mark.parametrize("way", ["records", "batches"])
-def test_what_the_disk_never_gives_holds_others_for_two_days_at_most(
-    bag_dir: Path, way: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    split(bag_dir, 0)
-    split(bag_dir, 600, name="rec_C")
-    split(bag_dir, 72_000, name="rec_B")
-    own_all(bag_dir)
-    fail_reading(monkeypatch, way, unreachable)
-    clock = SettableClock(0)
-
-    def monotonic() -> float:
-        return clock.now() / S
-
-    memory = days_of(bag_dir, monotonic=monotonic)
-    keeper = house(bag_dir, T0 + 72_700 * S, max_age_h=12, memory=memory, monotonic=monotonic)
-    keeper.apply()
-    assert not days_in(bag_dir)
-    # A day for its latched messages, then one for what stays of it.
-    for clock.at in range(0, 172_802 * S, 3600 * S):
-        keeper.apply()
-    assert not bags_left(bag_dir, "rec_[AC]")
-    [day] = bag_dir.glob("memory/*.mcap")
-    assert McapReader().summarize(day).start >= T0 + 600 * S
-
-
 def test_forgetting_takes_it_out_of_days_to_the_byte(
     bag_dir: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
 ) -> None:
@@ -807,72 +569,6 @@ def test_forgetting_takes_it_out_of_days_to_the_byte(
     topics = {*topics_in(bag_dir)}
     assert "/odom" in topics
     assert "/vision/scene/scene_objects" not in topics
-
-
-def blind_for_three_minutes(bag_dir: Path) -> None:
-    """Nine minutes of bags, in the middle three of which the detector is silent, and newer ones."""
-    for hour in (12, 29):
-        split(bag_dir, hour * 3600, name="rec_Z")
-    for nth in range(9):
-        split(bag_dir, 60 * nth, labels=None if nth in {3, 4, 5} else ("mug",))
-    own_all(bag_dir)
-
-
-def shown(bag_dir: Path) -> tuple[Any, ...]:
-    """What is reported besides messages: silences, steps of the clock, what a crash left open."""
-    times = reply_over(bag_dir, "data_time_range")
-    status = reply_over(bag_dir, "memory_status")
-    return times.get("silences"), times.get("clock_steps"), status.get("incomplete")
-
-
-def delete_all(bag_dir: Path) -> None:
-    """As retention does it, by age."""
-    for _ in range(3):
-        house(bag_dir, T0 + (29 * 3600 + 60) * S, max_age_h=24, memory=days_of(bag_dir)).apply()
-    assert not bags_left(bag_dir)
-
-
-def test_a_silence_is_forgotten_with_its_topic(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
-) -> None:
-    blind_for_three_minutes(bag_dir)
-    delete_all(bag_dir)
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
-    window = ("--start", T0_S, "--end", T0_S + 300)
-    exits(0, "forget", "--topic", "/odom", *window, "--yes")
-    assert read_thinned(bag_dir).silences
-    exits(0, "forget", "--topic", "/vision/*", *window, "--yes")
-    assert not read_thinned(bag_dir).silences
-    assert not shown(bag_dir)[0]
-
-
-def test_what_bags_showed_goes_with_the_last_day_of_that_time(bag_dir: Path) -> None:
-    blind_for_three_minutes(bag_dir)
-    delete_all(bag_dir)
-    later = 2 * 86_400
-    for nth in range(9):
-        split(bag_dir, later + 60 * nth, name="rec_B")
-    keep_all(bag_dir, "rec_B")
-    limits = MemoryLimits(max_age_ns=86_400 * S)
-    days_of(bag_dir, limits=limits).limit(T0 + (later + 3600) * S)
-    assert not read_thinned(bag_dir).silences
-    days_of(bag_dir, limits=limits).limit(T0 + 10 * later * S)
-    assert [*(bag_dir / "memory").iterdir()] == []
-
-
-def test_days_whose_bags_nobody_looked_at_say_so(bag_dir: Path) -> None:
-    blind_for_three_minutes(bag_dir)
-    delete_all(bag_dir)
-    note = "silences and steps of the clock within the days of memory/ are not known"
-    assert note not in reply_over(bag_dir, "data_time_range").get("notes", ())
-    (bag_dir / THINNED_FILE).write_text("{")
-    assert note in reply_over(bag_dir, "data_time_range")["notes"]
-    split(bag_dir, 3600, name="rec_B")
-    keep_all(bag_dir, "rec_B")
-    [said] = [
-        each for each in reply_over(bag_dir, "data_time_range")["notes"] if "memory/ before" in each
-    ]
-    assert said.endswith("are not known")
 
 
 GOLDEN = Path(__file__).resolve().parents[2] / "data" / "memory_day_1.mcap"
@@ -915,76 +611,6 @@ def test_a_day_across_a_step_of_the_clock_is_read_by_the_hours_that_it_has(
     assert asked
 
 
-@pytest.mark.parametrize(
-    ("names", "kept"),
-    [
-        (["neck_yaw", "face_pitch", "arm"], ["neck_yaw", "arm"]),
-        # Servos on a bus are called so, and labels of numbers are people's.
-        (["1", "2", "3"], ["1", "2", "3"]),
-    ],
-)
-def test_without_hidden_joints_others_keep_their_own_values(
-    bag_dir: Path, names: list[str], kept: list[str]
-) -> None:
-    kind, at = "sensor_msgs/msg/JointState", np.array([0.1, 0.2, 0.3])
-    none = np.zeros(0)
-    body = make(kind, header=header(T0, "1"), name=names, position=at, velocity=none, effort=none)
-    seen = [detections(T0 + nth * S, ("0", "mug")) for nth in range(3)]
-    record(bag_dir, [Msg("/joint_states", kind, T0, body), *seen])
-    keep_all(bag_dir)
-    [found] = of_topic(bag_dir, "/joint_states")
-    message: Any = McapReader().decode(found)
-    assert message.name == kept
-    left = [each for each, name in zip(at, names, strict=True) if name in kept]
-    assert message.position.tolist() == pytest.approx(left, abs=0.001)
-    assert labels_in(bag_dir / DAY_FILE) == {"mug"}
-
-
-@pytest.mark.parametrize(
-    ("kind", "entry", "listed", "named", "fields"),
-    [
-        (
-            "darknet_ros_msgs/msg/BoundingBoxes",
-            "darknet_ros_msgs/msg/BoundingBox",
-            "bounding_boxes",
-            "Class",
-            {"probability": 0.9, "xmin": 4},
-        ),
-        (
-            "yolo_msgs/msg/DetectionArray",
-            "yolo_msgs/msg/Detection",
-            "detections",
-            "id",
-            {"class_name": "thing", "score": 0.9},
-        ),
-    ],
-)
-def test_detections_stay_without_people_whatever_field_names_them(
-    bag_dir: Path, kind: str, entry: str, listed: str, named: str, fields: dict[str, object]
-) -> None:
-    found = [make(entry, **fields, **{named: name}) for name in ("cup_3", "person_17")]
-    at = [T0 + nth * S for nth in range(3)]
-    seen = [make(kind, header=header(each, "camera"), **{listed: found}) for each in at]
-    record(bag_dir, [Msg("/seen", kind, *each) for each in zip(at, seen, strict=True)])
-    keep_all(bag_dir)
-    [stays, *_] = of_topic(bag_dir, "/seen")
-    message = McapReader().decode(stays)
-    assert [getattr(one, named) for one in getattr(message, listed)] == ["cup_3"]
-
-
-def test_of_a_latched_message_only_the_hidden_frame_goes(bag_dir: Path) -> None:
-    """All that many robots say of their static frames is one message."""
-    at = [T0 + n * S for n in range(10)]
-    frames = ("base_link", "person_1", "2")
-    exact = tf(T0, *(transform(T0, "map", each, (0.123456789, 0, 0)) for each in frames))
-    record(bag_dir, [replace(exact, topic="/tf_static"), *(odom(each, 1.0, 2.0) for each in at)])
-    keep_all(bag_dir)
-    [kept] = of_topic(bag_dir, "/tf_static")
-    message: Any = McapReader().decode(kept)
-    assert [each.child_frame_id for each in message.transforms] == ["base_link", "2"]
-    assert {each.transform.translation.x for each in message.transforms} == {0.123456789}
-
-
 def test_a_clock_that_was_ahead_hides_nothing_and_pushes_no_day_out(bag_dir: Path) -> None:
     ahead = 400 * 86_400
     now = SettableClock(T0 + (ahead + 100) * S)
@@ -999,3 +625,257 @@ def test_a_clock_that_was_ahead_hides_nothing_and_pushes_no_day_out(bag_dir: Pat
     size = sum(path.stat().st_size for path in (bag_dir / "memory").glob("*.mcap"))
     days_of(bag_dir, limits=MemoryLimits(max_bytes=size - 1)).limit(T0 + 90_000 * S)
     assert days_in(bag_dir) == days[:2]
+
+
+def decoded(bag_dir: Path) -> dict[str, list[Any]]:
+    """The messages of the day by topic."""
+    found: dict[str, list[Any]] = {}
+    for one in messages_in(bag_dir / DAY_FILE):
+        found.setdefault(one.channel.topic, []).append(McapReader().decode(one))
+    return found
+
+
+def labels_in(bag_dir: Path) -> set[str]:
+    return {
+        seen.label
+        for each in decoded(bag_dir)["/vision/scene/scene_objects"]
+        for seen in each.detections
+    }
+
+
+PEOPLE = ("Person", "alte Frau", "niño", "行人", "TrackedPerson", "PERSON_2", "Anna", "0")
+THINGS = {"mug", "drill", "surface", "Manometer"}
+STATES = (
+    {"state": "held", "object": "mug"},
+    {"state": "held", "object": "person"},
+    {"class": "EVT", "of": [{"label": "child"}, {"class_id": 0}]},
+)
+
+
+def joints(topic: str, *names: str) -> Msg:
+    kind, at = "sensor_msgs/msg/JointState", np.array([0.1, 0.2, 0.3])
+    fields = {"position": at, "velocity": np.zeros(0), "effort": np.zeros(0)}
+    return Msg(topic, kind, T0, make(kind, header=header(T0, "1"), name=[*names], **fields))
+
+
+def seen_by(kind: str, entry: str, listed: str, named: str, **fields: object) -> Msg:
+    found = [make(entry, **fields, **{named: name}) for name in ("cup_3", "person_17")]
+    return Msg(f"/{listed}", kind, T0, make(kind, header=header(T0, "camera"), **{listed: found}))
+
+
+def test_people_are_taken_out_whatever_names_them_unless_their_label_is_named(
+    bag_dir: Path,
+) -> None:
+    """In words of several languages, labels, numbers of models, frames, topics, joints and JSON."""
+    times = [T0 + n * S for n in range(60)]
+    frames = [
+        transform(T0, "map", each, (0.123456789, 0, 0)) for each in ("base_link", "person_1", "2")
+    ]
+    record(
+        bag_dir,
+        [
+            *(detections(at, (*PEOPLE, *THINGS)) for at in times),
+            *(tf(at, *frames[: 1 + nth % 2]) for nth, at in enumerate(times)),
+            tf(T0, *frames, topic="/tf_static"),
+            tf(T0, transform(T0, "map", "child", (0.1, 0, 0.3)), topic="/tf_static"),
+            *(boolean(at, at % 2 == 0, topic="/face/is_seen") for at in times),
+            *(
+                text(at, json.dumps(state), "/arm")
+                for at, state in zip(times, cycle(STATES), strict=False)
+            ),
+            joints("/joints", "neck_yaw", "face_pitch", "arm"),
+            # Servos on a bus are called so, and labels of numbers are people's.
+            joints("/servos", "1", "2", "3"),
+            seen_by(
+                "darknet_ros_msgs/msg/BoundingBoxes",
+                "darknet_ros_msgs/msg/BoundingBox",
+                "bounding_boxes",
+                "Class",
+                probability=0.9,
+                xmin=4,
+            ),
+            seen_by(
+                "yolo_msgs/msg/DetectionArray",
+                "yolo_msgs/msg/Detection",
+                "detections",
+                "id",
+                class_name="thing",
+                score=0.9,
+            ),
+        ],
+    )
+    keep_all(bag_dir, limits=MemoryLimits(people=("anna",), texts=("/arm",)))
+    stays = decoded(bag_dir)
+    assert "/face/is_seen" not in stays
+    assert labels_in(bag_dir) == THINGS
+    assert {each.child_frame_id for one in stays["/tf"] for each in one.transforms} == {"base_link"}
+    [static] = stays["/tf_static"]
+    assert [each.child_frame_id for each in static.transforms] == ["base_link", "2"]
+    assert {each.transform.translation.x for each in static.transforms} == {0.123456789}
+    assert {each.data for each in stays["/arm"]} == {json.dumps(STATES[0])}
+    for topic, names, at in (
+        ("/joints", ["neck_yaw", "arm"], [0.1, 0.3]),
+        ("/servos", ["1", "2", "3"], [0.1, 0.2, 0.3]),
+    ):
+        [message] = stays[topic]
+        assert message.name == names
+        assert message.position.tolist() == pytest.approx(at, abs=0.001)
+    assert [each.Class for each in stays["/bounding_boxes"][0].bounding_boxes] == ["cup_3"]
+    assert [each.id for each in stays["/detections"][0].detections] == ["cup_3"]
+    assert b"Person" not in (bag_dir / DAY_FILE).read_bytes()
+    (bag_dir / DAY_FILE).unlink()
+    keep_all(bag_dir, limits=MemoryLimits(labels=("Person",), people=("anna",)))
+    assert labels_in(bag_dir) == {*THINGS, "Person"}
+
+
+def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> None:
+    kind = "std_msgs/msg/Float32MultiArray"
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    samples = make(kind, layout=layout, data=np.ones(65, np.float32))
+    spectrum = [Msg("/spectrum", kind, T0 + n * S, samples) for n in range(30)]
+    states = [goals(T0 + n * S // 2, {1: 2 if n < 21 else 4}) for n in range(60)]
+    record(bag_dir, [*spectrum, *states])
+    keep_all(bag_dir)
+    found = {(one.log_time - T0) / S for one in messages_in(bag_dir / DAY_FILE)}
+    assert {*topics_in(bag_dir)} == {"/drive/_action/status"}
+    assert found >= {10.0, 10.5}
+    assert len(found) < 20
+
+
+def test_after_a_month_numbers_have_one_message_a_minute_once_and_again_with_what_is_added(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splits(bag_dir, range(10))
+    own_all(bag_dir)
+    keep_all(bag_dir)
+    path, battery_only = bag_dir / DAY_FILE, "/battery_state"
+    now, whole, before = T0 + MONTH_NS + 2 * 86_400 * S, path.read_bytes(), topics_in(bag_dir)
+    # One that is damaged still says so.
+    path.write_bytes(damaged := whole[:300] + bytes(100) + whole[400:])
+    days_of(bag_dir).limit(now)
+    assert path.read_bytes() == damaged
+    path.write_bytes(whole)
+    days_of(bag_dir).limit(T0 + 2 * 86_400 * S)
+    assert path.read_bytes() == whole
+    days_of(bag_dir).limit(now)
+    after, status = topics_in(bag_dir), path.stat()
+    assert before[battery_only] > 80
+    assert after[battery_only] <= 10 + 2 * 8 + 1
+    assert after | {battery_only: 0} == before | {battery_only: 0}
+    # The bags that could not be deleted yet count no more than before.
+    assert read_superseded(bag_dir).days == {DAY_FILE: (status.st_size, status.st_mtime_ns)}
+    with monkeypatch.context() as patched:
+        patched.setattr(BagDirReader, "batches", lambda *_, **__: pytest.fail("it is read again"))
+        days_of(bag_dir).limit(now)
+    assert path.stat().st_ino == status.st_ino
+    split(bag_dir, 600, name="rec_B")
+    keep_all(bag_dir, "rec_B")
+    before = topics_in(bag_dir)
+    days_of(bag_dir).limit(now)
+    assert after[battery_only] < topics_in(bag_dir)[battery_only] < before[battery_only]
+
+
+def test_where_a_day_cannot_be_written_the_limits_take_the_oldest_and_age_waits_for_a_day(
+    bag_dir: Path,
+) -> None:
+    """The hour from 13:00 is too old, that from 14:00 is not."""
+    splits(bag_dir, range(0, 80, 10))
+    split(bag_dir, 86_400 + 3000, name="rec_B")
+    own_all(bag_dir)
+    sizes = [path.stat().st_size for path in bag_dir.rglob("rec_*/*.mcap")]
+    monotonic = SettableClock(0)
+    keeper = house(
+        bag_dir,
+        T0 + (86_400 + 3060) * S,
+        max_age_h=24,
+        max_bytes=sum(sizes) - min(sizes) // 2,
+        memory=days_of(bag_dir, writer=Failing(0)),
+        monotonic=lambda: monotonic.now() / S,
+    )
+    for monotonic.at, first in ((0, 10), (90_000 * S, 40)):
+        keeper.apply()
+        left = {path.name for path in (bag_dir / "rec_A").glob("*.mcap")}
+        assert left == {f"rec_A_{minute}.mcap" for minute in range(first, 80, 10)}
+
+
+@pytest.mark.parametrize("way", ["records", "batches"])
+@pytest.mark.parametrize("is_lasting", [False, True])
+def test_what_the_disk_does_not_give_holds_others_for_two_days_and_stays_if_it_comes(
+    bag_dir: Path, way: str, is_lasting: bool
+) -> None:
+    for start, name in ((0, "rec_A"), (600, "rec_C"), (72_000, "rec_B")):
+        split(bag_dir, start, name=name)
+    own_all(bag_dir)
+    clock = SettableClock(0)
+    how: dict[str, Any] = {"monotonic": lambda: clock.now() / S}
+    memory = days_of(bag_dir, **how)
+    keeper = house(bag_dir, T0 + 72_700 * S, max_age_h=12, memory=memory, **how)
+    with pytest.MonkeyPatch.context() as patched:
+        fail_reading(patched, way, unreachable)
+        keeper.apply()
+        assert bags_left(bag_dir, "rec_[AC]") == 2
+        assert not days_in(bag_dir)
+        # A day for its latched messages, then one for what stays of it.
+        for clock.at in range(0, 172_802 * S if is_lasting else 1, 3600 * S):
+            keeper.apply()
+    keeper.apply()
+    assert not bags_left(bag_dir, "rec_[AC]")
+    [day] = bag_dir.glob("memory/*.mcap")
+    assert (McapReader().summarize(day).start >= T0 + 600 * S) is is_lasting
+
+
+@pytest.fixture(scope="module")
+def deleted_by_age(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The days of nine minutes, in the middle three of which the detector was silent."""
+    bag_dir = tmp_path_factory.mktemp("bags")
+    for hour in (12, 29):
+        split(bag_dir, hour * 3600, name="rec_Z")
+    for nth in range(9):
+        split(bag_dir, 60 * nth, labels=None if nth in {3, 4, 5} else ("mug",))
+    own_all(bag_dir)
+    for _ in range(3):
+        house(bag_dir, T0 + (29 * 3600 + 60) * S, max_age_h=24, memory=days_of(bag_dir)).apply()
+    assert not bags_left(bag_dir)
+    return bag_dir
+
+
+@pytest.fixture
+def blind(deleted_by_age: Path, tmp_path: Path) -> Path:
+    copied = shutil.copytree(deleted_by_age, tmp_path / "blind")
+    own_all(copied)
+    return copied
+
+
+def test_a_silence_is_forgotten_with_its_topic(
+    blind: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+) -> None:
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(blind))
+    window = ("--start", T0_S, "--end", T0_S + 300)
+    exits(0, "forget --topic /odom", *window, "--yes")
+    assert read_thinned(blind).silences
+    exits(0, "forget --topic /vision/*", *window, "--yes")
+    assert not read_thinned(blind).silences
+    assert not reply_over(blind, "data_time_range").get("silences")
+
+
+def test_what_bags_showed_goes_with_the_last_day_of_that_time(blind: Path) -> None:
+    later = 2 * 86_400
+    split(blind, later, name="rec_B")
+    keep_all(blind, "rec_B")
+    limits = MemoryLimits(max_age_ns=86_400 * S)
+    days_of(blind, limits=limits).limit(T0 + (later + 3600) * S)
+    assert not read_thinned(blind).silences
+    days_of(blind, limits=limits).limit(T0 + 10 * later * S)
+    assert [*(blind / "memory").iterdir()] == []
+
+
+def test_days_whose_bags_nobody_looked_at_say_so(blind: Path) -> None:
+    note = "silences and steps of the clock within the days of memory/ are not known"
+    assert note not in reply_over(blind, "data_time_range").get("notes", ())
+    (blind / THINNED_FILE).write_text("{")
+    assert note in reply_over(blind, "data_time_range")["notes"]
+    split(blind, 3600, name="rec_B")
+    keep_all(blind, "rec_B")
+    notes = reply_over(blind, "data_time_range")["notes"]
+    [said] = [each for each in notes if "memory/ before" in each]
+    assert said.endswith("are not known")
