@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import pytest
@@ -66,37 +68,21 @@ def bags(bag_dir: Path) -> list[str]:
     return sorted(path.name for path in bag_dir.glob("rec_*/*.mcap"))
 
 
-def test_bags_that_lie_wholly_inside_go(bag_dir: Path, forget: Forget) -> None:
-    shown = forget(0, 20, 55).out
-    assert bags(bag_dir) == ["rec_0.mcap", "rec_3.mcap"]
-    assert "deleted: 2 bags" in shown
-
-
-def test_a_dry_run_only_reports(bag_dir: Path, forget: Forget) -> None:
+def test_it_asks_before_bags_that_lie_wholly_inside_go_and_a_dry_run_only_reports(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
     output = forget(0, 20, 35, "--dry-run").out
     assert "would be deleted: 1 bag" in output
     assert "rec_0/rec_1.mcap" in output
-    assert len(bags(bag_dir)) == 4
-
-
-@pytest.mark.parametrize(
-    ("answer", "left_over", "code"), [("y\n", 3, 0), ("n\n", 4, 1), ("", 4, 1)]
-)
-def test_it_asks_before(
-    bag_dir: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    answer: str,
-    left_over: int,
-    code: int,
-    forget: Forget,
-) -> None:
-    read, write = os.pipe()
-    os.write(write, answer.encode())
-    os.close(write)
-    with os.fdopen(read) as stdin:
-        monkeypatch.setattr("sys.stdin", stdin)
-        forget(code, 20, 35, "")
-    assert len(bags(bag_dir)) == left_over
+    for answer, code, left_over in (
+        ("", 1, [0, 1, 2, 3]),
+        ("n\n", 1, [0, 1, 2, 3]),
+        ("y\n", 0, [0, 3]),
+    ):
+        monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+        shown = forget(code, 20, 55, "").out
+        assert bags(bag_dir) == [f"rec_{number}.mcap" for number in left_over]
+    assert "deleted: 2 bags" in shown
 
 
 def test_latched_messages_that_later_answers_need_are_carried_on(
@@ -170,7 +156,7 @@ def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) ->
 class TestForeignBags:
     """Bags that this deployment's recorder did not make."""
 
-    def test_they_are_kept_and_are_named_with_what_to_do(
+    def test_they_are_kept_and_are_named_with_what_to_do_and_with_delete_they_go_too(
         self, bag_dir: Path, forget: Forget
     ) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
@@ -181,9 +167,6 @@ class TestForeignBags:
         assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in shown
         assert "`ros2-memory adopt session` first" in shown
         assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in shown
-
-    def test_with_delete_they_go_too(self, bag_dir: Path, forget: Forget) -> None:
-        (bag_dir / "rec_1").rename(bag_dir / "session")
         forget(0, 40, 100, "--yes retention.foreign=delete")
         assert not (bag_dir / "session").exists()
 
@@ -300,34 +283,26 @@ class TestUnreadable:
         assert not path.exists()
 
 
-class TestCopies:
-    """Two recordings overlapped: what both recorded counts once, and lies in two files."""
-
-    @pytest.fixture
-    def recordings(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-        """The second one's first split has copies alone, from 8 s to 9 s."""
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
-        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-        cut = T0 + 9 * NS_PER_S
-        for name, splits in {"rec_a": [(0, 5), (5, 10)], "rec_b": [(8, 9), (9, 15)]}.items():
-            for number, (first, last) in enumerate(splits):
-                times = range(T0 + first * NS_PER_S, T0 + last * NS_PER_S, NS_PER_S // 10)
-                messages = [odom(at, 1.0, 0.0) for at in times]
-                left(write_mcap(tmp_path / name / f"{name}_{number}.mcap", messages))
-        window = (T0 + 7 * NS_PER_S, T0 + 10 * NS_PER_S)
-        end, begin = Overlap(*window, ("rec_a_1.mcap",)), Overlap(*window, ("rec_b_0.mcap",))
-        write_handover(tmp_path / "rec_a", Handover(next="rec_b", counts_until=cut, end=end))
-        write_handover(tmp_path / "rec_b", Handover(previous="rec_a", counts_from=cut, begin=begin))
-        own_all(tmp_path)
-        return tmp_path
-
-    def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
-        self, recordings: Path, forget: Forget
-    ) -> None:
-        # What counts of rec_a_1 ends at 9 s; its copies at 10 s.
-        shown = forget(1, -1, 9.05).out
-        assert bags(recordings) == ["rec_a_1.mcap", "rec_b_1.mcap"]
-        assert "stays: rec_a/rec_a_1.mcap: it reaches beyond the window" in shown
+def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    """Two recordings overlap; the second one's first split has copies alone, from 8 s to 9 s."""
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    for name, edges in {"rec_a": (0, 5, 10), "rec_b": (8, 9, 15)}.items():
+        for number, (first, last) in enumerate(pairwise(edges)):
+            times = range(T0 + first * NS_PER_S, T0 + last * NS_PER_S, NS_PER_S // 10)
+            messages = [odom(at, 1.0, 0.0) for at in times]
+            left(write_mcap(tmp_path / name / f"{name}_{number}.mcap", messages))
+    cut, window = T0 + 9 * NS_PER_S, (T0 + 7 * NS_PER_S, T0 + 10 * NS_PER_S)
+    end, begin = Overlap(*window, ("rec_a_1.mcap",)), Overlap(*window, ("rec_b_0.mcap",))
+    write_handover(tmp_path / "rec_a", Handover(next="rec_b", counts_until=cut, end=end))
+    write_handover(tmp_path / "rec_b", Handover(previous="rec_a", counts_from=cut, begin=begin))
+    own_all(tmp_path)
+    # What counts of rec_a_1 ends at 9 s; its copies at 10 s.
+    shown = forget(1, -1, 9.05).out
+    assert bags(tmp_path) == ["rec_a_1.mcap", "rec_b_1.mcap"]
+    assert "stays: rec_a/rec_a_1.mcap: it reaches beyond the window" in shown
 
 
 class TestMetadata:

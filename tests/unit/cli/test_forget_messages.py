@@ -252,28 +252,18 @@ def test_answers_say_that_messages_were_deleted(bag_dir: Path, capsys: Capture) 
     assert f"2 messages deleted by request: {CAMERA} (2)" in capsys.readouterr().out
 
 
-class TestLatched:
-    @pytest.fixture
-    def carried(self, bag_dir: Path) -> Path:
-        assert forget(-1, 9.9, "") == 0
-        path = bag_dir / "latched" / "carried.mcap"
-        assert path.exists()
-        return path
-
-    def test_carried_messages_follow_where_their_topic_is_named(
-        self, bag_dir: Path, carried: Path
-    ) -> None:
-        assert forget(-1, 100, "--topic /tf_static") == 0
-        assert not carried.exists()
-        assert traces(bag_dir, "laser") == []
-
-    def test_beside_a_recorder_they_stay_and_are_named(
-        self, bag_dir: Path, carried: Path, capsys: Capture
-    ) -> None:
-        with locked(bag_dir):
-            assert forget(-1, 100, "--topic /tf_static") == 1
-        assert "stays: /tf_static: latched messages, which the recorder" in capsys.readouterr().out
-        assert carried.exists()
+def test_carried_messages_follow_where_their_topic_is_named_unless_a_recorder_has_them(
+    bag_dir: Path, capsys: Capture
+) -> None:
+    assert forget(-1, 9.9, "") == 0
+    carried = bag_dir / "latched" / "carried.mcap"
+    with locked(bag_dir):
+        assert forget(-1, 100, "--topic /tf_static") == 1
+    assert "stays: /tf_static: latched messages, which the recorder" in capsys.readouterr().out
+    assert carried.exists()
+    assert forget(-1, 100, "--topic /tf_static") == 0
+    assert not carried.exists()
+    assert traces(bag_dir, "laser") == []
 
 
 def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> None:
@@ -286,55 +276,51 @@ def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> N
     assert traces(bag_dir, "laser") == []
 
 
-@pytest.mark.parametrize("size", [None, 0])
-def test_what_is_being_written_is_named(bag_dir: Path, capsys: Capture, size: int | None) -> None:
-    active = bag_dir / "rec_a" / "rec_a_3.mcap"
-    write_mcap(active, messages(3), McapLayout(finish=False))
-    if size is not None:
-        os.truncate(active, size)
-    assert forget(0, 100) == 1
-    assert "stays: rec_a/rec_a_3.mcap: it is being written" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("more", ["", f"--topic {CAMERA}"])
-@pytest.mark.parametrize("name", ["rec_20990101T000000Z_0.mcap", "copied_0.db3"])
-def test_what_is_being_written_is_named_wherever_its_times_are(
-    bag_dir: Path, capsys: Capture, name: str, more: str
+def test_what_cannot_be_rewritten_stays_as_it_is_and_is_named_with_the_reason(
+    bag_dir: Path, capsys: Capture
 ) -> None:
-    active = bag_dir / name.rpartition("_")[0] / name
-    if active.suffix == ".mcap":
-        write_mcap(active, messages(3), McapLayout(finish=False, chunk_size=2048))
-    else:
-        write_db3(active, messages(3))
-    own_all(bag_dir)
-    assert forget(30, 40, f"{more} storage=rosbag2") == 1
-    assert f"stays: {active.relative_to(bag_dir)}: " in capsys.readouterr().out
-    assert forget(10, 19.9, f"{more} storage=rosbag2") == 0  # it begins later
-
-
-def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Capture) -> None:
-    path = bag_dir / "rec_a" / "rec_a_1.mcap"
-    data = bytearray(path.read_bytes())
+    recording = bag_dir / "rec_a"
+    damaged = recording / "rec_a_1.mcap"
+    data = bytearray(damaged.read_bytes())
     middle = data.index(b"zstd") + 200
     data[middle : middle + 40] = bytes(40)
-    path.write_bytes(data)
-    left(path)
+    damaged.write_bytes(data)
+    left(damaged)
+    for number in (3, 4):
+        write_mcap(recording / f"rec_a_{number}.mcap", messages(3), McapLayout(finish=False))
+    os.truncate(recording / "rec_a_4.mcap", 0)
+    for kind in ("MCAP", "db3"):
+        (recording / f"rec_a_5.{kind}").write_bytes(b"any")
     assert forget(0, 100) == 1
-    assert "stays: rec_a/rec_a_1.mcap: " in capsys.readouterr().out
-    assert path.read_bytes() == data
+    told = dict(
+        line.removeprefix("stays: rec_a/rec_a_").split(": ", 1)
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith("stays: ")
+    )
+    for name, reason in (
+        ("1.mcap", ""),
+        ("3.mcap", "it is being written"),
+        ("4.mcap", "it is being written"),
+        ("5.MCAP", "rename it"),
+        ("5.db3", "choose storage=rosbag2"),
+    ):
+        assert reason in told[name]
+    assert damaged.read_bytes() == data
 
 
-@pytest.mark.parametrize(
-    ("name", "do"), [("rec_a_3.MCAP", "rename it"), ("rec_a_3.db3", "choose storage=rosbag2")]
-)
-def test_what_is_not_read_is_named_with_its_reason(
-    bag_dir: Path, capsys: Capture, name: str, do: str
+def test_what_is_being_written_is_named_wherever_its_times_are(
+    bag_dir: Path, capsys: Capture
 ) -> None:
-    (bag_dir / "rec_a" / name).write_bytes(b"any")
-    assert forget(0, 100) == 1
-    kept = f"stays: rec_a/{name}: "
-    [line] = [line for line in capsys.readouterr().out.splitlines() if line.startswith(kept)]
-    assert do in line
+    names = ("rec_20990101T000000Z/rec_20990101T000000Z_0.mcap", "copied/copied_0.db3")
+    layout = McapLayout(finish=False, chunk_size=2048)
+    write_mcap(bag_dir / names[0], messages(3), layout)
+    write_db3(bag_dir / names[1], messages(3))
+    own_all(bag_dir)
+    for more in (f"--topic {CAMERA}", ""):
+        assert forget(30, 40, f"{more} storage=rosbag2") == 1
+        shown = capsys.readouterr().out
+        assert all(f"stays: {name}: " in shown for name in names)
+        assert forget(10, 19.9, f"{more} storage=rosbag2") == 0  # it begins later
 
 
 def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
@@ -357,48 +343,36 @@ def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
     assert f"{SAID} 0 3".encode() in path.read_bytes()
 
 
-class TestPlaces:
-    """The robot drives along X at 1 m/s in the first split; the bathroom is from 3 m to 5 m."""
-
-    @pytest.fixture
-    def home(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-        home = tmp_path / "home"
-        start = T0
-        found: list[Msg] = []
-        for n in range(100):
-            at = start + n * S // 10
-            found += [odom(at, n / 10, 0.0), text(at + 7, f"{SAID} {n:02}", CAMERA)]
-        found.insert(
-            0, tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static")
-        )
-        left(write_mcap(home / "rec_h" / "rec_h_0.mcap", found))
-        own_all(home)
-        places = tmp_path / "places.yaml"
-        places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
-        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-        self.places = f"data.places_file={places}"
-        return home
-
-    def test_the_time_in_it_goes_with_a_second_on_either_side(
-        self, home: Path, capsys: Capture
-    ) -> None:
-        indexed()
-        assert forget(0, 100, f"--where bathroom {self.places}") == 0
-        assert "latched messages stay" in capsys.readouterr().out
-        bag = home / "rec_h" / "rec_h_0.mcap"
-        times = {}  # type: dict[str, set[int]]
-        for each in whole(bag):
-            times.setdefault(str(each[3]), set()).add((int(str(each[7])) - T0) // 10**8)
-        outside = {n for n in range(100) if not 20 <= n <= 60}
-        # The track knows to a few centimetres where the robot was, and the robot drives 1 m/s.
-        for topic in ("/odom", CAMERA):
-            assert times[topic] <= outside | {20, 21, 59, 60}
-            assert times[topic] >= outside - {19, 61}
-        assert times["/tf_static"] == {0}
-        assert traces(home, f"{SAID} 40") == []
-        assert traces(home, f"{SAID} 70")
+def test_the_time_in_a_place_goes_with_a_second_on_either_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """The robot drives along X at 1 m/s; the bathroom is from 3 m to 5 m."""
+    home, places = tmp_path / "home", tmp_path / "places.yaml"
+    mount = transform(T0, "base_link", "laser", (0.1, 0.0, 0.2))
+    found = [tf(T0, mount, topic="/tf_static")]
+    for n in range(100):
+        at = T0 + n * S // 10
+        found += [odom(at, n / 10, 0.0), text(at + 7, f"{SAID} {n:02}", CAMERA)]
+    bag = left(write_mcap(home / "rec_h" / "rec_h_0.mcap", found))
+    own_all(home)
+    places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    indexed()
+    assert forget(0, 100, f"--where bathroom data.places_file={places}") == 0
+    assert "latched messages stay" in capsys.readouterr().out
+    times: dict[str, set[int]] = {}
+    for each in whole(bag):
+        times.setdefault(str(each[3]), set()).add((int(str(each[7])) - T0) // 10**8)
+    outside = {n for n in range(100) if not 20 <= n <= 60}
+    # The track knows to a few centimetres where the robot was, and the robot drives 1 m/s.
+    for topic in ("/odom", CAMERA):
+        assert times[topic] <= outside | {20, 21, 59, 60}
+        assert times[topic] >= outside - {19, 61}
+    assert times["/tf_static"] == {0}
+    assert traces(home, f"{SAID} 40") == []
+    assert traces(home, f"{SAID} 70")
 
 
 class TestInterruption:
