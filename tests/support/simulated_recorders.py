@@ -292,7 +292,8 @@ def events(logs: list[MutableMapping[str, Any]], name: str) -> list[MutableMappi
 
 
 def assert_what_stands_counts_once(world: World) -> None:
-    """Whatever stands in any bag counts exactly once."""
+    """Once it was stopped, whatever stands in any bag counts exactly once."""
+    world.supervisor.stop()
     stands, counts = world.published(counting=False), world.published(counting=True)
     assert counts == dict.fromkeys(stands, 1)
 

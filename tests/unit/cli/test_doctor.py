@@ -7,6 +7,7 @@ import re
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +21,7 @@ from ros2_memory.cli import doctor
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import heartbeats, stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
+from tests.support.mcap_surgery import raw_mcap
 from tests.unit.cli.conftest import left
 
 if TYPE_CHECKING:
@@ -234,16 +236,42 @@ def lay(robot: Path, name: str, content: bytes) -> None:
     left(path)
 
 
-def test_recover_is_not_advised_for_files_that_it_refuses(robot: Path, examined: Examined) -> None:
+def test_what_is_wrong_with_bags_is_reported_with_what_would_mend_that_alone(
+    robot: Path, examined: Examined
+) -> None:
     lay(robot, "letter", b"a letter")
-    wrong = examined(1)
-    assert "recover" not in wrong["bags"][0]["do"]
-    assert wrong["bags"][0]["do"].startswith("copy them again")
-    assert "letter_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
     whole = (robot / "rec" / "rec_0.mcap").read_bytes()
     lay(robot, "cut", whole[: len(whole) // 2])
-    advice = [finding["do"] for finding in examined(1)["bags"]]
-    assert {f"ros2-memory recover {robot}", wrong["bags"][0]["do"]} <= {*advice}
+    lay(robot, "twin", whole)
+    for name in ("a_0.db3", "b_0.db3", "c_0.MCAP"):
+        (robot / "rec" / name).write_bytes(b"any")
+    now = time.time_ns() - 3600 * NS_PER_S
+    raw_mcap(robot / "other" / "other_0.mcap", partial(enveloped, at=now))
+    foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", now, b"\x00\x01\x00\x00abc")
+    write_mcap(robot / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
+    told = {each["seen"]: each["do"] for each in examined(1)["bags"]}
+
+    def advice(seen: str) -> str:
+        [found] = [advised for told_of, advised in told.items() if seen in told_of]
+        return found
+
+    assert advice("letter_0.mcap (not an MCAP file").startswith("copy them again")
+    assert "recover" not in advice("letter_0.mcap")
+    assert f"ros2-memory recover {robot}" in told.values()
+    assert advice("rec, twin overlap in time (from 20")
+    assert advice("2 files not read: a_0.db3, b_0.db3").endswith(
+        ": choose storage=rosbag2, which does"
+    )
+    assert advice("1 file not read: c_0.MCAP").endswith(": rename it")
+    assert "reader.custom_msg_paths" in advice("1 topic cannot be decoded: /foreign ")
+    protobuf = "1 topic cannot be decoded: /keelson (its message encoding 'protobuf' is not read"
+    assert ".msg" not in advice(protobuf)
+
+
+def enveloped(writer: Writer, at: int) -> None:
+    schema = writer.register_schema("keelson.Envelope", "protobuf", b"")
+    channel = writer.register_channel("/keelson", "protobuf", schema)
+    writer.add_message(channel, at, b"\x08\x01", at)
 
 
 def test_what_this_user_may_not_read_is_not_advised_to_be_copied_and_ends_no_report(
@@ -263,31 +291,6 @@ def test_what_this_user_may_not_read_is_not_advised_to_be_copied_and_ends_no_rep
     found = examined(2)
     assert found["disk"][-1]["seen"] == "leaving.json: Permission denied"
     assert "bags" in found
-
-
-def test_msg_folders_are_advised_for_what_they_would_mend_alone(
-    robot: Path, examined: Examined
-) -> None:
-    path = robot / "other" / "other_0.mcap"
-    path.parent.mkdir()
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="", library="test")
-        schema = writer.register_schema("keelson.Envelope", "protobuf", b"")
-        channel = writer.register_channel("/keelson", "protobuf", schema)
-        now = time.time_ns() - 3600 * NS_PER_S
-        writer.add_message(channel, now, b"\x08\x01", now)
-        writer.finish()
-    wrong = examined(1)
-    [output] = wrong["bags"]
-    assert "/keelson (its message encoding 'protobuf' is not read" in output["seen"]
-    assert ".msg" not in output["do"]
-    foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", now, b"\x00\x01\x00\x00abc")
-    write_mcap(robot / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
-    wrong = examined(1)
-    by_topic = {each["seen"].split("(")[0]: each["do"] for each in wrong["bags"]}
-    assert "reader.custom_msg_paths" in by_topic["1 topic cannot be decoded: /foreign "]
-    assert ".msg" not in by_topic["1 topic cannot be decoded: /keelson "]
 
 
 def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_newest_receipt(
@@ -321,30 +324,16 @@ def test_a_running_recorder_has_a_ros_that_these_settings_do_not_name(
     assert examined(2)["ros"][0]["level"] == "error"
 
 
-class TestTheServer:
-    def test_another_program_is_recognised(self, robot: Path, examined: Examined) -> None:
-        Answering.reply = b"<html>a printer</html>"
-        wrong = examined(2)
-        assert "another program" in wrong["server"][0]["seen"]
-
-    def test_a_token_that_it_does_not_take_is_reported_as_such(
-        self, robot: Path, monkeypatch: pytest.MonkeyPatch, examined: Examined
-    ) -> None:
-        Answering.asks_for = f"Bearer {'s' * 32}"
-        monkeypatch.setenv("MEMORY_API_TOKEN", "t" * 32)
-        wrong = examined(1)
-        assert "takes another token" in wrong["server"][0]["seen"]
-        monkeypatch.setenv("MEMORY_API_TOKEN", "s" * 32)
-        assert examined(0) == {}
-
-
-def test_runs_that_are_answered_together_are_reported(robot: Path, examined: Examined) -> None:
-    write_mcap(
-        robot / "other" / "other_0.mcap",
-        [odom(time.time_ns() - (60 - n) * NS_PER_S, 0.0, 0.0) for n in range(50)],
-    )
-    [finding] = examined(1)["bags"]
-    assert "other, rec overlap in time (from 20" in finding["seen"]
+def test_another_program_in_place_of_the_server_and_a_token_that_it_does_not_take_are_told(
+    robot: Path, monkeypatch: pytest.MonkeyPatch, examined: Examined
+) -> None:
+    Answering.asks_for = f"Bearer {'s' * 32}"
+    monkeypatch.setenv("MEMORY_API_TOKEN", "t" * 32)
+    assert "takes another token" in examined(1)["server"][0]["seen"]
+    monkeypatch.setenv("MEMORY_API_TOKEN", "s" * 32)
+    assert examined(0) == {}
+    Answering.reply = b"<html>a printer</html>"
+    assert "another program" in examined(2)["server"][0]["seen"]
 
 
 @pytest.mark.parametrize(("recorder", "is_active"), [("none", False), ("ros2bag", True)])
@@ -382,13 +371,3 @@ def test_the_list_that_up_wrote_beside_the_bags_is_that_of_its_recorder(
     assert any("another list" in each["seen"] for each in examined(1)["topics"])
     (robot / "topics.yaml").write_text("topics: [/odom]\n")
     assert "topics" not in examined(0)
-
-
-def test_what_is_not_read_is_reported_with_its_reason(robot: Path, examined: Examined) -> None:
-    for name in ("a_0.db3", "b_0.db3", "c_0.MCAP"):
-        (robot / "rec" / name).write_bytes(b"any")
-    findings = [finding for finding in examined(1)["bags"] if "not read" in finding["seen"]]
-    assert [(finding["seen"], finding["do"].partition(":")[2]) for finding in findings] == [
-        ("2 files not read: a_0.db3, b_0.db3", " choose storage=rosbag2, which does"),
-        ("1 file not read: c_0.MCAP", " rename it"),
-    ]

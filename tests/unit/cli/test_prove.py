@@ -50,10 +50,7 @@ def messages(path: Path) -> list[tuple[str, int, bytes]]:
     "question",
     [
         f"find_last_match {json.dumps(ABOVE)}",
-        "find_last_match topic=*/scene_objects condition_type=contains value=never",
         'visits where={"x": 4.0, "y": 0.0, "radius_m": 1.0}',
-        "get_position_seconds_ago seconds_ago=1m frame_id=map",
-        "get_topic_at_time topic=/tf_static timestamp=2026-07-14T03:34:00Z",
         "get_topic_in_range topic=/nothing start=1784000000 end=1784000010",
     ],
 )

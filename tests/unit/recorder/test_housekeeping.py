@@ -4,20 +4,16 @@ import errno
 import os
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
 import zstandard
 
-from ros2_memory import queries
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses
-from ros2_memory.columns.scanner import Scanner
-from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.view import TimeRange
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
@@ -34,7 +30,7 @@ from tests.support.housekeepers import (
     recording_now,
     size_of,
 )
-from tests.support.memories import extractor
+from tests.support.memories import asked, memory_of
 from tests.support.simulated_recorders import events
 
 if TYPE_CHECKING:
@@ -79,19 +75,6 @@ def said(keeper: Housekeeping, event: str) -> list[MutableMapping[str, Any]]:
 
 
 class TestRetention:
-    def test_the_oldest_bags_go_and_their_recording_after_them(self, tmp_path: Path) -> None:
-        old, new = recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
-        keeper_of(tmp_path, max_bytes=sum(path.stat().st_size for path in new) + 100).apply()
-        assert files_in(tmp_path) == [
-            "b",
-            "b/b_0.mcap",
-            "b/b_1.mcap",
-            "b/b_2.mcap",
-            "b/handover.json",
-            "b/metadata.yaml",
-        ]
-        assert not any(path.exists() for path in old)
-
     def test_the_budget_counts_metadata_sidecars_open_bags_and_what_is_derived(
         self, tmp_path: Path
     ) -> None:
@@ -110,9 +93,11 @@ class TestRetention:
     def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
         self, tmp_path: Path
     ) -> None:
+        """What rules need is not held by the clock."""
         old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "b/b_0.mcap", 3 * 3600)
-        clock = Mock(return_value=False)
-        keeper = keeper_of(tmp_path, max_age_h=2, is_synchronised=clock)
+        clock, needed = Mock(return_value=False), bag(tmp_path / "a/a_1.mcap", 10)
+        rules = Mock(restarts=(), needed=lambda _: frozenset({str(needed)}))
+        keeper = keeper_of(tmp_path, max_age_h=2, is_synchronised=clock, watch=lambda _: rules)
         with structlog.testing.capture_logs() as captured:
             keeper.apply()
             keeper.apply()
@@ -126,16 +111,6 @@ class TestRetention:
         assert len(events(captured, "age_no_longer_held")) == 1
         keeper.apply()
         assert clock.call_count == 3
-
-    def test_what_rules_need_is_not_held_by_the_clock(self, tmp_path: Path) -> None:
-        old = [bag(tmp_path / f"a/a_{n}.mcap", n * 10) for n in range(2)]
-        bag(tmp_path / "b/b_0.mcap", 3 * 3600)
-        rules = Mock(restarts=(), needed=lambda _: frozenset({str(old[0])}))
-        keeper = keeper_of(
-            tmp_path, max_age_h=2, is_synchronised=lambda: False, watch=lambda _: rules
-        )
-        keeper.apply()
-        assert "1 bag is older than 2 h" in str(keeper.status().age_held)
 
     def test_where_bags_must_be_shipped_age_waits_for_the_receipt_of_this_very_bag(
         self, tmp_path: Path
@@ -191,19 +166,15 @@ class TestRetention:
         assert (second["log_level"], second["bags"]) == ("debug", 0)
         assert second["total_bytes"] == size_of(tmp_path) <= 45_000
 
-    def test_a_plain_bag_goes_with_its_unfinished_compressed_form(self, tmp_path: Path) -> None:
-        first, *_ = recording(tmp_path, "a", 0)
-        packed = zstandard.compress(first.read_bytes())
-        first.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
-        keeper_of(tmp_path, max_bytes=30_000, reader=Rosbag2Reader()).apply()
-        assert not first.exists()
-        assert not first.with_name("a_0.mcap.zstd").exists()
-
-    def test_a_sqlite_bag_goes_with_its_journals(self, tmp_path: Path) -> None:
+    def test_a_bag_goes_with_its_unfinished_compressed_form_and_with_its_journals(
+        self, tmp_path: Path
+    ) -> None:
         messages = [odom(T0 + n, 1.0, 2.0) for n in range(5)]
-        first = write_db3(tmp_path / "a/a_0.db3", messages)
-        first.with_name("a_0.db3-shm").write_bytes(b"")
-        first.with_name("a_1.db3-shm").write_bytes(b"")
+        plain, base = bag(tmp_path / "a/a_0.mcap", 0), write_db3(tmp_path / "a/a_0.db3", messages)
+        packed = zstandard.compress(plain.read_bytes())
+        plain.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
+        for journal in ("a_0.db3-shm", "a_1.db3-shm"):
+            base.with_name(journal).write_bytes(b"")
         bag(tmp_path / "b/b_0.mcap", 100)
         keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
         assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
@@ -343,38 +314,32 @@ class TestInTheBackground:
         assert all(asked)
 
 
-class TestQuestionsMeanwhile:
-    @pytest.mark.parametrize("kept", [1, 0])
-    def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
-        self, tmp_path: Path, kept: int
-    ) -> None:
-        paths = recording(tmp_path, "a", 0)
-        memory = stale_memory(tmp_path)
-        span = TimeRange(start_s=T0 / S, end_s=T0 / S + 24.5)
-        assert queries.topic_range(memory, Call(), "/odom", span).total == 59
-        for path in paths[: 3 - kept]:
-            path.unlink()
-        if kept:
-            reported = queries.topic_range(memory, Call(), "/odom", span)
-            assert len(reported.samples) == 19
-            [gone] = [note for note in reported.notes if "deleted before" in note]
-            assert gone.startswith("2 bags were deleted before they could be read: ")
-            assert queries.trajectory_summary(memory, Call(), span).start == T0 + 20 * S
-        else:
-            with pytest.raises(NoDataError):
-                queries.topic_range(memory, Call(), "/odom", span)
-            with pytest.raises(NoDataError):
-                queries.trajectory_summary(memory, Call(), span)
-        queries.list_recorded_topics(memory, Call())
-
-
-def stale_memory(bag_dir: Path) -> Memory:
-    """A memory that looked at the bags once, and does not look again."""
-    clock, reader = later(), McapReader()
-    index = IndexManager(bag_dir, reader, clock, refresh_s=10**6, split_duration_s=10.0)
+def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
+    tmp_path: Path,
+) -> None:
+    paths = recording(tmp_path, "a", 0)
+    memory = memory_of(tmp_path)
+    index = IndexManager(
+        tmp_path, memory.reader, memory.clock, refresh_s=10**6, split_duration_s=10.0
+    )
     index.refresh()
-    limits = QuerySettings(now="latest")
-    return Memory(index, reader, extractor(), clock, limits, Scanner(None, bag_dir))
+    memory = replace(memory, index=index)
+
+    def ask(tool: str, **given: object) -> Any:
+        return asked(memory, tmp_path, tool, start=T0 / S, end=T0 / S + 24.5, **given)
+
+    assert ask("get_topic_in_range", topic="/odom")["total"] == 59
+    for path in paths[:2]:
+        path.unlink()
+    found = ask("get_topic_in_range", topic="/odom")
+    assert len(found["samples"]) == 19
+    [gone] = [note for note in found["notes"] if "deleted before" in note]
+    assert gone.startswith("2 bags were deleted before they could be read: ")
+    assert ask("trajectory_summary")["start"] == T0 / S + 20
+    paths[2].unlink()
+    assert ask("get_topic_in_range", topic="/odom")["error"] == "no_data"
+    assert ask("trajectory_summary")["error"] == "no_data"
+    assert asked(memory, tmp_path, "list_recorded_topics") == []
 
 
 class TestRemoval:
@@ -438,32 +403,19 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]
 
 
-def test_a_recording_of_nothing_but_empty_splits_goes(tmp_path: Path) -> None:
-    (tmp_path / OWN).mkdir()
-    (tmp_path / OWN / f"{OWN}_0.mcap").write_bytes(b"")
-    (tmp_path / OWN / "metadata.yaml").touch()
-    (tmp_path / OWN / "handover.json").write_text("{}")
-    keeper_of(tmp_path).apply()
-    assert files_in(tmp_path) == []
-
-
-def test_a_recording_of_another_is_left_alone_until_it_lay_still(tmp_path: Path) -> None:
+def test_a_recording_of_another_is_left_alone_until_it_lay_still_and_nobody_holds_it(
+    tmp_path: Path,
+) -> None:
     theirs = left_open(tmp_path / "theirs" / "theirs_0.mcap")
     clock = later(0)
     keeper = keeper_of(tmp_path, clock=clock)
     keeper.apply()
     assert not McapReader().summarize(theirs).complete
     clock.at += HOUR
-    keeper.apply()
-    assert McapReader().summarize(theirs).complete
-
-
-def test_a_file_that_a_process_holds_open_is_left_alone(tmp_path: Path) -> None:
-    theirs = left_open(tmp_path / "theirs" / "theirs_0.mcap")
     with theirs.open("rb"):
-        keeper_of(tmp_path).apply()
+        keeper.apply()
     assert not McapReader().summarize(theirs).complete
-    keeper_of(tmp_path).apply()
+    keeper.apply()
     assert McapReader().summarize(theirs).complete
 
 

@@ -25,6 +25,12 @@ from tests.support.simulated_recorders import (
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
 
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """A recorder that has recorded for three seconds."""
+    return World(tmp_path).started(3)
+
+
 class TestStart:
     def test_one_whose_words_for_it_are_not_known_records_once_it_subscribes(
         self, tmp_path: Path
@@ -72,7 +78,6 @@ class TestRotation:
         world.run(4)
         new.deaf = False
         world.run(12)
-        world.supervisor.stop()
         assert_each_counts_once(world)
 
     def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(
@@ -85,7 +90,6 @@ class TestRotation:
         assert world.recorders[0].status == 0
         assert "does not subscribe to /door yet" in str(said["reason"])
         assert world.heartbeat()["last_error"] is None
-        world.supervisor.stop()
         assert_each_counts_once(world)
 
     def test_a_split_that_the_old_one_opens_while_it_ends_is_in_its_sidecar(
@@ -98,7 +102,6 @@ class TestRotation:
         assert old.end is not None
         last = f"{world.recorders[0].directory.name}_{world.recorders[0].splits}.mcap"
         assert last in old.end.files
-        world.supervisor.stop()
         assert_each_counts_once(world)
 
     def test_a_rotation_that_cannot_begin_is_tried_again(self, tmp_path: Path) -> None:
@@ -108,7 +111,6 @@ class TestRotation:
         assert read_handover(world.recorders[0].directory).handover.next is None
         world.refuse = ""
         world.run(12)
-        world.supervisor.stop()
         assert len(world.recorders) == 2
         assert_each_counts_once(world)
 
@@ -146,7 +148,6 @@ class TestStop:
             world.wall = before.wall
             world.supervisor.start()
         world.run(12)
-        world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
     def test_a_process_that_nothing_ends_is_named(self, tmp_path: Path) -> None:
@@ -172,7 +173,6 @@ class TestMessagesOfOneRecordingAlone:
         stands = {at for at in world.published(counting=False) if at < world.wall - 7 * NS_PER_S}
         counts = world.published(counting=True)
         assert {at: counts[at] for at in stands} == dict.fromkeys(stands, 1)
-        world.supervisor.stop()
         assert_each_counts_once(world)
 
     @pytest.mark.parametrize("deaf_s", [2, 8, 15])
@@ -183,7 +183,6 @@ class TestMessagesOfOneRecordingAlone:
         world = rotating(tmp_path, 20 - deaf_s)
         world.recorders[0].deaf = True
         world.run(deaf_s + 15)
-        world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
 
@@ -210,7 +209,6 @@ class TestClock:
         world.set_clock(seconds)
         world.run(20)
         assert len(world.recorders) == recordings
-        world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
     def test_set_back_while_nothing_records_no_recording_is_cut_short(self, tmp_path: Path) -> None:
@@ -241,7 +239,6 @@ class TestWatch:
         world.silent = True
         world.run(100)
         assert len(world.recorders) == 3
-        world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
     def test_a_directory_that_vanished_is_reported_and_recording_goes_on_elsewhere(
@@ -265,11 +262,11 @@ class TestWatch:
         assert kept.status is None
         assert not read_handover(kept.directory).handover.hides_all
         world.run(20)
-        world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
-    def test_a_warning_that_repeats_is_reported_once_for_each_topic(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(2)
+    def test_a_warning_that_repeats_is_reported_once_for_each_topic_with_what_it_means(
+        self, world: World
+    ) -> None:
         with capture_logs() as logs:
             for number in range(40):
                 world.recorders[0].lines += [
@@ -280,18 +277,14 @@ class TestWatch:
                 world.run(0.5)
         assert len(events(logs, "several_types")) == 2
         assert "/cam2" in str(world.heartbeat()["last_error"])
-
-    def test_a_refused_publisher_is_reported_with_what_it_means(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(2)
         world.recorders[0].lines.append(
             "[WARN] [1.5] [rosbag2_recorder]: A new publisher for subscribed topic /scan was found "
             "offering RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already subscribed"
         )
         [reported] = world.logged(3, "qos_refused")
-        assert str(reported["reason"]).startswith(
-            "/scan: messages of this publisher are not recorded"
-        )
-        assert world.heartbeat()["last_error"] == reported["reason"]
+        told = str(reported["reason"])
+        assert told.startswith("/scan: messages of this publisher are not recorded")
+        assert world.heartbeat()["last_error"] == told
 
     @pytest.mark.parametrize(("topic", "found"), [("/door", {"refused"}), ("/other", set())])
     def test_what_comes_of_another_type_than_subscribed_is_noted_as_missing(
@@ -356,9 +349,11 @@ class TestWaiting:
     def test_a_recorder_that_never_received_anything_says_what_it_waits_for(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, advice=lambda: "look at the network", silent=True).started(29)
+        world = World(
+            tmp_path, split_duration_s=60, advice=lambda: "look at the network", silent=True
+        ).started(58)  # a recording of long splits waits for one of them
         assert world.heartbeat()["state"] == "recording"
-        [reported] = world.logged(30, "recording_waits")
+        [reported] = world.logged(10, "recording_waits")
         beat = world.heartbeat()
         assert beat["state"] == "waiting"
         assert beat["waiting_for"] == reported["reason"]
@@ -366,12 +361,6 @@ class TestWaiting:
         world.silent = False
         world.run(10)
         assert (world.heartbeat()["state"], world.heartbeat()["waiting_for"]) == ("recording", None)
-
-    def test_a_recording_of_long_splits_waits_for_one_of_them(self, tmp_path: Path) -> None:
-        world = World(tmp_path, split_duration_s=60, silent=True).started(58)
-        assert world.heartbeat()["state"] == "recording"
-        world.run(10)
-        assert world.heartbeat()["state"] == "waiting"
 
     @pytest.mark.parametrize(
         ("simulated", "topics", "heard", "expected"),
@@ -486,10 +475,6 @@ class TestShortfall:
         world.run(30)
         assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
 
-    def test_a_robot_that_says_nothing_is_not_asked_again_and_again(self, tmp_path: Path) -> None:
-        world = World(tmp_path, silent=True).started(300)
-        assert len(world.recorders) == 2
-
 
 class TestChangedList:
     def test_a_changed_list_begins_a_recording_and_loses_nothing(self, tmp_path: Path) -> None:
@@ -508,7 +493,6 @@ class TestChangedList:
         world.run(60)
         assert world.heartbeat()["fell_silent"] == []
         assert len(world.recorders) == 2
-        world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
     def test_a_refused_list_changes_nothing_and_is_named(self, tmp_path: Path) -> None:
@@ -551,18 +535,23 @@ def test_topics_that_nobody_has_offered_are_named_once_a_recorder_has_looked(
     assert world.heartbeat()["missing"] == ["/gone"]
 
 
-def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path) -> None:
+def test_a_death_is_told_with_its_time_and_last_words_and_is_past_once_recording_goes_on(
+    tmp_path: Path,
+) -> None:
     world = World(tmp_path).started(20)
-    world.running[0].die()
-    world.run(0.25)
+    world.recorders[0].lines.append("terminate called after throwing")
+    world.recorders[0].die(-6)
+    [died] = world.logged(0.25, "recorder_died")
+    assert died["log_level"] == "error"
+    assert "was killed (SIGABRT)" in str(died["reason"])
+    assert "terminate called" in str(died["reason"])
     beat = world.heartbeat()
     assert (beat["state"], beat["recordings"]) == ("starting", [])
-    assert "was killed" in beat["last_error"]
-    assert (beat["last_error_at"], beat["recovered"]) == (world.wall, False)
+    told = (died["reason"], world.wall, False)
+    assert (beat["last_error"], beat["last_error_at"], beat["recovered"]) == told
     world.run(20)
     later = world.heartbeat()
-    assert (later["last_error"], later["recovered"]) == (beat["last_error"], True)
-    assert later["last_error_at"] == beat["last_error_at"]
+    assert (later["last_error"], later["last_error_at"], later["recovered"]) == (*told[:2], True)
 
 
 def test_an_error_that_lasts_is_not_past(tmp_path: Path) -> None:

@@ -38,6 +38,12 @@ from tests.support.simulated_recorders import (
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
 
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """A recorder that has recorded for three seconds."""
+    return World(tmp_path).started(3)
+
+
 class TestDeath:
     def test_waits_grow_until_a_good_split_was_written(self, tmp_path: Path) -> None:
         world = World(tmp_path, split_duration_s=100).started()
@@ -51,16 +57,6 @@ class TestDeath:
                 world.run(0.25)
             waits.append(round(world.mono - before))
         assert waits == [1, 2, 1, 2]
-
-    def test_it_is_reported_with_its_last_words(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(2)
-        world.recorders[0].lines.append("terminate called after throwing")
-        world.recorders[0].die(-6)
-        [died] = world.logged(3, "recorder_died")
-        assert died["log_level"] == "error"
-        assert "was killed (SIGABRT)" in str(died["reason"])
-        assert "terminate called" in str(died["reason"])
-        assert world.heartbeat()["last_error"] == died["reason"]
 
     def test_one_that_hangs_and_must_be_killed_counts_as_a_restart(self, tmp_path: Path) -> None:
         world = World(tmp_path).started(12)
@@ -105,7 +101,6 @@ class TestDeath:
         assert read_handover(new.directory).handover.hides_all
         assert read_handover(old.directory).handover.next is None
         world.run(15)
-        world.supervisor.stop()
         assert len(world.recorders) == 3
         assert_each_counts_once(world)
 
@@ -144,9 +139,8 @@ class FailingDisk:
 
 class TestFailingDisk:
     def test_a_restart_whose_name_cannot_be_looked_up_is_tried_again(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, world: World, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path).started(3)
         world.recorders[0].die()
         known = [recorder.directory for recorder in world.recorders]
         disk = FailingDisk(
@@ -179,7 +173,6 @@ class TestFailingDisk:
             [reported, *_] = world.logged(refused_s, "rotation_failed")
         assert "No space left on device" in reported["reason"]
         world.run(40)
-        world.supervisor.stop()
         assert len(world.recorders) > 2
         assert_each_counts_once(world)
 
@@ -192,14 +185,12 @@ class TestFailingDisk:
             assert world.logged(3, "rotation_failed")
         assert len(world.recorders) == 1
         world.run(20)
-        world.supervisor.stop()
         assert len(world.recorders) == 2
         assert_each_counts_once(world)
 
     def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, world: World, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path).started(3)
 
         monkeypatch.setattr(world.reader, "closing", failing(errno.ESTALE))
         world.recorders[0].die()
@@ -209,9 +200,8 @@ class TestFailingDisk:
         assert "Stale file handle" in events(logs, "unreadable")[0]["reason"]
 
     def test_once_its_splits_can_be_read_again_and_one_is_closed_that_fault_is_past(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, world: World, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path).started(3)
         for _ in range(2):
             with monkeypatch.context() as failing_disk:
                 failing_disk.setattr(world.reader, "closing", failing(errno.ESTALE))
@@ -223,9 +213,8 @@ class TestFailingDisk:
         assert len(world.recorders) == 1
 
     def test_one_task_that_fails_keeps_no_other_from_being_done(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, world: World, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path).started(3)
         monkeypatch.setattr(world.recorders[0], "take_lines", failing(errno.EIO))
         [reported] = world.logged(30, "supervision_failed")
         assert (reported["task"], reported["reason"]) == ("look", "[Errno 5] Input/output error")
@@ -251,8 +240,7 @@ class TestRecordedTime:
 
 
 class TestSpace:
-    def test_a_disk_that_fills_is_first_made_room_on(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(3)
+    def test_a_disk_that_fills_is_first_made_room_on(self, world: World) -> None:
         world.house.frees_to = 5000
         world.free = 900
         world.run(3)
@@ -261,9 +249,8 @@ class TestSpace:
         assert world.heartbeat()["state"] == "recording"
 
     def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
-        self, tmp_path: Path
+        self, world: World
     ) -> None:
-        world = World(tmp_path).started(3)
         world.house.making = True
         world.free = 600
         world.run(200)
@@ -273,19 +260,7 @@ class TestSpace:
         world.run(2)
         assert world.heartbeat()["state"] == "paused"
 
-    def test_a_pause_that_a_stop_ends_is_noted(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(3)
-        world.free = 900
-        paused = world.wall
-        world.run(30)
-        assert world.house.restarts == []
-        world.supervisor.stop()
-        [(since, how)] = world.house.restarts
-        assert how == "paused"
-        assert 0 <= since - paused <= NS_PER_S
-
-    def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(3)
+    def test_it_resumes_by_itself_when_more_than_that_is_free(self, world: World) -> None:
         world.free = 900
         paused = world.wall
         world.run(3)
@@ -300,8 +275,7 @@ class TestSpace:
         assert how == "paused"
         assert 0 <= since - paused <= 2 * NS_PER_S
 
-    def test_what_is_free_and_cannot_be_measured_is_no_full_disk(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(3)
+    def test_what_is_free_and_cannot_be_measured_is_no_full_disk(self, world: World) -> None:
         world.free = 900
         world.unmeasurable_after = 1
         with capture_logs() as logs:
@@ -310,12 +284,6 @@ class TestSpace:
         assert world.supervisor.is_recording
         assert events(logs, "recording_paused") == []
 
-    def test_while_it_pauses_room_is_asked_for_again_now_and_then(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(3)
-        world.free = 900
-        world.run(200)
-        assert 3 <= world.house.asked.count("room 1200") <= 5
-
     def test_pausing_in_a_handover_loses_and_doubles_nothing(self, tmp_path: Path) -> None:
         world = rotating(tmp_path, 22.25)
         world.free = 900
@@ -323,25 +291,34 @@ class TestSpace:
         assert world.running == []
         assert_each_counts_once(world)
 
-    def test_a_split_that_stays_empty_is_reported(self, tmp_path: Path) -> None:
+    def test_while_it_pauses_room_is_asked_for_again_and_a_stop_that_ends_it_notes_the_pause(
+        self, world: World
+    ) -> None:
+        world.free = 900
+        paused = world.wall
+        world.run(200)
+        assert 3 <= world.house.asked.count("room 1200") <= 5
+        assert world.house.restarts == []
+        world.supervisor.stop()
+        [(since, how)] = world.house.restarts
+        assert how == "paused"
+        assert 0 <= since - paused <= NS_PER_S
+
+    def test_each_split_that_stays_empty_is_reported(self, tmp_path: Path) -> None:
         world = World(tmp_path).started(8)
         world.disk_full = True
-        with capture_logs() as logs:
-            world.run(30)
-        reported = events(logs, "split_empty")
-        assert len(reported) >= 2
-        assert len({each["reason"] for each in reported}) == len(reported)
+        reasons = [each["reason"] for each in world.logged(30, "split_empty")]
+        assert len({*reasons}) == len(reasons) >= 2
 
     def test_once_a_newer_split_is_closed_an_empty_one_is_past(self, tmp_path: Path) -> None:
         world = World(tmp_path).started(8)
         world.disk_full = True
         world.run(12)
         world.disk_full = False
-        world.run(2)
-        assert world.heartbeat()["recovered"] is False
-        world.run(18)
+        for after_s, is_past in ((2, False), (18, True)):
+            world.run(after_s)
+            assert world.heartbeat()["recovered"] is is_past
         assert "is empty" in str(world.heartbeat()["last_error"])
-        assert world.heartbeat()["recovered"] is True
         assert len(world.recorders) == 1
 
 

@@ -335,17 +335,6 @@ class TestAnswers:
         keep_only(bag_dir, *(f"{name}.mcap" for name in kept))
         assert answers() == before
 
-    def test_deleting_split_by_split_ends_in_the_same(self, bag_dir: Path) -> None:
-        memory = memory_of(bag_dir)
-        before = [held(memory, DOCK, T0 + 290 * S), places(memory, T0 + 290 * S, ["laser", "arm"])]
-        for size in range(200_000, 0, -10_000):
-            keeper_of(bag_dir, max_bytes=size).apply()
-            after = [
-                held(memory, DOCK, T0 + 290 * S),
-                places(memory, T0 + 290 * S, ["laser", "arm"]),
-            ]
-            assert after == before
-
     def test_carried_messages_say_nothing_of_when_there_was_a_recording(
         self, bag_dir: Path
     ) -> None:

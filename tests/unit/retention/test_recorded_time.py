@@ -10,9 +10,8 @@ import structlog
 
 from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
+from ros2_memory.retention.recorded_time import RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
-from tests.support.examples import LONG
 from tests.support.fakes import failing
 
 if TYPE_CHECKING:
@@ -39,23 +38,6 @@ def recorded(
 def folders(bag_dir: Path, *names: str) -> None:
     for name in names:
         (bag_dir / name).mkdir()
-
-
-def test_what_was_never_seen_is_new(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "copied")
-    time = RecordedTime(tmp_path)
-    end = recorded(time, "a", 100)
-    assert time.since(["copied"]) == {"copied": 0}
-    recorded(time, "a", 120, since_s=end)
-    assert time.since(["copied"]) == {"copied": 120 * S}
-    assert RecordedTime(tmp_path).since(["copied"])["copied"] >= 60 * S
-
-
-def test_a_kill_forgets_a_minute_at_most(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    recorded(RecordedTime(tmp_path), "a", 119)
-    recorded(RecordedTime(tmp_path), "b", 119)
-    assert 60 * S <= RecordedTime(tmp_path).since(["a"])["a"] <= 119 * S
 
 
 def test_silence_does_not_count_for_more_than_a_minute(tmp_path: Path) -> None:
@@ -105,31 +87,6 @@ def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_p
     assert time.doubtful("ab") == {"a", "b"}
     recorded(time, "c", 20)
     assert RecordedTime(tmp_path).doubtful("ab") == {"a", "b"}
-
-
-def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b", "c")
-    time = RecordedTime(tmp_path)
-    end = recorded(time, "a", 90)
-    end = recorded(time, "b", 90, since_s=end)
-    recorded(time, "c", 120, since_s=end)
-    path = tmp_path / FILE
-    right, whole = RecordedTime(tmp_path).since("abc"), path.read_bytes()
-    assert right["a"] > right["b"] > right["c"] == 0
-    for bit in range(0, 8 * len(whole), 1 if LONG else 7):
-        flipped = bytearray(whole)
-        flipped[bit // 8] ^= 1 << bit % 8
-        path.write_bytes(flipped)
-        with structlog.testing.capture_logs() as captured:
-            spoiled = RecordedTime(tmp_path)
-            found = spoiled.since("abc")
-        assert spoiled.doubtful("abc") == {*"abc"}
-        # A flipped line end spoils two lines, and the one before these is two minutes older.
-        assert all(found[name] <= right[name] + 2 * SAVE_S * S for name in "abc")
-        if found != right:
-            [told] = captured
-            assert told["event"] == "recorded_time_damaged"
-            assert whole[: bit // 8].count(b"\n") + 1 in told["lines"]
 
 
 def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(

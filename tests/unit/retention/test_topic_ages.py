@@ -214,44 +214,52 @@ def test_a_bag_that_another_program_rewrites_is_left_to_it(bag_dir: Path) -> Non
     assert counts_of(bag)["/speech"] == 10
 
 
-def test_bags_wait_until_they_are_shipped_and_count_as_shipped_afterwards(bag_dir: Path) -> None:
-    old = [bag_dir / "rec_A" / f"rec_A_{hour}.mcap" for hour in (0, 1)]
-    receipt = Receipt("rec_A/rec_A_0.mcap", "id", old[0].stat().st_size, "00", "lake", 1)
-    append_receipts(bag_dir, [receipt])
+@pytest.fixture
+def shipped(bag_dir: Path) -> Path:
+    """The first of these bags, of which there is a receipt."""
+    path = bag_dir / "rec_A" / "rec_A_0.mcap"
+    size = path.stat().st_size
+    append_receipts(bag_dir, [Receipt("rec_A/rec_A_0.mcap", "id", size, "00", "lake", 1)])
+    return path
+
+
+def is_shipped(path: Path) -> bool:
+    bag = ("rec_A/rec_A_0.mcap", path.stat().st_size)
+    return not unshipped(path.parents[1], [bag])
+
+
+def test_bags_wait_until_they_are_shipped_and_count_as_shipped_afterwards(
+    bag_dir: Path, shipped: Path
+) -> None:
+    old = [shipped, shipped.with_name("rec_A_1.mcap")]
     house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert ["/speech" in counts_of(path) for path in old] == [False, True]
-    assert unshipped(bag_dir, [(receipt.bag, old[0].stat().st_size)]) == frozenset()
+    assert is_shipped(shipped)
 
 
 @pytest.mark.parametrize("step", ["receipt", "new name"])
 def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    bag_dir: Path, shipped: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
-    path = bag_dir / "rec_A" / "rec_A_0.mcap"
-    receipt = Receipt("rec_A/rec_A_0.mcap", "id", path.stat().st_size, "00", "lake", 1)
-    append_receipts(bag_dir, [receipt])
 
     owner, name = (SHIPPED, "append") if step == "receipt" else (repair, "replace_file")
     with monkeypatch.context() as patched:
         patched.setattr(owner, name, failing())
         house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
-    assert counts_of(path)["/speech"] == 10
-    assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
+    assert counts_of(shipped)["/speech"] == 10
+    assert is_shipped(shipped)
     assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
     house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
-    assert "/speech" not in counts_of(path)
-    assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
+    assert "/speech" not in counts_of(shipped)
+    assert is_shipped(shipped)
 
 
 def test_what_went_stays_written_down_where_the_folder_cannot_be_flushed_afterwards(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+    bag_dir: Path, shipped: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = bag_dir / "rec_A" / "rec_A_0.mcap"
-    receipt = Receipt("rec_A/rec_A_0.mcap", "id", path.stat().st_size, "00", "lake", 1)
-    append_receipts(bag_dir, [receipt])
     with monkeypatch.context() as patched:
         patched.setattr(repair, "flush", failing(errno.EIO))
         house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
-    assert "/speech" not in counts_of(path)
+    assert "/speech" not in counts_of(shipped)
     assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
-    assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
+    assert is_shipped(shipped)
