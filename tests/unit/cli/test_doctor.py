@@ -242,7 +242,8 @@ def test_what_is_wrong_with_bags_is_reported_with_what_would_mend_that_alone(
     lay(robot, "letter", b"a letter")
     whole = (robot / "rec" / "rec_0.mcap").read_bytes()
     lay(robot, "cut", whole[: len(whole) // 2])
-    lay(robot, "twin", whole)
+    same_time = [odom(time.time_ns() - (60 - n) * NS_PER_S, 0.0, 0.0) for n in range(50)]
+    write_mcap(robot / "twin" / "twin_0.mcap", same_time)
     for name in ("a_0.db3", "b_0.db3", "c_0.MCAP"):
         (robot / "rec" / name).write_bytes(b"any")
     now = time.time_ns() - 3600 * NS_PER_S
