@@ -44,6 +44,14 @@ def mode(second: float, value: bool, published: float | None = None) -> Msg:
     return Msg(said.topic, said.type, at, said.body, T0 + round((published or second) * S))
 
 
+def on(second: float, published: float | None = None) -> Msg:
+    return mode(second, value=True, published=published)
+
+
+def off(second: float) -> Msg:
+    return mode(second, value=False)
+
+
 def word(second: float, topic: str = "/chatter") -> Msg:
     """A message that says when it was recorded."""
     return text(T0 + round(second * S), f"{topic}@{second:g}", topic)

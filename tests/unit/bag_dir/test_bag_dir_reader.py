@@ -20,6 +20,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import memory_of
 
 T0 = 1_700_000_000 * 10**9
@@ -99,12 +100,12 @@ def test_a_sidecar_that_cannot_be_read_hides_nothing_and_is_named(tmp_path: Path
     assert "handover.json" in queries.data_time_range(counting(tmp_path), Call()).notes[0]
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(examples(40)))
 def test_a_summary_states_what_a_reading_gives(tmp_path: Path, seed: int) -> None:
     draw = random.Random(seed)
 
     def moment() -> int:
-        return T0 + draw.randrange(40) * S // 4
+        return T0 + draw.randrange(examples(40)) * S // 4
 
     def message(topic: str) -> Msg:
         at = moment()

@@ -19,7 +19,7 @@ import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.durable_write import write_durably
-from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.bag_dir.handover_file import Handover, read_handover, write_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.moment_file import PendingRequest, RequestQueue
@@ -30,14 +30,12 @@ from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import QuerySettings
 from ros2_memory.index.file_state import files_in_metadata
 from ros2_memory.index.scan import Tree
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from ros2_memory.tools.build import build_tools
 from tests.support.bags import boolean, text, write_db3, write_mcap
 from tests.support.examples import LONG
 from tests.support.handovers import recover_handovers
@@ -252,8 +250,16 @@ class TestDeletions:
     """What deletes: retention has its tests beside it (`test_housekeeping.py`)."""
 
     @pytest.mark.usefixtures("linked")
-    def test_a_wipe_leaves_what_a_link_leads_to(self, bags: Path, outside: Path) -> None:
+    def test_a_repair_the_next_start_and_a_wipe_leave_what_a_link_leads_to(
+        self, bags: Path, outside: Path
+    ) -> None:
+        cut = outside / "rec_0.mcap"
+        cut.write_bytes(cut.read_bytes()[:-100])
+        (outside / "rec_9.mcap").touch()
+        write_handover(outside, Handover(next="rec_2"))
         with untouched(outside):
+            recover_files(bags, force=True)
+            recover_handovers(bags, McapReader())
             clear_bags(bags)
 
     def test_a_wipe_leaves_what_takes_a_directory_s_place_meanwhile(
@@ -275,14 +281,6 @@ class TestDeletions:
         assert done
         assert contents(outside) == before
         assert len(wiped.faults) == 1
-
-    @pytest.mark.usefixtures("linked")
-    def test_a_repair_leaves_what_a_link_leads_to(self, bags: Path, outside: Path) -> None:
-        cut = outside / "rec_0.mcap"
-        cut.write_bytes(cut.read_bytes()[:-100])
-        (outside / "rec_9.mcap").touch()
-        with untouched(outside):
-            recover_files(bags, force=True)
 
     def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
         self, bags: Path, outside: Path
@@ -367,67 +365,39 @@ class TestWhatTheRecorderKeepsBesideBags:
             with pytest.raises(BagError, match="File exists"):
                 McapWriter().write(bags / "x.mcap", [])
 
-    def test_no_handover_is_settled_behind_a_link(self, bags: Path, outside: Path) -> None:
-        sidecar = {
-            "format": 1,
-            "state": "counts",
-            "clock": "publish",
-            "next": "rec_2",
-            "notes": [],
-        }
-        (outside / "handover.json").write_text(json.dumps(sidecar))
-        assert read_handover(outside).problem is None
-        with untouched(outside):
-            (bags / "rec").symlink_to(outside)
-            recover_handovers(bags, McapReader())
+
+HOSTILE = (
+    "/etc/passwd",
+    "../../../../../../etc/passwd",
+    "../outside/rec/rec_0.mcap",
+    "run/run_0.mcap",
+    "file:///proc/self/environ",
+    "std_msgs/msg/../../../../etc/passwd",
+    "*/../../*",
+    "~/.ssh/id_rsa",
+    "$(cat ${HOME}/secret)",
+)
 
 
-class TestArguments:
-    TOOLS = build_tools(QuerySettings())
-
-    @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
-    def test_no_tool_takes_a_path(self, tool: Any) -> None:
-        for name, shape in tool.schema.get("properties", {}).items():
-            assert not {"path", "file", "dir", "directory", "folder", "url", "uri", "bag"} & set(
-                name.lower().split("_")
-            )
-            assert shape.get("format") not in {"path", "file-path", "directory-path", "uri"}
-
-    HOSTILE = (
-        "/etc/passwd",
-        "../../../../../../etc/passwd",
-        "../outside/rec/rec_0.mcap",
-        "run/run_0.mcap",
-        "file:///proc/self/environ",
-        "std_msgs/msg/../../../../etc/passwd",
-        "*/../../*",
-        "~/.ssh/id_rsa",
-        "$(cat ${HOME}/secret)",
-    )
-
-    async def test_no_text_of_a_caller_reaches_the_file_system(
-        self, bags: Path, outside: Path
-    ) -> None:
-        places = [
-            (name, given, key)
-            for name, given, _ in ANSWERED
-            for key, value in [*given.items(), ("path", "")]
-            if isinstance(value, str)
-        ]
-        # In a short run each place has one of the texts, and each text several places.
-        calls = [
-            (name, given | {key: hostile})
-            for nth, (name, given, key) in enumerate(places)
-            for hostile in (self.HOSTILE if LONG else self.HOSTILE[nth % len(self.HOSTILE) :][:1])
-        ]
-        with asking(bags) as server:
-            # Once without being heard: modules are loaded then.
-            for name, given, _ in ANSWERED:
+async def test_no_text_of_a_caller_reaches_the_file_system(bags: Path) -> None:
+    places = [
+        (name, given, key)
+        for name, given, _ in ANSWERED
+        for key, value in [*given.items(), ("path", "")]
+        if isinstance(value, str)
+    ]
+    # In a short run each place has one of the texts, and each text several places.
+    calls = [
+        (name, given | {key: hostile})
+        for nth, (name, given, key) in enumerate(places)
+        for hostile in (HOSTILE if LONG else HOSTILE[nth % len(HOSTILE) :][:1])
+    ]
+    with asking(bags) as server:
+        # Once without being heard: modules are loaded then.
+        for name, given, _ in ANSWERED:
+            await told(server, name, given)
+        with hearing() as heard:
+            for name, given in [*calls, *((hostile, {}) for hostile in HOSTILE)]:
                 await told(server, name, given)
-            with hearing() as heard:
-                for name, given in calls:
-                    await told(server, name, given)
-                for hostile in self.HOSTILE:
-                    await told(server, hostile, {})
-            assert [each for each in heard if str(bags) not in each and "sqlite3" not in each] == []
-            assert [each for each in heard if "passwd" in each or "outside" in each] == []
+        assert [each for each in heard if str(bags) not in each and "sqlite3" not in each] == []
+        assert [each for each in heard if "passwd" in each or "outside" in each] == []

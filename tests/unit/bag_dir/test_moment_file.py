@@ -10,9 +10,9 @@ import stat
 from typing import TYPE_CHECKING
 
 import pytest
-import structlog
 from hypothesis import given
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir import moment_file
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER, bag_kind
@@ -46,18 +46,18 @@ def request(label: str = "charger found", number: str = NUMBER) -> SaveRequest:
 
 
 class TestLabels:
-    @pytest.mark.parametrize(
-        "label", ["a", "Küche, 2. Stock", "充電 /../ etc", "x" * 120, "it's 🙂"]
-    )
-    def test_what_people_write_is_one(self, label: str) -> None:
-        assert fault_of_label(label) is None
+    def test_one_is_what_can_be_seen_and_is_not_too_long(self) -> None:
+        for label in ("a", "Küche, 2. Stock", "充電 /../ etc", "x" * 120, "it's 🙂"):
+            assert fault_of_label(label) is None
+        unseen = ("", "  ", "two\nlines", "tab\t", "nul\0", "\u202eedoc", "\ud800", "\u2028")
+        for label in (*unseen, "x" * 121):
+            assert fault_of_label(label)
 
-    @pytest.mark.parametrize(
-        "label",
-        ["", "  ", "x" * 121, "two\nlines", "tab\t", "nul\0", "\u202eedoc", "\ud800", "\u2028"],
-    )
-    def test_what_cannot_be_seen_or_is_too_long_is_none(self, label: str) -> None:
-        assert fault_of_label(label)
+    def test_moments_of_one_label_and_second_have_folders_of_their_own(
+        self, tmp_path: Path
+    ) -> None:
+        names = [make_moment_folder(tmp_path, request()).name for _ in range(3)]
+        assert names == [f"20261120T050000Z-charger-found{end}" for end in ("", "_2", "_3")]
 
     @given(st.text(max_size=130))
     def test_any_of_them_names_a_folder_that_is_safe(self, label: str) -> None:
@@ -65,12 +65,6 @@ class TestLabels:
         assert re.fullmatch(r"20261120T050000Z-[a-z0-9]+(-[a-z0-9]+)*", name)
         assert bag_kind(name) is None
         assert len(name) < 64
-
-
-class TestFolders:
-    def test_two_of_one_label_and_second_have_their_own(self, tmp_path: Path) -> None:
-        names = [make_moment_folder(tmp_path, request()).name for _ in range(3)]
-        assert names == [f"20261120T050000Z-charger-found{end}" for end in ("", "_2", "_3")]
 
 
 class TestMomentFiles:
@@ -129,10 +123,15 @@ def names(bag_dir: Path) -> list[str]:
     return sorted(path.name for path in (bag_dir / REQUESTS_FOLDER).iterdir())
 
 
-def test_a_request_whose_server_died_is_forgotten(tmp_path: Path) -> None:
-    posted = asked(tmp_path)
-    assert list(RequestQueue(tmp_path).take(T0 + STALE_NS + 1)) == []
-    assert names(tmp_path) == [f"{posted.request.number}.answer"]
+def test_requests_and_answers_that_nobody_waits_for_are_swept_away(tmp_path: Path) -> None:
+    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
+    assert list(queue.take(T0 + STALE_NS + 1)) == []
+    [name] = names(tmp_path)
+    assert name == f"{posted.request.number}.answer"
+    os.utime(tmp_path / REQUESTS_FOLDER / name, ns=(T0, T0))
+    for after_s, left in ((500, [name]), (700, [])):
+        assert list(queue.take(T0 + after_s * S)) == []
+        assert names(tmp_path) == left
 
 
 def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
@@ -158,7 +157,7 @@ def test_what_is_no_request_is_told_and_dropped(tmp_path: Path, text: str) -> No
     queue = RequestQueue(tmp_path)
     (tmp_path / REQUESTS_FOLDER).mkdir(parents=True)
     (tmp_path / REQUESTS_FOLDER / f"{NUMBER}.json").write_text(text)
-    with structlog.testing.capture_logs() as captured:
+    with capture_logs() as captured:
         assert list(queue.take(T0)) == []
     assert [event["event"] for event in captured] == ["request_ignored"]
     assert names(tmp_path) == [f"{NUMBER}.answer"]
@@ -184,22 +183,11 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
     (folder / f"{'a' * 32}.json").symlink_to("/etc/hostname")
     os.mkfifo(folder / f"{'b' * 32}.json")
     posted, queue = asked(tmp_path), RequestQueue(tmp_path)
-    with structlog.testing.capture_logs() as captured:
+    with capture_logs() as captured:
         assert refuse_all(queue) == 1
     assert [event["event"] for event in captured] == ["request_ignored"] * 3
     assert posted.outcome() is not None
     assert not queue.has_requests()
-
-
-def test_answers_that_nobody_fetched_are_swept_away(tmp_path: Path) -> None:
-    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
-    assert refuse_all(queue) == 1
-    path = tmp_path / REQUESTS_FOLDER / f"{posted.request.number}.answer"
-    os.utime(path, ns=(T0, T0))
-    assert list(queue.take(T0 + 500 * S)) == []
-    assert path.exists()
-    assert list(queue.take(T0 + 700 * S)) == []
-    assert names(tmp_path) == []
 
 
 def test_another_user_may_read_a_request_and_its_answer(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-import structlog
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir import own_recordings
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
@@ -41,15 +41,6 @@ def claimed(bag_dir: Path) -> OwnRecordings:
     """The list after a start of the recorder."""
     own = OwnRecordings(bag_dir)
     own.claim()
-    return own
-
-
-def begun(bag_dir: Path) -> OwnRecordings:
-    """The list where a recording was begun, is named by the heartbeat and has its first split."""
-    own = claimed(bag_dir)
-    own.begin(A)
-    named_in_heartbeat(bag_dir, A)
-    embedding(bag_dir / A / f"{A}_0.mcap")
     return own
 
 
@@ -142,21 +133,33 @@ class TestWhatARecorderLists:
 class TestWhatAKillLeaves:
     """The steps of a recording: list it, start the child, which makes it, list its directory."""
 
-    def test_made_and_its_directory_not_listed(self, tmp_path: Path) -> None:
-        begun(tmp_path)
-        (tmp_path / A / f"{A}_1.mcap").touch()
-        assert not OwnRecordings(tmp_path).owns(tmp_path / A)
-        assert claimed(tmp_path).owns(tmp_path / A)
-        assert OwnRecordings(tmp_path).owns(tmp_path / A)
-
-    def test_what_no_heartbeat_names_may_be_anybodys(self, tmp_path: Path) -> None:
-        begun(tmp_path)
+    def test_a_directory_that_was_not_listed_is_ours_where_the_heartbeat_names_it(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        claimed(tmp_path).begin(A)
+        embedding(tmp_path / A / f"{A}_0.mcap")
         named_in_heartbeat(tmp_path)
-        with structlog.testing.capture_logs() as logs:
+        with capture_logs() as logs:
             assert not claimed(tmp_path).owns(tmp_path / A)
         [event] = events(logs, "recording_not_claimed")
         assert event["recording"] == A
         assert "ros2-memory adopt" in event["reason"]
+        named_in_heartbeat(tmp_path, A)
+        (tmp_path / A / f"{A}_1.mcap").touch()
+        own = OwnRecordings(tmp_path)
+        assert not own.owns(tmp_path / A)
+        # A list that cannot be written is known all the same.
+        with monkeypatch.context() as patch, capture_logs() as logs:
+            patch.setattr(own_recordings, "write_durably", failing())
+            own.claim()
+            assert events(logs, "recordings_not_listed")
+            assert own.owns(tmp_path / A)
+            patch.setattr(own_recordings, "append_lines", failing())
+            with pytest.raises(RecorderError, match="No space left"):
+                own.begin(B)
+        own.begin(B)
+        assert [each.get("recording") for each in lines(tmp_path)] == [A, A, B]
+        assert OwnRecordings(tmp_path).owns(tmp_path / A)
 
     @settings(max_examples=examples(60), deadline=None)
     @given(cut=st.integers(0, 200), junk=st.sampled_from([b"", b"\0\0\0\0", b"{", b"[" * 5000]))
@@ -203,27 +206,9 @@ class TestWhatAKillLeaves:
         own_all(tmp_path)
         with (tmp_path / LIST_FILE).open("a") as stream:
             stream.write(with_checks(json.dumps(line)))
-        with structlog.testing.capture_logs() as logs:
+        with capture_logs() as logs:
             assert not OwnRecordings(tmp_path).names()
         assert events(logs, "recordings_list_damaged")
-
-    def test_a_list_that_cannot_be_written_is_known_all_the_same(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        begun(tmp_path)
-        own = OwnRecordings(tmp_path)
-
-        with monkeypatch.context() as patch, structlog.testing.capture_logs() as logs:
-            patch.setattr(own_recordings, "write_durably", failing())
-            own.claim()
-            assert events(logs, "recordings_not_listed")
-            assert own.owns(tmp_path / A)
-            patch.setattr(own_recordings, "append_lines", failing())
-            with pytest.raises(RecorderError, match="No space left"):
-                own.begin(B)
-        own.begin(B)
-        assert [each.get("recording") for each in lines(tmp_path)] == [A, A, B]
-        assert OwnRecordings(tmp_path).owns(tmp_path / A)
 
     def test_what_another_program_listed_is_known_where_the_list_cannot_be_written(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -308,7 +293,7 @@ class TestWithoutAList:
         named_in_heartbeat(tmp_path, A)
         write_handover(tmp_path / A, Handover(next=B, counts_until=1))
         write_handover(tmp_path / B, Handover(previous=A, counts_from=1))
-        with structlog.testing.capture_logs() as logs:
+        with capture_logs() as logs:
             own = claimed(tmp_path)
         assert not own.names()
         [event] = events(logs, "recordings_not_adopted")
@@ -356,34 +341,23 @@ class TestBags:
         later = embedding(tmp_path / A / f"{A}_4.mcap")
         assert not claimed(tmp_path).owns_bag(later)
 
+    def test_an_adopted_folder_holds_what_lay_there_and_one_of_an_earlier_version_everything(
+        self, tmp_path: Path
+    ) -> None:
+        path = embedding(tmp_path / "runs" / "x_0.mcap")
+        own = own_all(tmp_path)
+        later = embedding(tmp_path / "runs" / "y_0.mcap")
+        assert (own.owns_bag(path), own.owns_bag(later)) == (True, False)
+        LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
+        assert OwnRecordings(tmp_path).owns_bag(later)
+
     def test_recordings_of_before_such_notes_hold_all_that_are_named_after_them(
         self, tmp_path: Path
     ) -> None:
-        path = embedding(tmp_path / A / f"{A}_12.mcap")
-        other = embedding(tmp_path / A / "x_0.mcap")
+        path, other = (embedding(tmp_path / A / name) for name in (f"{A}_12.mcap", "x_0.mcap"))
         own = claimed(tmp_path)
         identity = identity_of(tmp_path / A)
         assert identity is not None
         LIST.append(tmp_path, [ListRow(A, identity.inode, identity.generation)])
-        for _ in range(2):
-            assert own.owns_bag(path)
-            assert not own.owns_bag(other)
-            own = claimed(tmp_path)
-
-    def test_an_adopted_folder_holds_what_lay_there(self, tmp_path: Path) -> None:
-        path = embedding(tmp_path / "runs" / "x_0.mcap")
-        own = own_all(tmp_path)
-        later = embedding(tmp_path / "runs" / "y_0.mcap")
-        assert own.owns_bag(path)
-        assert not own.owns_bag(later)
-        own_all(tmp_path)
-        assert own.owns_bag(path)
-        assert own.owns_bag(later)
-
-    def test_a_folder_that_an_earlier_version_adopted_holds_everything(
-        self, tmp_path: Path
-    ) -> None:
-        path = embedding(tmp_path / "runs" / "x_0.mcap")
-        own_all(tmp_path)
-        LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
-        assert OwnRecordings(tmp_path).owns_bag(path)
+        for each in (own, claimed(tmp_path)):
+            assert (each.owns_bag(path), each.owns_bag(other)) == (True, False)

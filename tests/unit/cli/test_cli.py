@@ -59,19 +59,17 @@ class TestInfo:
 
 
 class TestConfig:
-    def test_it_is_shown_as_yaml_that_a_program_would_take(
-        self, bag_dir: Path, exits: Program
+    def test_it_is_shown_as_yaml_that_a_program_would_take_but_no_token_is(
+        self, bag_dir: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        shown = yaml.safe_load(exits(0, "config show server.port=9300").out)
+        monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
+        text = exits(0, "config show server.port=9300").out
+        shown = yaml.safe_load(text)
         assert shown["server"]["port"] == 9300
         assert shown["recording"]["bag_dir"] == str(bag_dir)
         assert shown["storage"]["_target_"].startswith("ros2_memory.")
-
-    def test_a_token_is_not(self, monkeypatch: pytest.MonkeyPatch, exits: Program) -> None:
-        monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
-        shown = exits(0, "config show").out
-        assert "MEMORY_API_TOKEN is set" in shown
-        assert "a-secret" not in shown
+        assert "MEMORY_API_TOKEN is set" in text
+        assert "a-secret" not in text
 
     def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
         self, monkeypatch: pytest.MonkeyPatch, exits: Program, bag_dir: Path

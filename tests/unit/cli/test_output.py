@@ -51,11 +51,18 @@ def test_objects_in_a_cell_are_words(value: JsonValue, output: str) -> None:
     assert format_value(value) == output
 
 
-def test_a_moment_has_its_local_time_and_its_age(shown: Shown) -> None:
+def test_a_moment_has_its_local_time_and_its_age_and_what_there_is_not_is_in_words(
+    shown: Shown,
+) -> None:
     output = shown({"timestamp": T0, "first": T0 - 7200.0, "next": T0 + 60.0}, now=T0)
     assert output.splitlines()[0].split(maxsplit=1) == ["timestamp", format_time(T0)]
     assert f"{format_time(T0 - 7200)} (2.0 h ago)" in output
     assert f"{format_time(T0 + 60)} (in 60.0 s)" in output
+    # That of a clock that was never set has its unit.
+    assert shown({"earliest": 0.0}).split() == ["earliest", "0", "s", "after", "1970"]
+    assert "0 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
+    assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
+    assert shown([]) == "none"
 
 
 def test_long_times_are_in_a_unit_that_suits_them(shown: Shown) -> None:
@@ -76,11 +83,6 @@ def test_the_rows_of_a_table_have_the_names_of_its_columns(shown: Shown) -> None
     assert lines[:3] == [["total", "2"], ["rows"], ["timestamp", "percentage"]]
     assert [line[-1] for line in lines[-2:]] == ["80.5", "-"]
     assert lines[-1][0] == format_time(T0 + 1.0)
-
-
-def test_a_time_of_a_clock_that_was_never_set_has_its_unit(shown: Shown) -> None:
-    assert shown({"earliest": 0.0}).split() == ["earliest", "0", "s", "after", "1970"]
-    assert "0 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
 
 
 def test_a_list_of_tools_stays_one_and_a_tool_to_ask_becomes_a_command() -> None:
@@ -107,22 +109,14 @@ def test_counts_by_day_are_a_table_whose_last_row_is_of_all(shown: Shown) -> Non
     ]
 
 
-def test_what_there_is_not_is_reported_in_words(shown: Shown) -> None:
-    assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
-    assert shown([]) == "none"
-
-
-def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time(shown: Shown) -> None:
+def test_in_a_narrow_terminal_moments_are_broken_and_wide_rows_stand_one_below_the_other(
+    shown: Shown,
+) -> None:
     rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
     output = shown(rows)
-    day, _, time = format_time(T0).partition("T")
-    assert [line.count(day) for line in output.splitlines() if day in line] == [2]
-    assert [line.count(time) for line in output.splitlines() if time in line] == [2]
+    for part in format_time(T0).split("T"):
+        assert [line.count(part) for line in output.splitlines() if part in line] == [2]
     assert "12345" in output
-
-
-def test_rows_that_are_too_wide_for_a_table_stand_one_below_the_other(shown: Shown) -> None:
     row: JsonValue = {f"a_key_with_a_long_name_{n}": n for n in range(6)}
-    output = shown([row, row])
-    assert output.count("a_key_with_a_long_name_5  5") == 2
+    assert shown([row, row]).count("a_key_with_a_long_name_5  5") == 2
     assert shown([row, row], width=200).count("a_key_with_a_long_name_5") == 1

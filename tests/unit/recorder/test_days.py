@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import structlog
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -540,7 +540,7 @@ def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
     split(bag_dir, 7200, name="rec_B")
     own_all(bag_dir)
     memory = days_of(bag_dir, writer=FullAtFirst())
-    with structlog.testing.capture_logs() as logs:
+    with capture_logs() as logs:
         house(bag_dir, T0 + 7300 * S, max_bytes=1, memory=memory).apply()
     assert [log["lost"] for log in logs if log["event"] == "memory_not_kept"] == [2]
     assert bags_left(bag_dir, "rec_*") == 1

@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-import structlog
 import zstandard
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses
@@ -68,7 +68,7 @@ def left_open(path: Path, start: int = 0, count: int = 20) -> Path:
 
 def said(keeper: Housekeeping, event: str) -> list[MutableMapping[str, Any]]:
     """What two passes log under a name."""
-    with structlog.testing.capture_logs() as captured:
+    with capture_logs() as captured:
         keeper.apply()
         keeper.apply()
     return events(captured, event)
@@ -98,7 +98,7 @@ class TestRetention:
         clock, needed = Mock(return_value=False), bag(tmp_path / "a/a_1.mcap", 10)
         rules = Mock(restarts=(), needed=lambda _: frozenset({str(needed)}))
         keeper = keeper_of(tmp_path, max_age_h=2, is_synchronised=clock, watch=lambda _: rules)
-        with structlog.testing.capture_logs() as captured:
+        with capture_logs() as captured:
             keeper.apply()
             keeper.apply()
             assert (old.exists(), clock.call_count) == (True, 2)
@@ -132,7 +132,7 @@ class TestRetention:
         append_receipts(tmp_path, [receipt(old[1], tmp_path)])
         budget = size_of(tmp_path) - sum(path.stat().st_size for path in old)
         keeper = keeper_of(tmp_path, max_bytes=budget, max_age_h=2, require_shipped=True)
-        with structlog.testing.capture_logs() as captured:
+        with capture_logs() as captured:
             keeper.apply()
             [lost] = events(captured, "unshipped_deleted")
             assert (lost["bags"], lost["names"]) == (2, ["a/a_0.mcap", "a/a_2.mcap"])
@@ -284,7 +284,7 @@ class TestMakingRoom:
         recording(tmp_path, "a", 0)
         before = files_in(tmp_path)
         keeper = keeper_of(tmp_path, measure_free=lambda _: 0)
-        with structlog.testing.capture_logs() as logs:
+        with capture_logs() as logs:
             keeper.make_room(PLENTY)
             keeper.make_room(PLENTY)
         assert files_in(tmp_path) == before
@@ -389,7 +389,7 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     empty.write_bytes(b"")
     (tmp_path / OWN / "metadata.yaml").touch()  # as on a disk that was full
     readable = McapReader().summarize(open_one).topics
-    with structlog.testing.capture_logs() as captured:
+    with capture_logs() as captured:
         keeper_of(tmp_path).apply()
     after = McapReader().summarize(open_one)
     assert (after.complete, after.topics) == (True, readable)

@@ -15,7 +15,7 @@ from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
-from tests.support.plain_text_bags import PlainReader, close, grow, plain
+from tests.support.plain_text_bags import PlainReader, plain
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -79,18 +79,6 @@ def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yar
     assert _names(snapshot.unread) == ["latest", "old_0.db3"]
     assert [path.name for path in snapshot.empty] == ["rec_2.mcap"]
     assert snapshot.silent_topics == {"/lost", "/idle"}
-
-
-def test_the_active_bag_stays_out_until_it_is_closed_in_place(yard: Yard) -> None:
-    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
-    yard.age(NOW - 5 * S)
-    assert _names(yard.scan_after().active) == ["rec_0.mcap"]
-    grow(path, 2, 3)
-    close(path)
-    yard.age(NOW - 5 * S)  # no name came or went
-    snapshot = yard.scan_after(1)
-    assert snapshot.active == ()
-    assert [(bag.start, bag.end) for bag in snapshot.bags] == [(1, 3)]
 
 
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:

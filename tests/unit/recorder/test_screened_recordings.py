@@ -14,7 +14,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from tests.support.bags import McapLayout
 from tests.support.fakes import failing
 from tests.support.housekeepers import keeper_of, recording_now
-from tests.support.screened_bags import ScreenedBags, mode, privacy, words
+from tests.support.screened_bags import ScreenedBags, off, on, privacy, words
 from tests.support.simulated_recorders import assert_each_counts_once, rotating
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class TestTheHouse:
         bags = ScreenedBags(tmp_path / "bags")
         house = keeper_of(bags.bag_dir, screening=bags.screening)
         name = bags.begin(0)
-        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        bags.split(name, [off(-2), *words(0, 10)])
         bags.split(name, words(10, 20), OPEN)
         bags.end()
         assert len(bags.served()) == 1
@@ -87,8 +87,8 @@ class TestTheHouse:
         monkeypatch.setattr(McapWriter, "cut", failing())
         bags = ScreenedBags(tmp_path / "bags")
         name = bags.begin(0)
-        held = bags.split(name, [mode(0, value=True), *words(0, 10)])
-        bags.split(name, [mode(13, value=False), *words(10, 30)])
+        held = bags.split(name, [on(0), *words(0, 10)])
+        bags.split(name, [off(13), *words(10, 30)])
         bags.end()
         recording_now(bags.bag_dir, name)
         keeper_of(bags.bag_dir, max_bytes=1).apply()
@@ -101,7 +101,7 @@ class TestTheHouse:
         bags = ScreenedBags(tmp_path / "bags")
         house = keeper_of(bags.bag_dir, background=Background(), screening=bags.screening)
         name = bags.begin(0)
-        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        bags.split(name, [off(-2), *words(0, 10)])
         house.screen(())
         house.wait()
         assert len(bags.served()) == 1

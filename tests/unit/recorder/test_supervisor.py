@@ -15,6 +15,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder import handover
 from ros2_memory.recorder.sessions import Required
 from tests.support.simulated_recorders import (
+    TOPICS,
     World,
     assert_each_counts_once,
     assert_what_stands_counts_once,
@@ -67,18 +68,6 @@ class TestRotation:
         assert old.asked_to_end == 0
         world.run(3)
         assert old.status == 0
-
-    def test_what_the_new_one_does_not_receive_for_4_s_counts_in_the_old_one(
-        self, tmp_path: Path
-    ) -> None:
-        """Publishers on a busy machine discover who has subscribed seconds later."""
-        world = rotating(tmp_path, 20.5)
-        _, new = world.recorders
-        new.deaf = True
-        world.run(4)
-        new.deaf = False
-        world.run(12)
-        assert_each_counts_once(world)
 
     def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -159,13 +148,16 @@ class TestStop:
 
 
 class TestMessagesOfOneRecordingAlone:
-    @pytest.mark.parametrize("which", [0, 1])
+    # Publishers on a busy machine discover seconds later who has subscribed.
+    @pytest.mark.parametrize(
+        ("which", "at_s", "deaf_s"), [(0, 21.75, 0.75), (1, 21.75, 0.75), (1, 20.5, 4)]
+    )
     def test_what_one_missed_in_a_rotation_counts_in_the_other(
-        self, tmp_path: Path, which: int
+        self, tmp_path: Path, which: int, at_s: float, deaf_s: float
     ) -> None:
-        world = rotating(tmp_path, 21.75)
+        world = rotating(tmp_path, at_s)
         world.recorders[which].deaf = True
-        world.run(0.75)
+        world.run(deaf_s)
         world.recorders[which].deaf = False
         # Compared as soon as the first split of the new one is closed, long before it ends.
         world.run(15)
@@ -326,13 +318,24 @@ class TestHeartbeat:
 
 
 class TestOffers:
-    def test_a_topic_that_nobody_offers_is_named_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path, expected=("/bumper", "/lidar")).started()
+    def test_topics_that_nobody_offers_are_named_once_a_recorder_has_looked(
+        self, tmp_path: Path
+    ) -> None:
+        expected, offered = ("/odom", "/gone", "/bumper"), {"topics": ("/bumper",)}
+        world = World(tmp_path, expected=expected, defaults=dict(offered)).started()
+        assert world.heartbeat()["missing"] == []
         with capture_logs() as logs:
             world.run(29)
+            assert world.heartbeat()["missing"] == ["/gone", "/odom"]
             assert not events(logs, "topic_not_offered")
             world.run(60)
-        assert [each["topics"] for each in events(logs, "topic_not_offered")] == [["/lidar"]]
+        assert [each["topics"] for each in events(logs, "topic_not_offered")] == [
+            ["/gone", "/odom"]
+        ]
+        world.defaults["topics"] = ("/odom",)
+        world.running[0].die()
+        world.run(10)
+        assert world.heartbeat()["missing"] == ["/gone"]
 
     def test_nodes_that_have_gone_are_reported_until_they_come_back(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -411,7 +414,8 @@ class TestShortfall:
             tmp_path,
             session_duration_s=20,
             advice=lambda: "look at the users",
-            defaults={"heard": ("/bumper",)},
+            # Services and actions may be unused.
+            defaults={"topics": (*TOPICS, "/go/_action/feedback"), "heard": ("/bumper",)},
         ).started(25)
         assert world.heartbeat()["unheard"] == []
         with capture_logs() as logs:
@@ -423,12 +427,6 @@ class TestShortfall:
         world.running[-1].heard = ("/bumper", "/door")
         world.run(15)
         assert (world.heartbeat()["unheard"], world.heartbeat()["advice"]) == ([], None)
-
-    def test_services_and_actions_may_be_unused(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.defaults |= {"topics": ("/bumper", "/go/_action/feedback"), "heard": ("/bumper",)}
-        world.started(60)
-        assert world.heartbeat()["unheard"] == []
 
     @pytest.mark.parametrize("still", [("/bumper",), ()])
     def test_a_regular_topic_that_stops_is_silent_until_it_comes(
@@ -497,7 +495,12 @@ class TestChangedList:
 
     def test_a_refused_list_changes_nothing_and_is_named(self, tmp_path: Path) -> None:
         world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
-        before = world.heartbeat()["listed"]
+        before, whole = world.heartbeat()["listed"], world.topics_path.read_text()
+        # One that is touched, or written in steps, is the same.
+        for text, run_s in (("topics:\n", 1.5), (whole, 20)):
+            world.topics_path.write_text(text)
+            world.run(run_s)
+        assert (len(world.recorders), world.heartbeat()["last_error"]) == (1, None)
         world.topics_path.write_text("topics: [no slash]\n")
         [refused] = world.logged(30, "topics_refused")
         beat = world.heartbeat()
@@ -508,31 +511,6 @@ class TestChangedList:
         world.run(20)
         beat = world.heartbeat()
         assert (beat["list_refused"], beat["listed"]) == (None, ["/bumper", "/door"])
-
-    def test_a_file_that_is_touched_or_written_in_steps_is_no_change(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags", expected=("/bumper",))
-        whole = world.topics_path.read_text()
-        world.started(20)
-        world.topics_path.write_text("topics:\n")
-        world.run(1.5)
-        world.topics_path.write_text(whole)
-        world.run(20)
-        assert (len(world.recorders), world.heartbeat()["last_error"]) == (1, None)
-
-
-def test_topics_that_nobody_has_offered_are_named_once_a_recorder_has_looked(
-    tmp_path: Path,
-) -> None:
-    world = World(
-        tmp_path, expected=("/odom", "/gone", "/bumper"), defaults={"topics": ("/bumper",)}
-    ).started()
-    assert world.heartbeat()["missing"] == []
-    world.run(7)
-    assert world.heartbeat()["missing"] == ["/gone", "/odom"]
-    world.defaults["topics"] = ("/odom",)
-    world.running[0].die()
-    world.run(10)
-    assert world.heartbeat()["missing"] == ["/gone"]
 
 
 def test_a_death_is_told_with_its_time_and_last_words_and_is_past_once_recording_goes_on(

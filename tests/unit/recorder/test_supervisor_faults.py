@@ -188,17 +188,6 @@ class TestFailingDisk:
         assert len(world.recorders) == 2
         assert_each_counts_once(world)
 
-    def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(
-        self, world: World, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-
-        monkeypatch.setattr(world.reader, "closing", failing(errno.ESTALE))
-        world.recorders[0].die()
-        with capture_logs() as logs:
-            world.run(6)
-        assert len(world.running) == 1
-        assert "Stale file handle" in events(logs, "unreadable")[0]["reason"]
-
     def test_once_its_splits_can_be_read_again_and_one_is_closed_that_fault_is_past(
         self, world: World, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -211,6 +200,11 @@ class TestFailingDisk:
             world.run(13)
             assert world.heartbeat()["recovered"] is True
         assert len(world.recorders) == 1
+        # One that dies is replaced all the same.
+        monkeypatch.setattr(world.reader, "closing", failing(errno.ESTALE))
+        world.recorders[0].die()
+        assert "Stale file handle" in world.logged(6, "unreadable")[0]["reason"]
+        assert len(world.running) == 1
 
     def test_one_task_that_fails_keeps_no_other_from_being_done(
         self, world: World, monkeypatch: pytest.MonkeyPatch
@@ -240,21 +234,18 @@ class TestRecordedTime:
 
 
 class TestSpace:
-    def test_a_disk_that_fills_is_first_made_room_on(self, world: World) -> None:
+    def test_room_is_made_first_and_waited_for_while_half_the_least_is_free(
+        self, world: World
+    ) -> None:
         world.house.frees_to = 5000
         world.free = 900
         world.run(3)
-        assert "room 1200" in world.house.asked
-        assert world.supervisor.is_recording
+        assert world.house.asked.count("room 1200") == 1
         assert world.heartbeat()["state"] == "recording"
-
-    def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
-        self, world: World
-    ) -> None:
-        world.house.making = True
+        world.house.frees_to, world.house.making = 0, True
         world.free = 600
         world.run(200)
-        assert world.house.asked.count("room 1200") == 1
+        assert world.house.asked.count("room 1200") == 2
         assert world.supervisor.is_recording
         world.free = 400
         world.run(2)
@@ -339,33 +330,29 @@ class TestUnmounted:
         aside.rename(world.bag_dir)
         world.device = 1
 
-    def test_nothing_is_recorded_onto_another_disk_and_that_is_reported(
+    def test_nothing_is_recorded_onto_another_disk_and_it_goes_on_when_the_disk_is_back(
         self, tmp_path: Path
     ) -> None:
         world = World(tmp_path / "bags").started(3)
-        self.unmounted(world)
+        aside = self.unmounted(world)
         assert len(world.logged(200, "disk_gone")) == 1
         assert world.running == []
-        assert len(world.recorders) == 1
         assert world.house.asked == ["apply"]
-        world.supervisor.stop()
         assert list(world.bag_dir.iterdir()) == []
-
-    def test_it_goes_on_by_itself_when_the_disk_is_back(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags").started(3)
-        aside = self.unmounted(world)
-        world.run(20)
         self.mounted(world, aside)
         with capture_logs() as logs:
             world.run(0.5)
             assert len(world.recorders) == 1
-            world.run(5)
+            world.run(60)
         assert len(events(logs, "disk_back")) == 1
-        assert world.supervisor.is_recording
         beat = world.heartbeat()
-        assert beat["state"] == "recording"
+        assert (world.supervisor.is_recording, beat["state"]) == (True, "recording")
         assert "has been unmounted" in beat["last_error"]
         assert [how for _, how in world.house.restarts] == ["paused"]
+        self.unmounted(world)
+        world.run(3)
+        world.supervisor.stop()
+        assert list(world.bag_dir.iterdir()) == []
 
     def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(
         self, tmp_path: Path

@@ -86,8 +86,10 @@ def test_every_change_of_a_boolean_stays_wherever_bags_are_cut(
     assert changes | {n - 1 for n in changes} <= stays
 
 
-@pytest.mark.parametrize("kind", ["UInt8", "Int32", "Int64"])
-@pytest.mark.parametrize("cuts", [(), range(20, 1200, 20)])
+@pytest.mark.parametrize(
+    ("kind", "cuts"),
+    [("UInt8", range(20, 1200, 20)), ("Int32", ()), ("Int64", range(50, 1200, 50))],
+)
 def test_of_integers_states_and_extremes_stay_and_measurements_do_not(
     tmp_path: Path, kind: str, cuts: Sequence[int]
 ) -> None:

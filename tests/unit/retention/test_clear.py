@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 
@@ -61,13 +60,6 @@ def test_a_directory_that_cannot_be_listed_is_named(
     wiped = clear_bags(tmp_path)
     assert wiped.faults == [f"{tmp_path / 'rec_1'} cannot be deleted: Input/output error"]
     assert wiped.files == 1
-
-
-def test_what_lies_beside_a_moment_of_somebody_else_stays(tmp_path: Path) -> None:
-    names = "moments/m/moment.json", "moments/m/metadata.yaml", "moments/m/rec_1/rec_1_0.mcap"
-    make(tmp_path, *names)
-    assert clear_bags(tmp_path, OwnRecordings(tmp_path)).files == 0
-    assert {*names} <= {*left(tmp_path)}
 
 
 def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -> None:

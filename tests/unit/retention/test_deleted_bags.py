@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
 import pytest
-import structlog
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir import state_files
 from ros2_memory.bag_dir.layout import DELETED_FILE
@@ -54,16 +54,21 @@ def listed(bag_dir: Path, name: str, start: int) -> list[Path]:
     return made
 
 
-@pytest.fixture
-def bag_dir(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def deleted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the recording of a minute, the moment at 10 to 30 s is left; another one follows later."""
-    listed(tmp_path, A, 0)
-    young = listed(tmp_path, B, 100)
-    kept(house_of(tmp_path), tmp_path, 12, 28)
-    split = young[0].stat().st_size
-    house_of(tmp_path, max_bytes=size_of(tmp_path) - 4 * split + split // 2).apply()
-    assert len([*(tmp_path / A).glob("*.mcap")]) == 2
-    return tmp_path
+    folder = tmp_path_factory.mktemp("bags")
+    listed(folder, A, 0)
+    split = listed(folder, B, 100)[0].stat().st_size
+    kept(house_of(folder), folder, 12, 28)
+    house_of(folder, max_bytes=size_of(folder) - 4 * split + split // 2).apply()
+    assert len([*(folder / A).glob("*.mcap")]) == 2
+    return folder
+
+
+@pytest.fixture
+def bag_dir(deleted: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(deleted, tmp_path / "bags")
 
 
 def ask(bag_dir: Path, tool: str, **given: object) -> Any:
@@ -164,7 +169,7 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
     listed(tmp_path, B, 3 * 3600)
     house = house_of(tmp_path, max_age_h=1)
 
-    with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
+    with monkeypatch.context() as patched, capture_logs() as captured:
         patched.setattr(DELETED, "append", failing())
         house.apply()
     assert "deletions_not_written" in {each["event"] for each in captured}

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import anyio
 import pytest
-import structlog
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import RecorderState
@@ -116,7 +115,7 @@ class TestRetention:
         list_bytes = (bag_dir / ".episodic" / "recordings.jsonl").stat().st_size
         counted = size_of(bag_dir) - besides - len(b"no bag")
         counted -= (bag_dir / "session_mcap" / "metadata.yaml").stat().st_size
-        with structlog.testing.capture_logs() as logs:
+        with capture_logs() as logs:
             careful(bag_dir, max_bytes=counted).apply()
         [reported] = events(logs, "retention_applied")
         assert (reported["bags"], reported["total_bytes"]) == (0, counted)
@@ -128,23 +127,6 @@ class TestRetention:
         # The first two are kept in a moment, and would free nothing.
         assert [path.exists() for path in mine[:4]] == [True, True, False, True]
 
-    def test_a_restored_recording_is_kept_until_it_is_adopted(self, tmp_path: Path) -> None:
-        bags = tmp_path / "bags"
-        recording(bags, A, 0)
-        newest = recording(bags, B, 3 * 3600)
-        own_all(bags)
-        shutil.copytree(bags / A, tmp_path / "backup")
-        # The directory that stays holds its number for good, whatever the file system.
-        (bags / A).rename(tmp_path / "moved")
-        shutil.copytree(tmp_path / "backup", bags / A)
-        house = careful(bags, max_bytes=LITTLE)
-        house.apply()
-        assert len([*(bags / A).glob("*.mcap")]) == 6
-        assert [path.exists() for path in newest] == [False] * 5 + [True]
-        own_all(bags)
-        house.apply()
-        assert not (bags / A).exists()
-
     def test_of_a_recording_that_was_noted_only_its_splits_go(self, tmp_path: Path) -> None:
         own = OwnRecordings(tmp_path)
         own.begin(A)
@@ -155,7 +137,7 @@ class TestRetention:
             own.begin(later)
         others = foreign(tmp_path, f"{A}/{A}_77.mcap", f"{A}/theirs_0.mcap")
         newest = recording(tmp_path, B, 3 * 3600)
-        with structlog.testing.capture_logs() as logs:
+        with capture_logs() as logs:
             careful(tmp_path, max_bytes=LITTLE).apply()
         assert [path.exists() for path in mine] == [False] * 5 + [True]
         assert all(path.exists() for path in (*others, *newest))

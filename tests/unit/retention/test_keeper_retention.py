@@ -6,9 +6,9 @@ import shutil
 from typing import TYPE_CHECKING
 
 import pytest
-import structlog
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -154,7 +154,7 @@ def test_no_moments_in_any_order_break_a_budget_or_lose_what_is_kept(
                 shutil.rmtree(folder)
             promised = {path: inode for path, inode in promised.items() if path.exists()}
         else:
-            with structlog.testing.capture_logs() as captured:
+            with capture_logs() as captured:
                 house.apply()
             [reported] = [each for each in captured if each["event"] == "retention_applied"]
             assert reported["total_bytes"] == size_of(root) <= rooms

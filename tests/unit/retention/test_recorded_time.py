@@ -6,7 +6,7 @@ import errno
 from typing import TYPE_CHECKING
 
 import pytest
-import structlog
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.timebase import ns_from_unix
@@ -98,7 +98,7 @@ def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(
     before = (tmp_path / FILE).read_text()
 
     time = RecordedTime(tmp_path)
-    with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
+    with monkeypatch.context() as patched, capture_logs() as captured:
         patched.setattr(RECORDED, "lines", failing(errno.EMFILE))
         end = recorded(time, "b", 200)
         assert time.since("ab") == {"a": 0, "b": 0}
@@ -120,7 +120,7 @@ def test_a_full_disk_is_reported_once_and_got_over(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk", "1m") as disk:
         folders(disk, "a", "b")
         time = RecordedTime(disk)
-        with structlog.testing.capture_logs() as captured:
+        with capture_logs() as captured:
             with filled(disk):
                 end = recorded(time, "a", 200)
             recorded(time, "b", 100, since_s=end)

@@ -7,9 +7,9 @@ import os
 from typing import TYPE_CHECKING, Any
 
 import pytest
-import structlog
 from hypothesis import given
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
@@ -100,38 +100,28 @@ class TestKeeping:
             return samefile(path, other)
 
         monkeypatch.setattr(type(sidecar), "samefile", gone)
-        with structlog.testing.capture_logs() as logs:
+        with capture_logs() as logs:
             house._moments.relink_sidecars()
         assert not events(logs, "moment_not_followed")
 
-    def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        outcome = kept(house_of(tmp_path), tmp_path, 500, 600)
-        assert outcome.refused is not None
-        assert "nothing was recorded then" in outcome.refused
-        assert not (tmp_path / "moments").exists()
-
-    def test_a_bag_that_two_moments_share_counts_once_in_the_share(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        share = sum(path.stat().st_size for path in made[:3])
-        house = house_of(tmp_path, moments_bytes=share)
-        assert kept(house, tmp_path, 0, 15).bags == 2
-        assert kept(house, tmp_path, 5, 25).bags == 3
-        refused = kept(house, tmp_path, 25, 35).refused
-        assert refused is not None
-        assert "retention.max_moments_gb" in refused
-        assert len(list(stored_moments_in(tmp_path))) == 2
-
-    def test_where_links_cannot_be_made_it_is_refused_and_nothing_is_left(
+    def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        recording(tmp_path, A, 0)
+        made = recording(tmp_path, A, 0)
+        house = house_of(tmp_path, moments_bytes=sum(path.stat().st_size for path in made[:3]))
 
-        monkeypatch.setattr(os, "link", failing(errno.EPERM))
-        outcome = kept(house_of(tmp_path), tmp_path, 15, 25)
-        assert outcome.refused is not None
-        assert "by hard links: Operation not permitted" in outcome.refused
-        assert files_in(tmp_path / "moments") == []
+        def refusal(start: int, end: int) -> str:
+            return str(kept(house, tmp_path, start, end).refused)
+
+        assert "nothing was recorded then" in refusal(500, 600)
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "link", failing(errno.EPERM))
+            assert "by hard links: Operation not permitted" in refusal(15, 25)
+        assert not [*(tmp_path / "moments").glob("*")]
+        # A bag that two moments share counts once in the share.
+        assert [kept(house, tmp_path, *span).bags for span in ((0, 15), (5, 25))] == [2, 3]
+        assert "retention.max_moments_gb" in refusal(25, 35)
+        assert len(list(stored_moments_in(tmp_path))) == 2
 
     def test_a_request_is_not_granted_twice(self, tmp_path: Path) -> None:
         """As where the recorder was killed after it kept a moment, and before it answered."""
@@ -218,7 +208,7 @@ class TestOpenBags:
         house, clock = waiting(tmp_path)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
 
-        with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
+        with monkeypatch.context() as patched, capture_logs() as captured:
             patched.setattr(os, "link", failing())
             for second in (26, 86):
                 clock.at = T0 + second * S
@@ -234,24 +224,19 @@ class TestOpenBags:
         assert told_of(tmp_path)["missing"] == (missing if stays_full else [])
         assert len(in_moments(tmp_path)) == (2 if stays_full else 3)
 
-    def test_a_bag_that_a_crash_left_open_is_kept_when_it_is_repaired(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0, splits=1)
-        bag(tmp_path / A / f"{A}_1.mcap", 10, McapLayout(chunk_size=400, finish=False))
-        house = house_of(tmp_path)
-        assert kept(house, tmp_path, 0, 15).pending
-        house.apply()
-        house.keep_moments()
-        assert told_of(tmp_path)["complete"] is True
-        assert len(in_moments(tmp_path)) == 2
-
     def test_before_anything_is_deleted_a_pending_moment_goes_on(self, tmp_path: Path) -> None:
-        """As after a night: the recorder that begins anew deletes before it records."""
+        """As after a night: the recorder that begins anew repairs and deletes before it records."""
         _, clock = waiting(tmp_path)
-        bag(tmp_path / A / f"{A}_2.mcap", 20)
+        layout = McapLayout(chunk_size=400, finish=False)
+        bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
+        # In a moment nothing is repaired: it would be another file than that it was linked to.
+        left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
+        before = left.read_bytes()
         recording(tmp_path, B, 100, splits=2)
         clock.at = NOW
         house_of(tmp_path, clock=clock, max_bytes=1).apply()
-        assert len(in_moments(tmp_path)) == 3
+        assert left.read_bytes() == before
+        assert len(in_moments(tmp_path)) == 4
         assert told_of(tmp_path)["complete"] is True
 
 
@@ -294,20 +279,9 @@ class TestCrashes:
         clock.at = NOW
         folder = tmp_path / "moments" / str(stuck.moment)
         (folder / f".{MOMENT_FILE}.tmp").mkdir()
-        with structlog.testing.capture_logs() as captured:
+        with capture_logs() as captured:
             assert kept(house, tmp_path, 30, 35).bags == 1
         assert events(captured, "moment_not_written")
-
-
-class TestOthers:
-    def test_what_is_in_a_moment_is_not_repaired(self, tmp_path: Path) -> None:
-        """It would be written anew, and be another file than the one that it was linked to."""
-        recording(tmp_path, A, 0, splits=1)
-        layout = McapLayout(chunk_size=400, finish=False)
-        left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
-        before = left.read_bytes()
-        house_of(tmp_path).apply()
-        assert left.read_bytes() == before
 
 
 class TestTheShare:

@@ -150,12 +150,6 @@ def test_nothing_stays_while_it_holds_or_is_not_known(
             assert found == (time in goes), time
 
 
-def test_a_condition_that_holds_later_says_nothing_of_when_the_next_recording_began() -> None:
-    """Two recordings overlap, the condition begins to hold in both, and the first one ends."""
-    both = heard_in(Past(0, 30, ((0, False), (20, True))), Past(10, 40, ((12, False), (20, True))))
-    assert excluded_intervals(rule(margin=2), both) == [Excluded(18, 43, held=True)]
-
-
 def test_what_was_known_before_a_clock_was_set_back_is_not_known_after_it() -> None:
     one, other = heard_in(Past(0, 600, ((0, False),)), Past(400, 700, ((450, False),)))
     assert excluded_intervals(rule(), [one, other]) == []

@@ -82,10 +82,12 @@ def test_a_rule_begins_with_what_is_recorded_from_now_on(robot: WatchedBags) -> 
 def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> None:
     robot.begin(T0)
     said = Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, boolean(0, True).body, T0 + 5 * S - 1)
-    robot.split([text(T0, "a"), said, text(T0 + 9 * S, "b")], layout=LATCHED)
+    # Nor does what was published long before.
+    old = replace(flag(1, True), publish_time=T0 - 60 * S)
+    robot.split([text(T0, "a"), old, flag(3, False), said, text(T0 + 9 * S, "b")], layout=LATCHED)
     for at in (10, 20, 30):
-        old, new = robot.names[-1], robot.begin(T0 + at * S)
-        robot.hand_over(old, new, T0 + at * S, f"{old}_0.mcap")
+        before, new = robot.names[-1], robot.begin(T0 + at * S)
+        robot.hand_over(before, new, T0 + at * S, f"{before}_0.mcap")
         again = Msg(said.topic, said.type, T0 + at * S + 1, said.body, said.publish_time)
         robot.split([again, text(T0 + (at + 5) * S, "c")], layout=LATCHED)
         robot.look()
@@ -93,27 +95,9 @@ def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> No
     assert robot.record().fired == 1
 
 
-def test_what_was_published_long_before_fires_nothing(robot: WatchedBags) -> None:
-    robot.begin(T0)
-    old = Msg("/bumper", "std_msgs/msg/Bool", T0 + S, boolean(0, True).body, T0 - 60 * S)
-    robot.split([text(T0, "a"), old, text(T0 + 9 * S, "b")], layout=LATCHED)
-    robot.close_all()
-    assert robot.record().fired == 0
-
-
-def test_a_topic_that_falls_silent(tmp_path: Path) -> None:
-    robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
-    name = robot.begin(T0)
-    robot.split(seconds(0, 10), name)
-    robot.split([text(T0 + n * S, "x") for n in range(10, 20)], name)
-    robot.look()
-    robot.split([text(T0 + n * S, "x") for n in range(20, 30)], name)
-    robot.close_all()
-    assert robot.fired_at() == [T0 + 14 * S]
-    assert robot.spans() == [(4, 17)]
-
-
-def test_a_recorder_that_was_off_is_no_silence(tmp_path: Path) -> None:
+def test_a_topic_that_falls_silent_fires_and_a_recorder_that_was_off_is_no_silence(
+    tmp_path: Path,
+) -> None:
     robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
     robot.begin(T0)
     robot.split(seconds(0, 10))
@@ -121,8 +105,12 @@ def test_a_recorder_that_was_off_is_no_silence(tmp_path: Path) -> None:
     robot.look()
     robot.begin(T0 + 60 * S)
     robot.split(seconds(60, 70))
+    robot.split([text(T0 + n * S, "x") for n in range(70, 80)])
+    robot.look()
+    robot.split([text(T0 + n * S, "x") for n in range(80, 90)])
     robot.close_all()
-    assert robot.record("quiet").fired == 0
+    assert robot.fired_at() == [T0 + 74 * S]
+    assert robot.spans() == [(64, 77)]
 
 
 def test_a_rule_on_a_topic_that_is_not_recorded_has_a_problem(tmp_path: Path) -> None:
@@ -135,7 +123,7 @@ def test_a_rule_on_a_topic_that_is_not_recorded_has_a_problem(tmp_path: Path) ->
     assert robot.record("bumper").problem is None
 
 
-def test_a_recording_that_ended_unasked(tmp_path: Path) -> None:
+def test_a_recording_that_ended_unasked_and_a_recorder_that_was_killed(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule("restart", **RESTART))
     robot.begin(T0)
     robot.split(seconds(0, 10))
@@ -143,25 +131,19 @@ def test_a_recording_that_ended_unasked(tmp_path: Path) -> None:
     robot.house.note_restart(T0 + 8 * S, "died")
     robot.house.keep_moments()
     assert robot.spans() == [(4, 12)]
-
-
-def test_a_recorder_that_was_killed(tmp_path: Path) -> None:
-    robot = watched(tmp_path, rule("restart", **RESTART))
-    robot.begin(T0)
-    robot.split(seconds(0, 10))
-    robot.clock.at = T0 + 9 * S
+    robot.clock.at = T0 + 39 * S
     robot.beat(robot.names[-1])
-    robot.clock.at = T0 + 30 * S
+    robot.clock.at = T0 + 60 * S
     robot.house = robot.new_house()
     robot.house.prepare()
     robot.look()
-    assert robot.spans() == [(4, 33)]
+    assert robot.spans() == [(4, 12), (34, 63)]
     # One that was stopped ended as it should.
     robot.beat(state=RecorderState.STOPPED)
     robot.house = robot.new_house()
     robot.house.prepare()
     robot.look()
-    assert robot.record("restart").fired == 1
+    assert robot.record("restart").fired == 2
 
 
 def test_a_noisy_rule_leaves_the_other_its_share(tmp_path: Path) -> None:

@@ -63,11 +63,7 @@ def test_exactly_the_listed_names_match(wanted: list[str], others: list[str]) ->
     topics = TopicSelection(tuple(wanted))
     assert all(topics.matches(name) for name in wanted)
     assert [name for name in others if topics.matches(name) != (name in wanted)] == []
-
-
-@given(NAMES)
-def test_the_pattern_needs_no_escape_that_differs_between_regex_dialects(names: list[str]) -> None:
-    assert "\\" not in TopicSelection(tuple(names)).regex
+    assert "\\" not in topics.regex  # dialects of regular expressions differ in what needs one
 
 
 def test_events_of_a_service_are_selected_by_the_name_of_the_service_too() -> None:
