@@ -83,14 +83,6 @@ class TestAQuestionMeanwhile:
 class TestTheIndex:
     """Bags that the catalogue knows are taken over unread; what is kept is weighed beside them."""
 
-    def test_a_kept_bag_that_is_known_by_its_own_name_is_no_second_one(self, start: Start) -> None:
-        before = found(start.index()[0])
-        keep(start, "one", 1, 2)
-        keep(start, "two", 2, 3)
-        start.age()
-        assert found(start.index()[0]) == before
-        assert start.index()[0].refresh() == start.read()
-
     def test_it_answers_when_the_other_has_gone_under_a_running_index(self, start: Start) -> None:
         index, _ = start.index()
         before = index.refresh()

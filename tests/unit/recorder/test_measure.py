@@ -145,13 +145,6 @@ def test_nothing_is_missing_between_splits_around_one_that_was_not_measured() ->
     assert [each.lost for each in counter.measured("a", progress([*range(510, 600)]))] == [10]
 
 
-def test_rosbags_own_count_counts_where_nothing_else_does() -> None:
-    counter = LossCounter()
-    counter.measured("a", progress([*range(100)]))
-    assert counter.reported("/odom", T0, T0 + NS, 5) == []
-    assert counter.reported("/image", T0, T0 + NS, 5) == [Loss("/image", T0, T0 + NS, 5, "rosbag2")]
-
-
 @pytest.mark.parametrize(
     ("text", "payload", "kind", "value"),
     [

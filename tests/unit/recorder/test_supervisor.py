@@ -119,8 +119,10 @@ class TestStop:
         (assert_what_stands_counts_once if is_deaf else assert_each_counts_once)(world)
 
     @pytest.mark.parametrize("killed", ["old", "new", "all"])
-    @pytest.mark.parametrize("obeys_after", [1, 8])
-    @pytest.mark.parametrize("after_s", [20.5, 21.25, 22.5, 24.0, 25.0, 26.25, 27.5])
+    @pytest.mark.parametrize(
+        ("after_s", "obeys_after"),
+        [(20.5, 1), (21.25, 8), (22.5, 1), (24.0, 8), (25.0, 1), (26.25, 8), (27.5, 1)],
+    )
     def test_kills_at_any_moment_of_a_handover_lose_and_double_nothing(
         self, tmp_path: Path, after_s: float, obeys_after: int, killed: str
     ) -> None:

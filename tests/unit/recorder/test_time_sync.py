@@ -34,23 +34,25 @@ def test_it_is_asked_for_the_one_property_and_inherits_nothing(
     assert "secret" not in heard.read_text()
 
 
-@pytest.mark.parametrize("error_us", [DISCIPLINED, UNDISCIPLINED, None])
 @pytest.mark.parametrize(
-    ("script", "timedated"),
+    ("script", "error_us", "expected"),
     [
-        ("echo yes", True),
-        ("echo no", False),
-        *((script, None) for script in ("exit 1", "echo yes; exit 1", "true", "kill -9 $$")),
+        ("echo yes", UNDISCIPLINED, True),
+        ("echo no", DISCIPLINED, False),
+        ("true", DISCIPLINED, True),
+        ("true", UNDISCIPLINED, False),
+        ("true", None, False),
+        *((script, DISCIPLINED, True) for script in ("exit 1", "echo no; exit 1", "kill -9 $$")),
+        ("echo yes; exit 1", None, False),
     ],
 )
 def test_timedated_is_believed_before_the_kernel_which_is_asked_where_it_cannot_say(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     script: str,
-    timedated: bool | None,
     error_us: int | None,
+    expected: bool,
 ) -> None:
-    expected = error_us == DISCIPLINED if timedated is None else timedated
     assert asked(monkeypatch, tmp_path, script, error_us) is expected
 
 

@@ -25,8 +25,7 @@ from ros2_memory.retention.latched_carry import (
 from ros2_memory.storage.base import REPEATED_NS
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.fakes import failing
 from tests.support.housekeepers import files_in, keeper_of
@@ -156,13 +155,6 @@ class TestTheBagOfCarriedMessages:
         keep_only(tmp_path, "thi/thi_0.mcap")
         after = (tmp_path / "latched/carried.mcap").stat()
         assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
-
-    def test_messages_of_a_sqlite_bag_are_carried(self, tmp_path: Path) -> None:
-        write_db3(tmp_path / "rec/old_0.db3", [frame(T0, "laser", 0.1), *drive(T0, T0 + 9 * S)])
-        recording(tmp_path, "rec", drive_in(1))
-        keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
-        memory = memory_of(tmp_path, storage="rosbag2")
-        assert places(memory, T0 + 15 * S, ["laser"]) == [(0.1, 0.0, 0.0)]
 
     def test_a_link_in_its_place_is_not_followed_and_nothing_is_lost(self, tmp_path: Path) -> None:
         bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
