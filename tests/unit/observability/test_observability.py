@@ -200,25 +200,35 @@ def reply(exporter: InMemorySpanExporter, outcome: str) -> ReadableSpan:
 
 
 class TestTraces:
-    async def test_a_call_has_one_span_with_its_outcome_and_stages(
-        self, spans: InMemorySpanExporter
+    @pytest.mark.parametrize("over_mcp", [True, False])
+    async def test_a_call_has_one_span_of_its_length_with_its_outcome_and_stages(
+        self, spans: InMemorySpanExporter, over_mcp: bool
     ) -> None:
-        async with Client(traced()) as client:
-            await client.call_tool("full", {})
-            await client.call_tool("empty", {"secret": "s3cret"})
-        served = [
-            each
-            for each in spans.get_finished_spans()
-            if each.kind is trace.SpanKind.SERVER and each.name.startswith("tools/call")
-        ]
-        assert [each.name for each in served] == ["tools/call full", "tools/call empty"]
-        full = reply(spans, "ok").attributes or {}
-        assert full["gen_ai.tool.name"] == "full"
-        assert full["mcp.method.name"] == "tools/call"
-        assert float(cast("float", full["ros2_memory.stage.read_ms"])) >= 0
-        assert full["ros2_memory.reply_chars"]
-        assert full["ros2_memory.correlation_id"]
-        assert reply(spans, "no_data: gap").name == "tools/call empty"
+        server, given = traced(), {"secret": "s3cret"}
+        if over_mcp:
+            async with Client(server) as client:
+                await client.call_tool("full", {})
+                await client.call_tool("empty", given)
+        else:
+            await server.dispatcher.answer("full", {})
+            await server.dispatcher.answer("other", given)
+        full = reply(spans, "ok")
+        attributes = full.attributes or {}
+        assert full.name == "tools/call full"
+        assert full.start_time is not None
+        assert full.end_time is not None
+        assert full.end_time > full.start_time
+        assert full.status.status_code is trace.StatusCode.UNSET
+        assert float(cast("float", attributes["ros2_memory.stage.read_ms"])) >= 0
+        assert attributes["ros2_memory.reply_chars"]
+        assert attributes["ros2_memory.correlation_id"]
+        if over_mcp:
+            assert attributes["gen_ai.tool.name"] == "full"
+            assert attributes["mcp.method.name"] == "tools/call"
+            assert reply(spans, "no_data: gap").name == "tools/call empty"
+        else:
+            refused = reply(spans, "invalid_arguments")
+            assert refused.status.status_code is trace.StatusCode.ERROR
         assert "s3cret" not in "".join(each.to_json() for each in spans.get_finished_spans())
 
     @pytest.mark.parametrize("spans", [False], indirect=True)
@@ -236,20 +246,18 @@ class TestTraces:
         names = {each.name for each in served}
         assert {"tools/call full", "tools/call unknown", "prompts/get", "resources/read"} <= names
 
-    async def test_a_call_that_did_not_come_over_mcp_gets_a_span_of_its_length(
+    async def test_whatever_a_client_sends_spans_stay_small(
         self, spans: InMemorySpanExporter
     ) -> None:
-        server = traced()
-        await server.dispatcher.answer("full", {})
-        await server.dispatcher.answer("other", {})
-        span = reply(spans, "ok")
-        assert span.name == "tools/call full"
-        assert span.start_time is not None
-        assert span.end_time is not None
-        assert span.end_time > span.start_time
-        assert span.status.status_code is trace.StatusCode.UNSET
-        refused = reply(spans, "invalid_arguments")
-        assert refused.status.status_code is trace.StatusCode.ERROR
+        long = "x" * 100_000
+        async with Client(traced()) as client:
+            await client.call_tool(long, {long: long})
+            for ask in (client.get_prompt, client.read_resource):
+                with pytest.raises(MCPError):
+                    await ask(f"file:///{long}")
+        sizes = [len(each.to_json()) for each in spans.get_finished_spans()]
+        assert len(sizes) >= 3
+        assert max(sizes) < 4000
 
     @pytest.mark.parametrize(
         ("variable", "text", "name"),
@@ -283,16 +291,3 @@ class TestTraces:
 
         Traces(provider_to(SimpleSpanProcessor(Hanging()))).stop()
         freed.set()
-
-    async def test_whatever_a_client_sends_spans_stay_small(
-        self, spans: InMemorySpanExporter
-    ) -> None:
-        long = "x" * 100_000
-        async with Client(traced()) as client:
-            await client.call_tool(long, {long: long})
-            for ask in (client.get_prompt, client.read_resource):
-                with pytest.raises(MCPError):
-                    await ask(f"file:///{long}")
-        assert len(spans.get_finished_spans()) >= 3
-        for each in spans.get_finished_spans():
-            assert len(each.to_json()) < 4000
