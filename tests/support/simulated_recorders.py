@@ -7,6 +7,7 @@ second; all recorders that have subscribed receive it, each a little later.
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from collections.abc import Callable, Collection, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -119,9 +120,18 @@ class PlayedRecorder(Child):
             message = boolean(published, True, topic)
             self._held.append(replace(message, log_time=logged, publish_time=published))
         if self.directory.is_dir():
-            # An open file that grows; what is in it matters when its recorder dies.
-            size = 0 if self.world.disk_full or self.buffers else 50 * len(self._held)
-            (self.directory / self._file).write_bytes(MCAP_MAGIC[: size and 8] + bytes(size))
+            self._grow(0 if self.world.disk_full or self.buffers else 50 * len(self._held))
+
+    def _grow(self, size: int) -> None:
+        """Has an open file of a size; what is in it matters when its recorder dies.
+
+        It is not written anew, which file systems flush.
+        """
+        opened = os.open(self.directory / self._file, os.O_RDWR | os.O_CREAT, 0o644)
+        if size and not os.fstat(opened).st_size:
+            os.write(opened, MCAP_MAGIC)
+        os.ftruncate(opened, size and len(MCAP_MAGIC) + size)
+        os.close(opened)
 
     @property
     def _file(self) -> str:

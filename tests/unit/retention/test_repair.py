@@ -123,3 +123,12 @@ def test_what_does_not_hold_what_was_readable_does_not_take_its_place(
         repairer().repair(path)
     assert path.read_bytes() == before
     assert files_in(tmp_path) == ["a_0.mcap"]
+
+
+def test_links_are_not_followed(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    before = path.read_bytes()
+    (tmp_path / "b_0.mcap").symlink_to(path)
+    with pytest.raises(BagError, match="not a regular file"):
+        repairer().repair(tmp_path / "b_0.mcap")
+    assert path.read_bytes() == before
