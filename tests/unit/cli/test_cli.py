@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 import yaml
 
-from ros2_memory import cli
 from ros2_memory.cli.app import COMMANDS, epilog
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
@@ -120,7 +119,6 @@ class TestTheProgram:
         assert " ".join(exits(0, f"{command} --help").out.split()).endswith(epilog(command))
 
 
-@pytest.mark.parametrize("words", [["-h"], ["info", "-h"], ["config", "show", "-h"]])
-def test_help_has_a_short_option(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(words) == 0
-    assert "Usage: ros2-memory" in capsys.readouterr().out
+@pytest.mark.parametrize("words", ["-h", "info -h", "config show -h"])
+def test_help_has_a_short_option(words: str, exits: Program) -> None:
+    assert "Usage: ros2-memory" in exits(0, words).out

@@ -105,11 +105,14 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
 
 
-def test_a_topic_taken_for_latched_that_is_not_adapts_too(tmp_path: Path) -> None:
+def test_a_topic_taken_for_latched_whose_publisher_is_volatile_adapts_too(tmp_path: Path) -> None:
     made = reception(tmp_path)
     made.overrides("a")
     made.refused("a", "/tf_static", best_effort=False)
     assert profiles(made, "b") == {}
+    made.learn("a", latched_split(tmp_path / "a.mcap", "/map"))
+    made.refused("a", "/map", best_effort=False)
+    assert qos(made, "b")["/map"] == ("reliable", "volatile")
 
 
 def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_heard(
@@ -149,14 +152,6 @@ def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_h
         made.learn("a", splits[0])
     made.learn("a", splits[1])
     assert profiles(made, "b")["/odom"]["reliability"] == "best_effort"
-
-
-def test_what_a_volatile_publisher_needs_is_asked_for_reliably(tmp_path: Path) -> None:
-    made = reception(tmp_path)
-    made.overrides("a")
-    made.learn("a", latched_split(tmp_path / "a.mcap", "/map"))
-    made.refused("a", "/map", best_effort=False)
-    assert qos(made, "b")["/map"] == ("reliable", "volatile")
 
 
 def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_path: Path) -> None:
@@ -212,17 +207,13 @@ def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended
     assert made.lost_in_last_hour(T0) == {}
 
 
-def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) -> None:
-    made = reception(tmp_path, latched=(), volatile=["/rosout"])
-    made.learn("a", latched_split(tmp_path / "a_0.mcap", "/rosout", "/map"))
-    latched, volatile = ("reliable", "transient_local"), ("reliable", "volatile")
-    assert qos(made, "b") == {"/rosout": volatile, "/map": latched}
-
-
 def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> None:
-    """Unless another publisher of the topic may have one, or it is not known who publishes it."""
-    made = reception(tmp_path)
-    topics = ("/map", "/tf_static", "/shared", "/plan")
+    """Unless another publisher of the topic may have one, or it is not known who publishes it.
+
+    A log is never asked for what a rule may have excluded.
+    """
+    made = reception(tmp_path, volatile=["/rosout"])
+    topics = ("/map", "/tf_static", "/shared", "/plan", "/rosout")
     made.learn("a", latched_split(tmp_path / "a_0.mcap", *topics))
     made._flows["/shared"] = made._flows["/shared"]._replace(
         offered=OfferedQos(reliable=True, latched=True, publishers=2)
@@ -234,9 +225,10 @@ def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> 
         "/tf_static": volatile,
         "/shared": latched,
         "/plan": latched,
+        "/rosout": volatile,
     }
     made.skip_latched([])
-    assert {*qos(made, "c").values()} == {latched}
+    assert qos(made, "c") == dict.fromkeys(topics, latched) | {"/rosout": volatile}
 
 
 MIB = 2**20

@@ -451,21 +451,21 @@ class TestSlowDisk:
     ) -> None:
         """Each flush takes 5 s; after 90 s without a sign of life it would be killed."""
         signs = [1_000.0]
-        world = World(
+        slow = World(
             tmp_path,
             session_duration_s=20,
-            keep_alive=lambda: signs.append(world.mono),
+            keep_alive=lambda: signs.append(slow.mono),
             background=Background(),
         )
 
         def flush(_: int) -> None:
             if threading.current_thread() is threading.main_thread():
-                world.mono += 5.0
-                world.wall += 5 * NS_PER_S
+                slow.mono += 5.0
+                slow.wall += 5 * NS_PER_S
 
         monkeypatch.setattr(os, "fsync", flush)
-        world.started(30)
-        assert len(world.recorders) > 2
+        slow.started(30)
+        assert len(slow.recorders) > 2
         assert max(after - before for before, after in pairwise(signs)) < 45.0
 
 
