@@ -40,6 +40,14 @@ def folders(bag_dir: Path, *names: str) -> None:
         (bag_dir / name).mkdir()
 
 
+def test_it_is_written_once_a_minute_so_that_a_kill_forgets_no_more(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    end = recorded(RecordedTime(tmp_path), "a", 119)
+    assert [row.recorded_s for row in RECORDED.rows(tmp_path)] == [0, 60]
+    recorded(RecordedTime(tmp_path), "b", 119, since_s=end)
+    assert RecordedTime(tmp_path).since(["a"]) == {"a": 60 * S}
+
+
 def test_silence_does_not_count_for_more_than_a_minute(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     time = RecordedTime(tmp_path)
@@ -84,7 +92,9 @@ def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_p
     (tmp_path / ".episodic").mkdir()
     (tmp_path / FILE).write_text('{"recording": "a", "recorded_s": 90, "clock_right": true}\n')
     time = RecordedTime(tmp_path)
-    assert time.doubtful("ab") == {"a", "b"}
+    with capture_logs() as logs:
+        assert time.doubtful("ab") == {"a", "b"}
+    assert [(told["event"], told["lines"]) for told in logs] == [("recorded_time_damaged", [1])]
     recorded(time, "c", 20)
     assert RecordedTime(tmp_path).doubtful("ab") == {"a", "b"}
 
