@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.recorder.measure import (
     HOUR_NS,
     Arrival,
@@ -202,21 +201,6 @@ def test_a_counter_that_begins_anew_loses_nothing_and_is_followed_from_there() -
     assert [each.lost for each in counter.measured("a", counts(range(45, 100), 190))] == [5]
     assert counter.measured("a", counts(range(50), 300)) == []
     assert counter.flush() == []
-
-
-def test_stamps_of_a_clock_that_was_set_back_are_followed_from_there() -> None:
-    counter = LossCounter()
-    counter.measured("a", progress([*range(1000)]))
-    an_hour = 3600 * 50
-    counter.begin("b")
-    losses: list[Loss] = []
-    for split in range(9):
-        first = 1000 + split * 100 - an_hour
-        ticks = [tick for tick in range(first, first + 100) if tick - first not in {40, 41}]
-        losses += counter.measured("b", progress(ticks))
-    losses += counter.flush()
-    assert sum(loss.lost for loss in losses) == 9 * 2
-    assert all(loss.stop < T0 for loss in losses)
 
 
 def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
