@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 on_every_shelf = pytest.mark.parametrize("shelf", FILES, ids=str)
 
 EVERYTHING = TimeWindow.everything()
+MS = 10**6
 STRING, BOOL = "std_msgs/msg/String", "std_msgs/msg/Bool"
 
 
@@ -60,25 +61,27 @@ def expected(
     ]
 
 
-def read(
-    reader: BagReader,
-    path: Path,
-    topics: Collection[str],
-    window: TimeWindow | None = None,
-    *,
-    newest_first: bool = False,
-) -> list[Seen]:
-    span = window or EVERYTHING
-    return [seen(r) for r in reader.records(path, topics, span, newest_first=newest_first)]
+def read(reader: BagReader, path: Path, topics: Collection[str]) -> list[Seen]:
+    return [*map(seen, reader.records(path, topics, EVERYTHING))]
 
 
 def batched(batches: Iterable[Batch]) -> list[Record]:
-    """The messages of batches, by log time, ties by place."""
+    """The messages of batches, by log time, ties by place.
+
+    Batches of one buffer follow each other, and lie inside of it.
+    """
+    batches = [*batches]
     found = [
         (int(batch.log_times[nth]), int(batch.places[nth]), batch.record(nth))
         for batch in batches
         for nth in range(batch.sizes.size)
     ]
+    for batch in batches:
+        ends = batch.starts + batch.sizes
+        assert batch.starts.min() >= 0
+        assert ends.max() <= len(batch.buffer)
+    buffers = [key for key, _ in groupby(id(batch.buffer) for batch in batches)]
+    assert len(buffers) == len({*buffers})
     assert len({place for _, place, _ in found}) == len(found)
     return [record for _, _, record in sorted(found, key=itemgetter(0, 1))]
 
@@ -104,60 +107,27 @@ _windows = st.tuples(st.integers(-1, 14), st.integers(-1, 14)).map(lambda ends: 
 
 
 @on_every_shelf
-@settings(max_examples=examples(30))
-@given(messages=_messages(), topics=_some_topics, window=_windows)
-def test_messages_come_by_log_time_and_newest_first_is_exactly_the_reverse(
-    shelf: Shelf, messages: list[Msg], topics: set[str], window: TimeWindow
+@settings(max_examples=examples(40))
+@given(messages=_messages(), topics=_some_topics, window=_windows, bare=_some_topics)
+def test_records_batches_and_the_summary_hold_the_messages_in_their_order(
+    shelf: Shelf, messages: list[Msg], topics: set[str], window: TimeWindow, bare: set[str]
 ) -> None:
+    """By log time, ties in file order; newest first is exactly the reverse."""
     with tempfile.TemporaryDirectory() as folder:
         reader, path = shelf.stocked(Path(folder), messages)
         for span in (window, EVERYTHING):
-            found = read(reader, path, topics, span)
-            assert found == expected(messages, topics, span)
-            assert read(reader, path, topics, span, newest_first=True) == found[::-1]
+            records = list(reader.records(path, topics, span))
+            assert [*map(seen, records)] == expected(messages, topics, span)
+            assert [*reader.records(path, topics, span, newest_first=True)] == records[::-1]
             for topic in TOPICS:
                 newest = reader.newest(path, topic, span)
                 last = expected(messages, [topic], span)[-1:]
                 assert [seen(newest)] == last if newest is not None else not last
-
-
-@on_every_shelf
-@settings(max_examples=examples(30))
-@given(messages=_messages(), topics=_some_topics, window=_windows, bare=_some_topics)
-def test_batches_hold_the_messages_of_the_records_and_their_order(
-    shelf: Shelf, messages: list[Msg], topics: set[str], window: TimeWindow, bare: set[str]
-) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        reader, path = shelf.stocked(Path(folder), messages)
-        for span in (window, EVERYTHING):
-            whole = batched(reader.batches(path, topics, span))
-            assert whole == list(reader.records(path, topics, span))
+            assert batched(reader.batches(path, topics, span)) == records
             without = batched(reader.batches(path, topics, span, bare=bare))
-            assert [record[:2] for record in without] == [record[:2] for record in whole]
-            kept = [record for record in whole if record.channel.topic not in bare]
+            assert [record[:2] for record in without] == [record[:2] for record in records]
+            kept = [record for record in records if record.channel.topic not in bare]
             assert [each for each in without if each.channel.topic not in bare] == kept
-
-
-@on_every_shelf
-def test_batches_of_one_buffer_follow_each_other_and_lie_inside_of_it(
-    shelf: Shelf, tmp_path: Path
-) -> None:
-    messages = [text(time, f"{time:0100d}", TOPICS[time % 3]) for time in range(60)]
-    reader, path = shelf.stocked(tmp_path, messages)
-    batches = list(reader.batches(path, TOPICS, EVERYTHING))
-    for batch in batches:
-        assert batch.starts.min() >= 0
-        assert (batch.starts + batch.sizes).max() <= len(batch.buffer)
-    buffers = [id(batch.buffer) for batch in batches]
-    assert [key for key, _ in groupby(buffers)] == list(dict.fromkeys(buffers))
-
-
-@on_every_shelf
-@settings(max_examples=examples(20))
-@given(messages=_messages())
-def test_a_summary_counts_what_the_messages_say(shelf: Shelf, messages: list[Msg]) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        reader, path = shelf.stocked(Path(folder), messages)
         summary = reader.summarize(path)
     times: dict[tuple[str, str], list[int]] = {}
     for message in messages:
@@ -165,93 +135,79 @@ def test_a_summary_counts_what_the_messages_say(shelf: Shelf, messages: list[Msg
     found = {(t.topic, t.type): (t.count, t.first, t.last) for t in summary.topics}
     assert found == {key: (len(at), min(at), max(at)) for key, at in times.items()}
     assert len(summary.topics) == len(found)
-    assert summary.complete
-    assert summary.notes == ()
+    assert (summary.complete, summary.notes) == (True, ())
 
 
 @on_every_shelf
-def test_topics_without_messages_are_declared_and_silent(shelf: Shelf, tmp_path: Path) -> None:
+def test_what_channels_declare_and_publish_times_are_kept(shelf: Shelf, tmp_path: Path) -> None:
+    """Publish times where the format has them; a topic may have no message."""
     silent = [("/quiet", STRING), ("/still", BOOL)]
-    reader, path = shelf.stocked(tmp_path, [text(1, "x")], declared=silent)
-    summary = reader.summarize(path)
-    assert [topic.topic for topic in summary.topics] == ["/chatter"]
+    messages = [
+        tf(1, transform(1, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static"),
+        odom(5, 0.0, 0.0, log_time=7),
+        odom(6, 0.0, 0.0, log_time=9),
+    ]
+    reader, path = shelf.stocked(tmp_path, messages, declared=silent)
+    summary, channels = reader.summarize(path), reader.channels(path)
     assert summary.silent == ("/quiet", "/still")
-    channels = reader.channels(path)
-    assert {(c.topic, c.type) for c in channels} == {("/chatter", STRING), *silent}
-    assert read(reader, path, ["/quiet"]) == []
-
-
-@on_every_shelf
-def test_a_topic_offered_as_transient_local_is_latched(shelf: Shelf, tmp_path: Path) -> None:
-    static = tf(1, transform(1, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static")
-    reader, path = shelf.stocked(tmp_path, [static, odom(2, 0.0, 0.0)])
-    assert {t.topic: t.latched for t in reader.summarize(path).topics} == {
-        "/tf_static": True,
-        "/odom": False,
-    }
-    assert {c.topic: c.latched for c in reader.channels(path)} == {
-        "/tf_static": True,
-        "/odom": False,
-    }
-
-
-@on_every_shelf
-def test_publish_times_are_kept_where_the_format_keeps_them(shelf: Shelf, tmp_path: Path) -> None:
-    messages = [odom(5, 0.0, 0.0, log_time=7), odom(6, 0.0, 0.0, log_time=9)]
-    reader, path = shelf.stocked(tmp_path, messages)
-    records = list(reader.records(path, ["/odom"], EVERYTHING))
+    assert {t.topic: t.latched for t in summary.topics} == {"/tf_static": True, "/odom": False}
+    recorded = {(m.topic, m.type) for m in messages}
+    assert {(c.topic, c.type) for c in channels} == {*recorded, *silent}
+    assert [c.topic for c in channels if c.latched] == ["/tf_static"]
+    records = reader.records(path, ["/odom", "/quiet"], EVERYTHING)
     published = [5, 6] if shelf.keeps_publish_time else [7, 9]
-    assert [(r.log_time, r.publish_time) for r in records] == list(
-        zip([7, 9], published, strict=True)
-    )
+    assert [(r.log_time, r.publish_time) for r in records] == [*zip([7, 9], published, strict=True)]
 
 
 @on_every_shelf
-def test_a_bag_that_is_gone_has_vanished_for_every_question(shelf: Shelf, tmp_path: Path) -> None:
-    reader, path = shelf.stocked(tmp_path, [text(1, "x")])
-    list(reader.records(path, ["/chatter"], EVERYTHING))
-    path.unlink()
-    lazy = reader.records(path, ["/chatter"], EVERYTHING)
-    lazy_batches = reader.batches(path, ["/chatter"], EVERYTHING)
-    questions = (
-        lambda: next(lazy),
-        lambda: next(lazy_batches),
-        lambda: reader.summarize(path),
-        lambda: reader.closing(path),
-        lambda: reader.channels(path),
-    )
-    for question in questions:
-        with pytest.raises(BagVanishedError) as caught:
-            question()
-        assert caught.value.path == str(path)
-
-
-@on_every_shelf
-def test_what_is_no_bag_counts_as_closed_and_its_fault_is_reported(
+def test_a_pause_of_all_topics_is_found_wherever_its_messages_lie(
     shelf: Shelf, tmp_path: Path
 ) -> None:
-    reader, path = shelf.stocked(tmp_path, [text(1, "x")])
-    path.write_bytes(b"FROM ros:jazzy\nRUN true\n" * 30)
-    assert reader.closing(path) is Closing.CLOSED
-    questions = (
+    """And none where a slower topic goes on."""
+    begin, off = 1_784_000_000_000, [(3000, 3700), (5000, 5400), (6000, 8000)]
+
+    def beats(topic: str, period: int, *off: tuple[int, int]) -> list[Msg]:
+        times = [at for at in range(0, 10_000, period) if not any(a < at < b for a, b in off)]
+        return [boolean((begin + at) * MS, True, topic) for at in times]
+
+    messages = [*beats("/fast", 20, *off, (1000, 2500)), *beats("/slow", 100, *off)]
+    reader, path = shelf.stocked(tmp_path, sorted(messages, key=lambda each: each.log_time))
+    assert reader.summarize(path).schema.pauses == tuple(
+        ((begin + start) * MS, (begin + stop) * MS) for start, stop in (off[0], off[2])
+    )
+
+
+def refusals(reader: BagReader, path: Path) -> list[BagError]:
+    """What each question about a bag that cannot be read raises."""
+    found = []
+    for question in (
         lambda: reader.summarize(path),
         lambda: reader.channels(path),
-        lambda: list(reader.records(path, ["/chatter"], EVERYTHING)),
-        lambda: list(reader.batches(path, ["/chatter"], EVERYTHING)),
-    )
-    for question in questions:
+        lambda: next(reader.records(path, ["/chatter"], EVERYTHING)),
+        lambda: next(reader.batches(path, ["/chatter"], EVERYTHING)),
+    ):
         with pytest.raises(BagError) as caught:
             question()
-        assert not isinstance(caught.value, BagVanishedError)
         assert caught.value.path == str(path)
-        assert caught.value.reason
+        found.append(caught.value)
+    return found
 
 
 @on_every_shelf
-def test_an_empty_file_is_open_and_nothing_had_reached_the_disk(
+def test_what_is_gone_has_vanished_and_what_is_no_bag_is_closed_and_its_fault_reported(
     shelf: Shelf, tmp_path: Path
 ) -> None:
-    reader, path = shelf.stocked(tmp_path, [])
+    reader, path = shelf.stocked(tmp_path, [text(1, "x")])
+    assert len(read(reader, path, ["/chatter"])) == 1
+    path.unlink()
+    assert all(isinstance(error, BagVanishedError) for error in refusals(reader, path))
+    with pytest.raises(BagVanishedError):
+        reader.closing(path)
+    path.write_bytes(b"FROM ros:jazzy\nRUN true\n" * 30)
+    assert reader.closing(path) is Closing.CLOSED
+    for error in refusals(reader, path):
+        assert not isinstance(error, BagVanishedError)
+        assert error.reason
     path.write_bytes(b"")
     assert reader.closing(path) is Closing.OPEN
     with pytest.raises(BagError, match="empty file: nothing had reached the disk"):
@@ -272,22 +228,16 @@ def test_a_folder_or_a_pipe_in_place_of_a_bag_is_an_error_that_names_it(
 
 
 @on_every_shelf
-def test_a_bag_deleted_while_it_is_read_still_answers_to_the_end(
+def test_a_bag_that_is_deleted_or_rewritten_meanwhile_is_read_to_its_end_and_anew(
     shelf: Shelf, tmp_path: Path
 ) -> None:
     messages = [text(time, f"{time:0100d}") for time in range(50)]
     reader, path = shelf.stocked(tmp_path, messages)
+    assert reader.summarize(path).count == 50
     records = reader.records(path, ["/chatter"], EVERYTHING)
     first = seen(next(records))
     path.unlink()
     assert [first, *map(seen, records)] == expected(messages, ["/chatter"])
-
-
-@on_every_shelf
-def test_a_bag_rewritten_in_place_is_read_anew(shelf: Shelf, tmp_path: Path) -> None:
-    reader, path = shelf.stocked(tmp_path, [text(1, "old")])
-    assert reader.summarize(path).count == 1
-    path.unlink()
     later = [text(2, "new"), text(3, "newer")]
     shelf.write(path, later, ())
     assert reader.summarize(path).count == 2
@@ -298,14 +248,9 @@ def test_a_bag_rewritten_in_place_is_read_anew(shelf: Shelf, tmp_path: Path) -> 
 def test_threads_that_read_at_once_all_get_the_same(shelf: Shelf, tmp_path: Path) -> None:
     messages = [text(time, f"{time:0100d}", TOPICS[time % 3]) for time in range(60)]
     reader, path = shelf.stocked(tmp_path, messages)
-
-    def ask(turn: int) -> list[Seen]:
-        return read(reader, path, TOPICS, newest_first=turn % 2 == 1)
-
     with ThreadPoolExecutor(max_workers=4) as pool:
-        answers = list(pool.map(ask, range(16)))
-    whole = expected(messages, TOPICS)
-    assert answers == [whole if turn % 2 == 0 else whole[::-1] for turn in range(16)]
+        answers = [*pool.map(lambda _: read(reader, path, TOPICS), range(8))]
+    assert answers == [expected(messages, TOPICS)] * 8
 
 
 @on_every_shelf

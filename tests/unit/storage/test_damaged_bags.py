@@ -1,29 +1,22 @@
 """Nothing but the error tree leaves a reader, and what it serves of a damaged bag is consistent."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
-from ros2_memory.core.errors import BagError, EpisodicError, UndecodableError
+from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.storage.errors import UnreadableError, reading
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(
     "foreign",
     [
         MemoryError(),
-        RecursionError("deep"),
         KeyError(1),
         OSError(5, "Input/output error"),
-        RuntimeError("LZ4F_decompress failed"),
+        RuntimeError("LZ4F_decompress\nfailed"),
         AssertionError(),
         UnreadableError("its reason"),
-        OverflowError("too large"),
         UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"),
     ],
     ids=lambda error: type(error).__name__,
@@ -40,8 +33,8 @@ def test_every_foreign_exception_becomes_an_error_about_the_file(
     assert caught.value.__cause__ is foreign
 
 
-def test_errors_of_the_tree_and_interruptions_pass_as_they_are(tmp_path: Path) -> None:
-    for error in (UndecodableError("/t", "a/msg/B", "no"), KeyboardInterrupt()):
-        with pytest.raises((EpisodicError, KeyboardInterrupt)) as caught, reading(tmp_path):
-            raise error
-        assert caught.value is error
+@pytest.mark.parametrize("error", [UndecodableError("/t", "a/msg/B", "no"), KeyboardInterrupt()])
+def test_errors_of_the_tree_and_interruptions_pass_as_they_are(error: BaseException) -> None:
+    with pytest.raises(type(error)) as caught, reading(Path("bag.mcap")):
+        raise error
+    assert caught.value is error

@@ -5,12 +5,10 @@ A damaged index costs none, and is reported too.
 
 from __future__ import annotations
 
-import struct
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from mcap.opcode import Opcode
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -21,9 +19,8 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
-from tests.support.mcap_surgery import SMALL, chatter, chunks_of, edit_summary, spoil_chunk
-from tests.support.memories import asked as asked_tool
+from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
+from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
 from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
@@ -159,52 +156,6 @@ def test_sightings_report_what_is_damaged_in_the_time_that_they_span(tmp_path: P
         assert not is_damage_noted(limit=1)
 
 
-class TestAnIndexThatContradictsItsMessages:
-    """One bit of a message index is another: nothing that is asked for is missed or moved."""
-
-    def driven(self, bag_dir: Path) -> Path:
-        """Ten seconds at 1 m/s; one message is indexed as if it lay 0.2 s later."""
-        moving = [
-            each
-            for n in range(100)
-            for at in [T0 + n * S // 10]
-            for each in (
-                odom(at, n / 10, 0.0),
-                tf(at, transform(at, "odom", "base", (n / 10, 0.0, 0.0))),
-            )
-        ]
-        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=8000))
-        self.right = path.read_bytes()
-        chunk = chunks_of(path)[2]
-        for offset in chunk.message_index_offsets.values():
-            data = bytearray(path.read_bytes())
-            at = offset + 15 + 16 * 5
-            (time,) = struct.unpack_from("<Q", data, at)
-            self.at = time
-            struct.pack_into("<Q", data, at, time + S // 5)
-            path.write_bytes(data)
-        return path
-
-    def test_where_the_robot_was_is_what_its_messages_say(self, tmp_path: Path) -> None:
-        self.driven(tmp_path)
-        true = (self.at - T0) / S
-        for storage in ("mcap", "rosbag2"):
-            memory = memory_of(tmp_path, storage=storage)
-            at_s = self.at / S
-            reply = asked_tool(memory, tmp_path, "get_position_at", topic="/odom", timestamp=at_s)
-            assert reply["x"] == pytest.approx(true, abs=1e-6)
-            assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])
-            frames = {"parent": "odom", "child": "base"}
-            reply = asked_tool(memory, tmp_path, "get_transform_at", timestamp=at_s, **frames)
-            assert reply["translation"]["x"] == pytest.approx(true, abs=1e-6)
-            reply = asked_tool(
-                memory, tmp_path, "get_topic_in_range", topic="/odom", start=at_s, end=at_s + 0.15
-            )
-            assert [sample["timestamp"] for sample in reply["samples"]] == [
-                pytest.approx(at_s + n / 10, abs=1e-5) for n in range(2)
-            ]
-
-
 def test_a_bag_that_pauses_and_one_whose_chunks_overlap_are_read_by_their_indexes(
     tmp_path: Path,
 ) -> None:
@@ -217,36 +168,3 @@ def test_a_bag_that_pauses_and_one_whose_chunks_overlap_are_read_by_their_indexe
         for n in range(0, 500, 20):
             reader.newest(path, "/odom", TimeWindow(T0, T0 + n * S // 50))
         assert reader.summarize(path).notes == ()
-
-
-class TestASummarySectionThatDeclaresOtherThanItsChunks:
-    """What a chunk declares is protected by its checksum; the summary section repeats it."""
-
-    def misnamed(self, bag_dir: Path) -> Path:
-        """A drive whose summary section has the numbers of two topics of one type swapped."""
-        moving = [
-            each
-            for n in range(100)
-            for at in [T0 + n * S // 10]
-            for each in (odom(at, n / 10, 0.0), odom(at, -n / 10, 0.0, topic="/ghost"))
-        ]
-        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=8000))
-        numbers = {b"\x01\x00": b"\x02\x00", b"\x02\x00": b"\x01\x00"}
-
-        def swapped(body: bytearray) -> None:
-            body[:2] = numbers[bytes(body[:2])]
-
-        edit_summary(path, Opcode.CHANNEL, swapped)
-        return path
-
-    @pytest.mark.parametrize("storage", ["mcap", "rosbag2"])
-    def test_where_the_robot_was_is_what_the_chunks_say(self, tmp_path: Path, storage: str) -> None:
-        self.misnamed(tmp_path)
-        plain = memory_of(tmp_path, storage=storage)
-        for memory in (plain, with_store(plain, tmp_path)):
-            for topic, sign in (("/odom", 1), ("/ghost", -1)):
-                reply = asked_tool(
-                    memory, tmp_path, "get_position_at", topic=topic, timestamp=T0 / S + 5
-                )
-                assert reply["x"] == pytest.approx(sign * 5.0, abs=1e-6)
-                assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import struct
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -15,10 +16,10 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
+from tests.fuzz.records import message
 from tests.support.bags import VOLATILE, McapLayout, boolean, text, write_mcap
 from tests.support.mcap_surgery import (
     FOOTER,
-    RECORD,
     SMALL,
     change_index,
     chatter,
@@ -28,6 +29,7 @@ from tests.support.mcap_surgery import (
     rewrite_summary,
     spoil_chunk,
 )
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -99,20 +101,12 @@ class TestIndexesThatAreWrong:
         assert any("21 messages" in note for note in summary.notes)
 
     @pytest.mark.parametrize(
-        ("count", "layout"),
-        [
-            pytest.param(12, SMALL, id="few in a chunk"),
-            pytest.param(120, McapLayout(chunk_size=5000), id="many in a chunk"),
-        ],
+        ("count", "layout"), [(12, SMALL), (120, McapLayout(chunk_size=5000))], ids=["few", "many"]
     )
     @pytest.mark.parametrize(
         ("at", "value"),
-        [
-            pytest.param(0, 1, id="another time"),
-            pytest.param(8, 7, id="another place"),
-            pytest.param(8, 1 << 40, id="a place outside"),
-            pytest.param(8, (1 << 64) - 60, id="a place before"),
-        ],
+        [(0, 1), (8, 7), (8, 1 << 40), (8, (1 << 64) - 60)],
+        ids=["another time", "another place", "a place outside", "a place before"],
     )
     def test_a_message_index_that_is_wrong_costs_no_message_and_is_named(
         self, tmp_path: Path, at: int, value: int, count: int, layout: McapLayout
@@ -126,31 +120,34 @@ class TestIndexesThatAreWrong:
             fault = "a chunk states other times than its messages have"
         note = f"damaged: {fault}; its messages were read without its indexes"
         for newest_first in (False, True):
-            found, notes = read_on(McapReader(), path, newest_first=newest_first)
-            assert found == sorted(range(count), reverse=newest_first)
-            assert notes == [note]
+            found = read_on(McapReader(), path, newest_first=newest_first)
+            assert found == (sorted(range(count), reverse=newest_first), [note])
         reader = McapReader()
         with pytest.raises(BagContradictionError):
             next(reader.records(path, ["/chatter"], TimeWindow(first, first + 1)))
         # From now on it is known, and named in every answer.
         with pytest.raises(BagError):
             reader.newest(path, "/chatter", EVERYTHING)
-        found, notes = read_on(reader, path)
-        assert found == [*range(count)]
-        assert len(notes) == 1
+        assert read_on(reader, path)[0] == [*range(count)]
         assert any("without its indexes" in note for note in reader.summarize(path).notes)
+        reply = asked(
+            memory_of(tmp_path), tmp_path, "get_topic_in_range", topic="/chatter", start=0, end=1
+        )
+        assert reply["total"] == count
+        assert reply["notes"][0].endswith(f"a.mcap contradicts itself: {note}")
 
     @pytest.mark.parametrize(
         ("kind", "old", "new"),
         [
-            pytest.param(Opcode.CHANNEL, b"/chatter", b"/chattes", id="topic"),
-            pytest.param(Opcode.CHANNEL, b"\x01\x00\x01\x00", b"\x01\x00\x02\x00", id="schema"),
-            pytest.param(Opcode.CHANNEL, b"cdr", b"cbr", id="encoding"),
-            pytest.param(Opcode.CHANNEL, b"volatile", b"volatild", id="metadata"),
-            pytest.param(Opcode.SCHEMA, b"msg/String", b"msg/Strinh", id="type"),
-            pytest.param(Opcode.SCHEMA, b"ros2msg", b"ros2mso", id="kind of definition"),
-            pytest.param(Opcode.SCHEMA, b"string data", b"string dada", id="definition"),
+            (Opcode.CHANNEL, b"/chatter", b"/chattes"),
+            (Opcode.CHANNEL, b"\x01\x00\x01\x00", b"\x01\x00\x02\x00"),  # its schema
+            (Opcode.CHANNEL, b"cdr", b"cbr"),
+            (Opcode.CHANNEL, b"volatile", b"volatild"),
+            (Opcode.SCHEMA, b"msg/String", b"msg/Strinh"),
+            (Opcode.SCHEMA, b"ros2msg", b"ros2mso"),
+            (Opcode.SCHEMA, b"string data", b"string dada"),
         ],
+        ids=count(),
     )
     @pytest.mark.parametrize("cache_mb", [64, 0])
     def test_what_a_summary_section_declares_otherwise_than_the_chunks_is_named(
@@ -175,9 +172,7 @@ class TestIndexesThatAreWrong:
             " were read without its indexes"
         )
         assert summary.notes == (reason,)
-        found, notes = read_on(reader, path)
-        assert found == [*range(20)]
-        assert notes == [reason]
+        assert read_on(reader, path) == ([*range(20)], [reason])
         records = reader.records(path, ["/chatter"], TimeWindow(15, 20))
         with pytest.raises(BagContradictionError):
             next(records)
@@ -206,24 +201,21 @@ class TestIndexesThatAreWrong:
         assert times(read(reader, path)) == [*range(20)]
         assert any("all of its chunks" in note for note in reader.summarize(path).notes)
 
-    def test_messages_outside_chunks_are_not_lost_beside_chunks(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(6), SMALL)
-        data = path.read_bytes()
-        body = struct.pack("<HIQQ", 1, 0, 3, 3) + text(3, "loose").payload
-        loose = RECORD.pack(Opcode.MESSAGE, len(body)) + body
+    def test_messages_outside_chunks_are_not_lost_beside_chunks(self, path: Path) -> None:
+        data, chunk = path.read_bytes(), chunks_of(path)[-1]
+        loose = message(1, 3, text(3, "loose").payload).data
         # Before the data end: behind the last message index, which moves the summary on.
-        chunk = chunks_of(path)[-1]
         at = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
         moved = bytearray(data[:at] + loose + data[at:])
         footer_at = len(moved) - 8 - FOOTER.size
         kind, length, start, _, _ = FOOTER.unpack_from(moved, footer_at)
         FOOTER.pack_into(moved, footer_at, kind, length, start + len(loose), 0, 0)
         path.write_bytes(moved)
-        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 7))
-        reader = McapReader()
-        assert reader.summarize(path).count == 7
-        assert times(read(reader, path)) == [0, 1, 2, 3, 3, 4, 5]
-        assert times(read(reader, path, newest_first=True)) == [5, 4, 3, 3, 2, 1, 0]
+        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 21))
+        reader, expected = McapReader(), sorted([*range(20), 3])
+        assert reader.summarize(path).count == 21
+        assert times(read(reader, path)) == expected
+        assert times(read(reader, path, newest_first=True)) == expected[::-1]
 
 
 class TestWhatAWriterMayDo:
@@ -257,45 +249,36 @@ class TestWhatAWriterMayDo:
         assert times(read(McapReader(), tmp_path / "b.mcap")) == [0, 1, 2]
 
     def test_json_is_read_as_what_it_says(self, tmp_path: Path) -> None:
+        payloads = b'{"x": 1.5, "far": NaN, "tags": ["a"]}', b"{not json", b"[" * 100_000
+
         def fill(writer: Writer) -> None:
             schema = writer.register_schema("Mouse", "jsonschema", b"{}")
             channel = writer.register_channel("mouse", "json", schema)
-            writer.add_message(channel, 1, b'{"x": 1.5, "far": NaN, "tags": ["a"]}', 1)
-            writer.add_message(channel, 2, b"{not json", 2)
-            writer.add_message(channel, 3, b"[" * 100_000, 3)
+            for at, payload in enumerate(payloads):
+                writer.add_message(channel, at, payload, at)
 
         reader = McapReader()
-        good, bad, deep = read(reader, raw_mcap(tmp_path / "a.mcap", fill), "mouse")
-        value = reader.decode(good)
-        assert isinstance(value, dict)
-        assert value["x"] == 1.5
-        assert value["far"] != value["far"]
+        good, *others = read(reader, raw_mcap(tmp_path / "a.mcap", fill), "mouse")
+        assert repr(reader.decode(good)) == "{'x': 1.5, 'far': nan, 'tags': ['a']}"
         assert reader.undecodable(good.channel) is None
-        for record in (bad, deep):
+        for record in others:
             with pytest.raises(UndecodableError, match=r"mouse \(Mouse\): the payload is not JSON"):
                 reader.decode(record)
 
-    def test_times_that_no_clock_shows_are_left_out_and_reported(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("chunked", [True, False])
+    def test_times_and_channels_that_cannot_be_are_left_out_and_reported(
+        self, tmp_path: Path, chunked: bool
+    ) -> None:
         def fill(writer: Writer) -> None:
             channel = writer.register_channel("/t", "json", 0)
             for time in (5, 2**63 + 1, 2**64 - 1):
                 writer.add_message(channel, time, b"{}", time)
-
-        for number, chunked in enumerate((True, False)):
-            path = raw_mcap(tmp_path / f"{number}.mcap", fill, use_chunking=chunked)
-            reader = McapReader()
-            summary = reader.summarize(path)
-            assert (summary.count, summary.start, summary.end) == (1, 5, 5)
-            assert "left out: 2 messages without a possible log time" in summary.notes
-            assert times(read(reader, path, "/t")) == [5]
-
-    def test_messages_without_a_channel_are_left_out_and_reported(self, tmp_path: Path) -> None:
-        def fill(writer: Writer) -> None:
-            channel = writer.register_channel("/t", "json", 0)
-            writer.add_message(channel, 1, b"{}", 1)
             writer.add_message(99, 2, b"{}", 2)
 
-        path = raw_mcap(tmp_path / "a.mcap", fill)
-        summary = McapReader().summarize(path)
-        assert summary.count == 1
+        path = raw_mcap(tmp_path / "a.mcap", fill, use_chunking=chunked)
+        reader = McapReader()
+        summary = reader.summarize(path)
+        assert (summary.count, summary.start, summary.end) == (1, 5, 5)
+        assert "left out: 2 messages without a possible log time" in summary.notes
         assert "left out: 1 message of no declared channel" in summary.notes
+        assert times(read(reader, path, "/t")) == [5]

@@ -12,12 +12,17 @@ from typing import TYPE_CHECKING
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Channel, Record, Schema
+from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MESSAGES,
+    MAX_DEFINITION_BYTES,
+    MAX_NAMES_CHARS,
     MAX_TOPICS,
     UnreadableError,
     max_decompressed_bytes,
@@ -45,6 +50,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MB = 1 << 20
+TOO_LONG = "a" * MAX_NAMES_CHARS
 EVERYTHING = TimeWindow.everything()
 STRINGS = [schema(1, "std_msgs/msg/String", "ros2msg", b"string data\n"), channel(1, 1, "/chatter")]
 
@@ -53,8 +59,8 @@ def string_message(name: str = "x", time: int = 5) -> Piece:
     return message(1, time, text(0, name).payload)
 
 
-def bytes_of(records: list[Piece]) -> bytes:
-    return b"".join(each.data for each in records)
+def string_chunk(*more: Piece) -> Piece:
+    return chunk_of(b"".join(each.data for each in (*STRINGS, string_message(), *more)))
 
 
 def bomb(size: int) -> Piece:
@@ -90,9 +96,8 @@ class TestChunks:
     def test_a_chunk_larger_than_allowed_is_left_out_and_named(
         self, tmp_path: Path, compression: str, packed: bytes, stated: int
     ) -> None:
-        whole = chunk_of(bytes_of([*STRINGS, string_message()]))
         large = chunk_of(b"", compression, packed=packed, size=stated, crc=0)
-        path = bag(tmp_path, whole, large)
+        path = bag(tmp_path, string_chunk(), large)
         with little_memory(10 * MB):
             summary = McapReader(max_chunk_mb=1).summarize(path)
         assert summary.count == 1
@@ -102,9 +107,8 @@ class TestChunks:
     def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
         self, tmp_path: Path
     ) -> None:
-        whole = chunk_of(bytes_of([*STRINGS, string_message()]))
-        many = [bomb(30 * MB)] * 5
-        summary = McapReader().summarize(bag(tmp_path, whole, *many, whole))
+        whole = string_chunk()
+        summary = McapReader().summarize(bag(tmp_path, whole, *[bomb(30 * MB)] * 5, whole))
         assert summary.count == 1
         assert "4 damaged records" not in summary.notes[0]
         assert "damaged record" in summary.notes[0]
@@ -126,8 +130,7 @@ class TestChunks:
         assert [each.log_time for each in reader.records(path, ["/chatter"], EVERYTHING)] == [9]
 
     def test_repairing_a_bag_of_bombs_counts_them_as_lost(self, tmp_path: Path) -> None:
-        whole = chunk_of(bytes_of([*STRINGS, string_message()]))
-        path = bag(tmp_path, whole, *[bomb(30 * MB)] * 6)
+        path = bag(tmp_path, string_chunk(), *[bomb(30 * MB)] * 6)
         path.write_bytes(path.read_bytes()[: -len(MAGIC)])
         rewritten = McapWriter().rewrite(path, tmp_path / "repaired.mcap")
         assert rewritten.messages == 1
@@ -138,14 +141,11 @@ class TestChunks:
     ) -> None:
         count, size = 8, 9 * MB
         noise = random.Random(1).randbytes(size)
-        chunks = [
-            chunk_of(
-                bytes_of([*STRINGS, message(1, time, noise), string_message("b", 100 + time)]),
-                "zstd",
-                span=(time, 100 + time),
-            )
-            for time in range(count)
-        ]
+        declared = b"".join(each.data for each in STRINGS)
+        chunks = []
+        for time in range(count):
+            both = message(1, time, noise).data + string_message("b", 100 + time).data
+            chunks.append(chunk_of(declared + both, "zstd", span=(time, 100 + time)))
         path = bag(tmp_path, *chunks)
         reader = McapReader(cache_mb=1)
         reader.summarize(path)
@@ -157,20 +157,15 @@ class TestChunks:
         many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_TOPICS + 2)]
         with pytest.raises(BagError, match="may be whole, but has more than the 5000 topics"):
             McapReader().summarize(bag(tmp_path, STRINGS[0], *many, string_message()))
-        assert (
-            McapReader().summarize(bag(tmp_path, STRINGS[0], *many[:-1], string_message())).count
-            == 1
-        )
+        known = bag(tmp_path, STRINGS[0], *many[:-1], string_message())
+        assert McapReader().summarize(known).count == 1
 
     def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("ros2_memory.storage.mcap.chunk.MAX_CHUNKS", 20)
-        first, each = (
-            chunk_of(bytes_of([*STRINGS, string_message()])),
-            chunk_of(string_message().data),
-        )
-        summary = McapReader().summarize(bag(tmp_path, first, *[each] * 21))
+        each = chunk_of(string_message().data)
+        summary = McapReader().summarize(bag(tmp_path, string_chunk(), *[each] * 21))
         assert summary.count == 20
         assert "more than 20 chunks" in summary.notes[0]
 
@@ -204,6 +199,37 @@ class TestMessages:
         payload = b"[" + b"0," * (2 * MB) + b"0]"
         with pytest.raises(UndecodableError, match="longer than the 4 MiB"):
             McapReader().decode(Record(known, 1, 1, payload))
+
+
+class TestDeclarations:
+    """They stay in memory as long as a bag exists."""
+
+    @pytest.mark.parametrize(
+        ("topic", "kind"), [("/" + TOO_LONG, "a/msg/B"), ("/a", TOO_LONG)], ids=["topic", "type"]
+    )
+    def test_names_longer_than_any_are_refused(self, tmp_path: Path, topic: str, kind: str) -> None:
+        declared = schema(1, kind, "ros2msg", b"uint8 data").data + channel(1, 1, topic).data
+        path = bag(tmp_path, chunk_of(declared + string_message().data, "zstd"))
+        assert path.stat().st_size < 10_000
+        with pytest.raises(BagError, match="longer names"):
+            McapReader().summarize(path)
+
+    def test_of_a_definition_larger_than_any_no_more_is_kept_than_shows_it(
+        self, tmp_path: Path
+    ) -> None:
+        large = schema(1, "a/msg/B", "ros2msg", b"#" * 3 * MB + b"\nuint8 data").data
+        path = bag(tmp_path, chunk_of(large + STRINGS[1].data + string_message().data, "zstd"))
+        reader = McapReader()
+        [known] = reader.channels(path)
+        assert len(known.schema.text) == MAX_DEFINITION_BYTES + 1
+        assert "larger than" in (reader.undecodable(known) or "")
+
+    @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 15_000))))
+    def test_what_is_cached_never_passes_the_bound(self, puts: list[tuple[int, int]]) -> None:
+        cache: ByteLru[int] = ByteLru(20_000)
+        for key, size in puts:
+            cache.put(key, size, size)
+            assert sum(cache.get(each) or 0 for each in range(6)) <= 20_000
 
 
 class TestWholeFiles:
@@ -266,27 +292,29 @@ class TestSqlite:
         with pytest.raises(BagError, match=reason):
             Rosbag2Reader().summarize(path)
 
+    @pytest.mark.parametrize(
+        ("statement", "rows", "said"),
+        [
+            (
+                "message_definitions VALUES (?, 'a/msg/B', 'ros2msg', ?, '')",
+                [(n, "x" * 1_000_000) for n in range(10, 80)],
+                "texts of its table message_definitions are longer",
+            ),
+            (
+                "topics VALUES (?, ?, 'a/msg/B', 'cdr', '', '')",
+                [(n, f"/t{n}") for n in range(10, 5010)],
+                "more than the 5000 topics",
+            ),
+        ],
+    )
     def test_more_topics_than_any_robot_has_and_enormous_definitions_are_refused(
-        self, tmp_path: Path
+        self, tmp_path: Path, statement: str, rows: list[tuple[int, str]], said: str
     ) -> None:
         path = self.edited(tmp_path)
-        text_of_mb = "x" * 1_000_000
         with closing(sqlite3.connect(path)) as base:
-            base.executemany(
-                "INSERT INTO message_definitions VALUES (?, 'a/msg/B', 'ros2msg', ?, '')",
-                ((n, text_of_mb) for n in range(10, 80)),
-            )
+            base.executemany(f"INSERT INTO {statement}", rows)
             base.commit()
-        with pytest.raises(BagError, match="texts of its table message_definitions are longer"):
-            Rosbag2Reader().summarize(path)
-        with closing(sqlite3.connect(path)) as base:
-            base.execute("DELETE FROM message_definitions")
-            base.executemany(
-                "INSERT INTO topics VALUES (?, ?, 'a/msg/B', 'cdr', '', '')",
-                ((n, f"/t{n}") for n in range(10, 5010)),
-            )
-            base.commit()
-        with pytest.raises(BagError, match="more than the 5000 topics"):
+        with pytest.raises(BagError, match=said):
             Rosbag2Reader().summarize(path)
 
     @pytest.mark.parametrize(
