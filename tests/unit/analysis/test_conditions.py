@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import (
@@ -22,7 +22,6 @@ from ros2_memory.analysis.conditions import (
     refusal_for,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
-from tests.support.strategies import json_values
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
@@ -37,13 +36,6 @@ SCENE: JsonValue = {
 }
 ESCAPED = json.dumps([{"label": "größer"}, 'say "hi"', "a\\b"])
 """As most programs write it: what is not ASCII is escaped, too."""
-asked_scalars: st.SearchStrategy[Scalar] = st.one_of(
-    st.booleans(),
-    st.integers(-5, 5),
-    st.floats(allow_nan=False),
-    st.sampled_from(["a", "Ab", "1", "true", "-2.5"]),
-)
-asked_coordinates = st.floats(-10, 10)
 
 
 # contains
@@ -72,6 +64,8 @@ asked_coordinates = st.floats(-10, 10)
         (1, None, [True], False),
         *((word, None, ESCAPED, True) for word in ("größer", "GRÖSSER", 'say "hi"', "a\\b")),
         ("größer", None, f"x{ESCAPED}", False),  # no JSON
+        *((leaf, "x", {"x": [leaf, None]}, True) for leaf in (-2.5, 1e300, "-2.5", "Ab", False)),
+        ("cup", None, [None, {"seen": [{"label": "a cup, or two"}]}], True),
     ],
     ids=count(),
 )
@@ -79,25 +73,6 @@ def test_what_contains_finds(
     needle: Scalar, field: str | None, value: JsonValue, is_met: bool
 ) -> None:
     assert Condition(Contains(needle), field).matches(value) is is_met
-
-
-@given(asked_scalars, json_values)
-def test_what_a_field_is_equal_to_it_contains(asked: Scalar, value: JsonValue) -> None:
-    held: JsonValue = {"x": [asked, value]}
-    assert Condition(Contains(asked), "x").matches(held)
-    if not isinstance(value, dict | list) and Condition(Equals(asked)).matches(value):
-        assert Condition(Contains(asked), "x").matches({"x": value})
-
-
-@given(asked_scalars, json_values, json_values, st.text())
-def test_what_a_value_contains_is_in_all_that_it_is_in(
-    needle: Scalar, value: JsonValue, more: JsonValue, text: str
-) -> None:
-    if Condition(Contains(needle)).matches(value):
-        assert Condition(Contains(needle)).matches({"x": [more, value]})
-        assert Condition(Contains(needle)).matches([value, more])
-    if isinstance(needle, str):
-        assert Condition(Contains(needle)).matches([{"label": text + needle + text}])
 
 
 # equals
@@ -110,6 +85,8 @@ def test_what_a_value_contains_is_in_all_that_it_is_in(
         *((one, {"data": True}, True) for one in (1, 1.0, "1")),
         *((one, {"data": False}, False) for one in (1, 1.0, "1")),
         *((yes, {"data": 1}, True) for yes in (True, "True")),
+        *((yes, [no, math.nan, None], False) for yes, no in ((True, 2), (False, 0.5), (2, True))),
+        *((math.nan, [leaf], False) for leaf in (math.nan, None, 0)),
         *((number, [number], True) for number in (0.9, 1e300, -1e300, 10**400, 1e-320, math.inf)),
         (2**53 + 1, 2**53 + 2, False),
         # What a float32 would hold of it is another number.
@@ -132,12 +109,6 @@ def test_what_equals_finds(asked: Scalar, value: JsonValue, is_met: bool) -> Non
     assert Condition(Equals(asked)).matches(value) is is_met
 
 
-@given(st.booleans(), st.one_of(st.integers(), st.floats()).filter(lambda n: n not in (0, 1)))
-def test_a_boolean_equals_no_other_number(asked: bool, number: float) -> None:
-    assert not Condition(Equals(asked)).matches([number])
-    assert not Condition(Equals(number)).matches([asked])
-
-
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False), st.floats(-1e-9, 1e-9))
 def test_a_number_equals_what_a_float32_field_stores_of_it(held: float, nudge: float) -> None:
     asked = held * (1 + nudge)
@@ -146,43 +117,21 @@ def test_a_number_equals_what_a_float32_field_stores_of_it(held: float, nudge: f
     assert Condition(Equals(asked)).matches(stored) is (is_meant or stored == asked)
 
 
-@given(asked_scalars)
-def test_nothing_equals_nan_or_null(asked: Scalar) -> None:
-    assert not Condition(Equals(asked)).matches([math.nan, None])
-    assert not Condition(Equals(math.nan)).matches([asked, math.nan, None])
-
-
-@given(st.text(), json_values)
-def test_what_is_equal_to_a_text_contains_it(asked: str, value: JsonValue) -> None:
-    for held in (asked, asked.upper(), asked.casefold()):
-        if Condition(Equals(held)).matches([asked, value]):
-            assert Condition(Contains(held)).matches([asked, value])
-    assert Condition(Equals(asked.casefold())).matches([asked])
-
-
 # above and below
 
 
-@given(st.floats(allow_nan=False), st.floats(allow_nan=False))
-def test_a_limit_is_not_part_of_either_side(limit: float, number: float) -> None:
-    assume(number != Beyond(limit, above=True).stored)
-    assert Condition(Beyond(limit, above=True)).matches([number]) == (number > limit)
-    assert Condition(Beyond(limit, above=False)).matches([number]) == (number < limit)
-    assert not Condition(Beyond(limit, above=True)).matches({"a": limit})
-    assert not Condition(Beyond(limit, above=False)).matches({"a": limit})
+@pytest.mark.parametrize("limit", [0.0, -2.5, 0.1, 1e300, 2**53 + 1])
+def test_a_limit_is_not_part_of_either_side(limit: float) -> None:
+    for above, sign in ((True, 1), (False, -1)):
+        condition = Condition(Beyond(limit, above=above))
+        # What a float32 holds of the limit is the limit.
+        held = [limit, *([float(np.float32(limit))] if abs(limit) < 1e30 else [])]
+        assert not any(condition.matches({"a": each}) for each in held)
+        assert condition.matches([limit + sign * max(1.0, abs(limit) / 9)])
+        assert not condition.matches([limit - sign * max(1.0, abs(limit) / 9)])
 
 
 # near_position
-
-
-@given(asked_coordinates, asked_coordinates, st.floats(0, 5), asked_coordinates, asked_coordinates)
-def test_near_is_within_the_tolerance_in_the_plane(
-    x: float, y: float, tolerance_m: float, px: float, py: float
-) -> None:
-    distance_m = math.dist((x, y), (px, py))
-    assume(abs(distance_m - tolerance_m) > 1e-12 * max(distance_m, 1.0))
-    near = Condition(NearPosition(x, y, None, tolerance_m)).matches({"x": px, "y": py, "z": 1e6})
-    assert near == (distance_m < tolerance_m)
 
 
 ONE_TWO, OTHER = {"x": 1.0, "y": 2.0}, {"x": 9.0, "y": 9.0}
@@ -211,6 +160,10 @@ BAD = (None, math.nan, math.inf)
         *((1.0, None, {**ONE_TWO, "z": bad}, False) for bad in BAD),
         (1.0, None, ONE_TWO, False),
         *((1.0, None, {**ONE_TWO, "z": z}, is_near) for z, is_near in ((1.4, True), (1.6, False))),
+        *(
+            (None, None, {"x": 1.3, "y": y}, is_near)
+            for y, is_near in ((1.61, True), (1.59, False))
+        ),
     ],
     ids=count(),
 )

@@ -133,11 +133,6 @@ def test_between_two_messages_translation_is_linear_and_rotation_slerp(
         assert (Rotation.from_quat(found.rotation).inv() * expected).magnitude() < 1e-6
 
 
-@given(st.permutations(moving()), st.integers(100 * S, 105 * S))
-def test_messages_may_come_in_any_order(shuffled: list[StampedTransform], time: int) -> None:
-    assert shift(Tree(shuffled), "odom", "base", time) == pytest.approx(time / S - 100)
-
-
 # Parents that change
 
 

@@ -25,8 +25,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.history import reverse_search
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.view import View
+from ros2_memory.index import timeline
 from ros2_memory.serving.backfill import make_fragments
 from tests.support.bags import (
     McapLayout,
@@ -432,18 +438,26 @@ def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[flo
 
 
 @patch.object(Scanner, "damaged_parts", lambda *_: [])  # Who fills knows of damage earlier.
-@settings(max_examples=27 if LONG else 2)
+@patch.object(reverse_search, "MOST_UNSURE", 1)
+@settings(max_examples=60 if LONG else 2)
 @given(seed=st.integers(0, 2**32))
 @example(17293)  # A topic of two types, in recordings side by side.
 @example(177)  # A chunk that is damaged.
 def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(seed: int) -> None:
-    draw = random.Random(seed)
-    with tempfile.TemporaryDirectory() as folder:
+    draw, how = random.Random(seed), random.Random(-seed)
+    limits = QuerySettings(tf_clock=how.choice(["auto", "stamp"]))
+
+    def world_of(bag_dir: Path, kept: StoreLimits | None = None) -> World:
+        world = World.of(bag_dir, limits=kept)
+        return replace(world, memory=replace(world.memory, limits=limits))
+
+    size = how.choice([1, 2, timeline.SEGMENT_BAGS])
+    with tempfile.TemporaryDirectory() as folder, patch.object(timeline, "SEGMENT_BAGS", size):
         bag_dir, aside = Path(folder, "bags"), Path(folder, "aside")
         bag_dir.mkdir()
-        moments = write_history(bag_dir, draw).moments
+        moments = write_history(bag_dir, draw, how.choice([MS, MS, 5 * S])).moments
         put_aside(bag_dir, aside, draw)
-        world = World.of(bag_dir)
+        world = world_of(bag_dir)
         check_all(world.unstored())
         for _ in range(draw.randint(1, 5)):
             fill_some(world, draw)
@@ -452,13 +466,19 @@ def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(see
             change_something(bag_dir, aside, draw)
         world.fill()
         check_all(world)
-        again = World.of(bag_dir)
+        again = world_of(bag_dir)
         check_all(again)
         check_stored(again, questions(draw, again.topics(), moments, most=10))
-        begin = draw.choice(moments)
-        window = TimeWindow(begin, begin + draw.randrange(1, 40) * S)
         for topic in again.topics():
+            begin = draw.choice([*moments, MIN_NS])
+            window = TimeWindow(begin, max(begin, draw.choice(moments)) + draw.randrange(40 * S))
             check_rows(again, topic, window, newest_first=draw.random() < 0.5)
+            for memory in (again.memory, again.unstored().memory):
+                first = View(memory, Call()).stream.first([topic], window, newest_first=True)
+                assert View(memory, Call()).stream.newest(topic, window) == first
+        without_columns = world_of(bag_dir, StoreLimits(max_share=0.0, least_bytes_per_s=0))
+        without_columns.fill()
+        check_stored(without_columns, questions(draw, again.topics(), moments, most=20))
 
 
 def draw_recordings(draw: Random) -> Splits:

@@ -8,9 +8,8 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -20,7 +19,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import TimeRange, View
-from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap
 from ros2_memory.messages.to_json import evenly
 from ros2_memory.storage.base import Record
@@ -127,49 +125,6 @@ def test_every_message_counts_exactly_once_however_recordings_overlap(
     assert [each.time for each in chosen] == [expected[i] for i in evenly(total, 8)]
 
 
-@st.composite
-def histories(draw: st.DrawFn) -> dict[str, list[Msg]]:
-    """Rows of a few messages that are alike, in two recordings or three, some rows close by."""
-    recordings: dict[str, list[Msg]] = {}
-    start = T0
-    for _ in range(draw(st.integers(1, 4))):
-        start += draw(st.sampled_from([MS, 3 * S, 20 * S]))
-        published = draw(st.sampled_from([start, T0]))
-        for _ in range(draw(st.integers(1, 6))):
-            at = start + draw(st.integers(0, 3)) * draw(st.sampled_from([1, 150 * MS]))
-            said = boolean(at, data=draw(st.booleans()))
-            recording = recordings.setdefault(draw(st.sampled_from("aabbc")), [])
-            recording.append(replace(said, publish_time=published))
-        start = max(each.log_time for messages in recordings.values() for each in messages)
-    return {
-        name: sorted(messages, key=lambda each: each.log_time)
-        for name, messages in recordings.items()
-    }
-
-
-def alike(*log_times: int) -> list[Msg]:
-    return [replace(boolean(T0 + at, data=True), publish_time=T0) for at in log_times]
-
-
-@settings(max_examples=examples(40))
-@given(histories(), st.sampled_from([0.0, 0.5, 1.0]))
-@example({"a": alike(0), "b": alike(1, 2)}, 0.0)
-@example({"a": alike(0, 2), "b": alike(1)}, 1.0)
-@example({"a": alike(0), "b": alike(0, 0)}, 0.0)
-def test_the_same_copies_are_left_out_newest_first_and_of_columns(
-    recordings: dict[str, list[Msg]], part: float
-) -> None:
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        for name, messages in recordings.items():
-            recorded(bag_dir, name, messages)
-        view = View(with_store(memory_of(bag_dir), bag_dir, part=part), Call())
-        counting = [rows.times for rows in scan(view, "/bumper", TimeWindow.everything())]
-        expected = np.sort(np.concatenate(counting)).tolist()
-        assert times(view, "/bumper") == expected
-        assert times(view, "/bumper", newest_first=True) == expected[::-1]
-
-
 TOPIC = "/rosout"
 LAYOUT = McapLayout(latched=frozenset({TOPIC}))
 SPLIT = 10 * S
@@ -234,9 +189,9 @@ def once(stored: Sequence[Stored]) -> list[Stored]:
     ]
 
 
-def texts(memory: Memory, window: TimeWindow) -> list[tuple[int, int]]:
-    stream = View(memory, Call()).stream
-    return [(each.time, each.record.publish_time) for each in stream.messages([TOPIC], window)]
+def texts(memory: Memory, window: TimeWindow, *, newest_first: bool = False) -> list[Any]:
+    found = View(memory, Call()).stream.messages([TOPIC], window, newest_first=newest_first)
+    return [(each.time, each.record.publish_time) for each in found]
 
 
 def picked(memory: Memory, window: TimeWindow) -> list[int]:
@@ -264,48 +219,16 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         edges = sorted(draw.choice(stored)[0] + draw.choice([0, 1]) for _ in range(2))
         for window in (TimeWindow.everything(), TimeWindow(edges[0], edges[1] + 1)):
             inside = [each for each in counted if window.contains(each[0])]
-            assert texts(memory, window) == [each[:2] for each in inside]
+            said = texts(memory, window)
+            assert said == [each[:2] for each in inside]
+            assert texts(memory, window, newest_first=True) == said[::-1]
             assert picked(memory, window) == [each[0] for each in inside]
         [census] = View(memory, Call()).census(TOPIC).values()
-        assert (census.first, census.last, census.messages) == (
-            counted[0][0],
-            counted[-1][0],
-            len(counted),
-        )
+        ends = counted[0][0], counted[-1][0]
+        assert (census.first, census.last, census.messages) == (*ends, len(counted))
         last = View(memory, Call()).stream.newest(TOPIC, TimeWindow.everything())
         assert last is not None
         assert last.time == counted[-1][0]
-
-
-@settings(max_examples=examples(6))
-@given(seed=st.integers(0, 10**6), part=st.sampled_from([0.0, 1.0]))
-def test_what_was_counted_before_is_right_after_bags_come_and_go(seed: int, part: float) -> None:
-    draw = random.Random(seed)
-    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timeline, "SEGMENT_BAGS", 2)
-        root, aside = Path(folder) / "bags", Path(folder) / "aside"
-        write_recordings(root, draw)
-        aside.mkdir()
-        bags = sorted(root.glob("*/*.mcap"), key=lambda each: (each.parent, int(each.stem[5:])))
-        for bag in bags[-3:]:
-            bag.rename(aside / bag.name)
-        memory = with_store(memory_of(root, reader=McapReader()), root, part=part)
-
-        def check() -> None:
-            census = View(memory, Call()).census(TOPIC)
-            found = texts(memory, TimeWindow.everything())
-            assert sum(each.messages for each in census.values()) == len(found)
-            fresh = memory_of(root, reader=McapReader())
-            assert found == texts(fresh, TimeWindow.everything())
-            assert census == View(fresh, Call()).census(TOPIC)
-
-        check()
-        for bag in bags[-3:]:
-            (aside / bag.name).rename(bag)
-            check()
-        for bag in bags[:3]:
-            bag.unlink()
-            check()
 
 
 def test_what_was_an_original_no_longer_matters_once_its_recording_is_gone(tmp_path: Path) -> None:

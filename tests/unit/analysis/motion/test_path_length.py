@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,13 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.trajectory import Trajectory
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import examples
+from tests.support.strategies import points
 from tests.unit.analysis.motion.posed import posed, way_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable
+
+    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.analysis.poses import Poses
+    from ros2_memory.core.model import Vector3
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
@@ -35,50 +41,35 @@ def arc(speed: float, hertz: float, seconds: float) -> Points:
 
 
 def noisy(points: Points, sigma: float, seed: int = 1, axes: int = 3) -> Points:
-    draw = np.random.default_rng(seed)
-    off = draw.normal(0.0, sigma, points.shape)
+    off = np.random.default_rng(seed).normal(0.0, sigma, points.shape)
     off[:, axes:] = 0.0
     return points + off
 
 
-def plain_sum(points: Points) -> float:
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+def driven(positions: Iterable[Vector3], hertz: float = 1.0) -> Poses:
+    """Poses at even steps of log time."""
+    return posed((BEGIN + round(nth * S / hertz), place) for nth, place in enumerate(positions))
 
 
-def summarise(points: Points, hertz: float, cuts: Sequence[int] | None = None) -> Trajectory:
-    """Measured in slices of the clock, or in parts cut at these poses."""
-    rows = [(BEGIN + round(nth * S / hertz), place) for nth, place in enumerate(points.tolist())]
-    return way_of(posed(rows), 10.0, cuts).trajectory()
-
-
-def cuts_of(poses: Points, count: int, seed: int) -> list[int]:
-    return sorted(np.random.default_rng(seed).choice(len(poses), count, replace=False).tolist())
-
-
-@settings(max_examples=examples(30), deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     st.sampled_from([20, 50]),
     st.floats(0.1, 2.0),
     st.integers(1, 40),
     st.integers(0, 10**6),
-    st.booleans(),
+    st.sampled_from([line, arc]),
+    st.sampled_from([0.0, 0.005]),
 )
-def test_other_cuts_of_a_history_differ_by_half_a_percent_at_most(
-    hertz: int, speed: float, count: int, seed: int, curved: bool
+def test_other_cuts_of_a_history_differ_by_half_a_percent_at_most_and_without_noise_not_at_all(
+    hertz: int, speed: float, count: int, seed: int, shape: Callable[..., Points], noise_m: float
 ) -> None:
-    poses = noisy((arc if curved else line)(speed, hertz, 120), 0.005, seed)
-    whole = summarise(poses, hertz).totals.distance_m
-    assert summarise(poses, hertz, cuts_of(poses, count, seed)).totals.distance_m == pytest.approx(
-        whole, rel=0.005
-    )
-
-
-@settings(max_examples=examples(20), deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 300))
-def test_without_noise_any_cuts_give_the_same_length(seed: int, count: int) -> None:
-    poses = arc(0.5, 20, 60)
-    found = summarise(poses, 20, cuts_of(poses, count, seed))
-    assert found.totals.distance_m == pytest.approx(plain_sum(poses), rel=1e-9)
+    places = noisy(shape(speed, hertz, 60), noise_m, seed)
+    poses = driven(places.tolist(), hertz)
+    cuts = np.random.default_rng(seed).choice(len(places), count, replace=False).tolist()
+    whole, parts = (way_of(poses, 10.0, each).trajectory().totals for each in (None, sorted(cuts)))
+    exact = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    expected, off = (whole.distance_m, 0.005) if noise_m else (exact, 1e-9)
+    assert parts.distance_m == pytest.approx(expected, rel=off)
 
 
 @pytest.mark.parametrize("split", [None, 0, 2, -3], ids=["one part", "at it", "after", "before"])
@@ -99,3 +90,61 @@ def test_a_step_back_to_the_origin_that_nothing_near_it_is_like_is_a_reset(
     assert found.totals.distance_m == pytest.approx(out_m + 10, rel=0.02 if noise_m else 1e-9)
     assert found.max_speed == pytest.approx(1.0, rel=0.1)
     assert len(found.totals.resets) == 1
+
+
+# Of these none is at the origin, where odometry may have begun anew.
+elsewhere = points.map(lambda point: (abs(point[0]) + 10, point[1], point[2]))
+
+
+@given(st.lists(elsewhere, min_size=2, max_size=15))
+def test_of_few_poses_the_distance_is_the_plain_length(positions: list[Vector3]) -> None:
+    found = way_of(driven(positions), 1e9).trajectory()
+    length_m = math.fsum(math.dist(a, b) for a, b in pairwise(positions))
+    assert found.totals.distance_m == pytest.approx(length_m, rel=1e-12)
+    assert found.totals.jumps == 0
+    assert (found.max_speed or 0) >= (found.avg_speed or 0) >= 0
+
+
+@pytest.mark.parametrize(
+    ("xs", "drawn"),
+    [
+        ((0, 1, 2, 102, 103, 104, 5, 6), [(0, 0), (2, 0), (3, 1), (5, 0), (6, 1), (7, 0)]),
+        # It stands before and after, and is drawn until it jumps.
+        ((*(0.001 * (i % 2) for i in range(9)), 90, 90, 91), [(0, 0), (8, 0), (9, 1), (11, 0)]),
+    ],
+)
+def test_both_ends_of_a_jump_are_drawn_and_nothing_between_them(
+    xs: tuple[float, ...], drawn: list[tuple[int, int]]
+) -> None:
+    found = way_of(driven((x, 0.0, 0.0) for x in xs), 10.0).trajectory()
+    assert [((each.time - BEGIN) // S, each.jump) for each in found.waypoints] == drawn
+
+
+def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
+    """Distance from the polyline, written independently of the code under test."""
+    vertices = np.array([waypoint.position for waypoint in found.waypoints])
+    starts, ways = vertices[:-1], np.diff(vertices, axis=0)
+    squared = np.maximum((ways * ways).sum(axis=1), 1e-300)
+    worst = 0.0
+    for p in np.array([*positions]):
+        ratios = np.clip(((p - starts) * ways).sum(axis=1) / squared, 0.0, 1.0)
+        ends = np.concatenate((starts + ratios[:, None] * ways, vertices))
+        worst = max(worst, float(np.linalg.norm(ends - p, axis=1).min()))
+    return worst
+
+
+@given(st.lists(points, min_size=1, max_size=60), st.integers(2, 60))
+def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
+    positions: list[Vector3], at_most: int
+) -> None:
+    poses = driven(positions)
+    found = way_of(poses, 10.0).trajectory(at_most)
+    assert farthest_off(positions, found) <= found.waypoint_error_m + 1e-7
+    assert len(found.waypoints) <= at_most
+    assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.totals.jumps
+    # They are recorded poses, from the first to the last.
+    recorded = dict(zip(poses.times.tolist(), positions, strict=True))
+    assert all(recorded[each.time] == each.position for each in found.waypoints)
+    times = [each.time for each in found.waypoints]
+    assert times == sorted(set(times))
+    assert (times[0], times[-1]) == (poses.times[0], poses.times[-1])
