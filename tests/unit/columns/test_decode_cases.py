@@ -31,37 +31,31 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.bags import transform as transform_of
+from tests.support.examples import examples
 from tests.support.leaves import Comparison
-from tests.support.mcap_surgery import SMALL, chatter, raw_mcap, spoil_chunk
+from tests.support.mcap_surgery import SMALL, chatter, spoil_chunk
 from tests.unit.columns.decoded_bags import (
     bag_of,
     compared,
     tables_of,
 )
+from tests.unit.columns.drawn_tables import message
 from tests.unit.columns.drawn_types import DrawnField, DrawnTypes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
-
-    from mcap.writer import Writer
 
     from ros2_memory.storage.base import Channel
 
 
 def path_message(ns: int, points: int) -> Msg:
     """A path whose poses have frames of various lengths, and which something follows in a type."""
-    poses = [
-        make(
-            "geometry_msgs/msg/PoseStamped",
-            header=header(ns + nth, "map" if nth % 3 else "odometry"),
-            pose=make(
-                "geometry_msgs/msg/Pose",
-                position=point(float(nth), 0.5),
-                orientation=quaternion(0.1),
-            ),
-        )
-        for nth in range(points)
-    ]
+    kind, turn = "geometry_msgs/msg/PoseStamped", quaternion(0.1)
+    poses = []
+    for nth in range(points):
+        pose = make("geometry_msgs/msg/Pose", position=point(nth, 0.5), orientation=turn)
+        frame = "map" if nth % 3 else "odometry"
+        poses.append(make(kind, header=header(ns + nth, frame), pose=pose))
     made = make("nav_msgs/msg/Path", header=header(ns, "map"), poses=poses)
     return Msg("/plan", "nav_msgs/msg/Path", ns, made)
 
@@ -78,14 +72,8 @@ def numbers(table: Table, path: str) -> list[object]:
 
 LONG_TYPES: Final = DrawnTypes(
     (
-        (
-            "Point",
-            (DrawnField("x", "float64"), DrawnField("kind", "uint8")),
-        ),
-        (
-            "Named",
-            (DrawnField("label", "string"), DrawnField("points", "Point", -1)),
-        ),
+        ("Point", (DrawnField("x", "float64"), DrawnField("kind", "uint8"))),
+        ("Named", (DrawnField("label", "string"), DrawnField("points", "Point", -1))),
         (
             "Long",
             (
@@ -129,39 +117,29 @@ def test_what_follows_long_sequences_is_read_where_it_is(
     assert fallbacks == []
 
 
-def mixed(count: int) -> list[Msg]:
-    messages: list[Msg] = []
-    for time in range(0, count * 10, 10):
+def test_small_groups_hold_together_what_one_group_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = []
+    for nth in range(40):
+        parts = [transform_of(nth, "odom", f"link{n}", (0.0, 1.0, n)) for n in range(nth % 3)]
         messages += [
-            odom(time, time / 7, -1.0),
-            tf(
-                time + 1,
-                *(
-                    transform_of(time, "odom", f"link{nth}", (0.0, 1.0, nth))
-                    for nth in range(time // 10 % 3)
-                ),
-            ),
-            text(time + 2, f"text {time // 40}"),
-            detections(time + 3, ["cup", "person"][: time // 10 % 3]),
+            odom(nth * 10, nth / 7, -1.0),
+            tf(nth * 10 + 1, *parts),
+            text(nth * 10 + 2, f"text {nth // 4}"),
+            detections(nth * 10 + 3, ["cup", "person"][: nth % 3]),
         ]
-    return messages
-
-
-def test_small_groups_hold_together_what_one_group_does(tmp_path: Path) -> None:
     # Out of order, so that later groups reach back in time.
-    messages = mixed(40)
     messages = [*messages[:50], *messages[90:], *messages[50:90]]
     path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=1500))
-    reader = McapReader()
     [whole] = groups_of(path)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(decode, "GROUP_BYTES", 1)
-        assert len(list(groups_of(path))) == 1  # one buffer
-        patch.setattr(decode, "GROUP_BYTES", 8000)
-        patch.setattr(bulk, "BATCH_BYTES", 4000)
-        assert len(list(groups_of(path))) > 5
-        tables = tables_of(reader, path)
-    assert compared(reader, path, tables).wrong == []
+    monkeypatch.setattr(decode, "GROUP_BYTES", 1)
+    assert len(list(groups_of(path))) == 1  # one buffer
+    monkeypatch.setattr(decode, "GROUP_BYTES", 8000)
+    monkeypatch.setattr(bulk, "BATCH_BYTES", 4000)
+    assert len(list(groups_of(path))) > 5
+    tables = tables_of(McapReader(), path)
+    assert compared(McapReader(), path, tables).wrong == []
     assert {len(table) for table in tables} == {len(table) for table in whole}
 
 
@@ -209,7 +187,7 @@ def rows_by_bag(tables: Iterable[Table], bag: int | None = None) -> dict[object,
 
 def test_bags_that_are_decoded_together_have_the_rows_that_each_has_alone(tmp_path: Path) -> None:
     reader = McapReader()
-    for seed in range(40):
+    for seed in range(examples(60)):
         draw = random.Random(seed)
         paths = [
             drawn_bag(tmp_path / f"{seed}_{n}.mcap", draw) for n in range(draw.randrange(1, 5))
@@ -231,24 +209,11 @@ def test_bags_that_are_decoded_together_have_the_rows_that_each_has_alone(tmp_pa
         assert rows_by_bag(tables) == alone, seed
 
 
-def image(ns: int, size: int = 3000) -> Msg:
-    """An image, out of a camera."""
-    made = make(
-        "sensor_msgs/msg/Image",
-        header=header(ns, "camera"),
-        height=1,
-        width=size,
-        encoding="mono8",
-        is_bigendian=0,
-        step=size,
-        data=np.zeros(size, np.uint8),
-    )
-    return Msg("/camera", "sensor_msgs/msg/Image", ns, made)
-
-
 def test_images_have_times_alone_and_their_chunks_are_not_read(tmp_path: Path) -> None:
-    messages = [*(image(time) for time in range(10)), *(text(time, "x") for time in range(10, 20))]
-    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=4000))
+    kind = "sensor_msgs/msg/Image"
+    images = [Msg("/camera", kind, time, message(kind, random.Random(1))) for time in range(10)]
+    messages = [*images, *(text(time, "x") for time in range(10, 20))]
+    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=1000))
     spoil_chunk(path, 0)
     [tables] = groups_of(path)
     by_topic = {table.channel.topic: table for table in tables}
@@ -274,16 +239,10 @@ def test_large_messages_of_large_files_have_times_alone(
 
 
 def test_an_array_longer_than_any_message_has_no_columns(tmp_path: Path) -> None:
-    text = f"uint8 known\nfloat64[{10**18}] endless\n".encode()
-
-    def fill(writer: Writer) -> None:
-        schema = writer.register_schema("pkg/msg/Endless", "ros2msg", text)
-        channel = writer.register_channel("/endless", "cdr", schema)
-        writer.add_message(channel, 3, b"\0\1\0\0\7", 3)
-
-    [[table]] = groups_of(raw_mcap(tmp_path / "a.mcap", fill))
-    assert table.log_times.tolist() == [3]
-    assert f"endless is an array of {10**18} elements" in table.left_out[""]
+    endless = DrawnTypes((("Endless", (DrawnField("numbers", "float64", 10**18),)),))
+    [[table]] = groups_of(bag_of(tmp_path / "a.mcap", endless, [b"\0\1\0\0\7"]))
+    assert table.log_times.tolist() == [10]
+    assert f"numbers is an array of {10**18} elements" in table.left_out[""]
 
 
 @pytest.mark.parametrize("broken", [[], [b"\x00\x01\x00\x00\xff\xff\xff\x7f"]])

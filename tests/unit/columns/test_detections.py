@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 
 from ros2_memory.columns.detections import DetectionColumns, Detections, detections_by
@@ -13,7 +12,6 @@ from ros2_memory.columns.table import Table
 from ros2_memory.messages.detections import Detection, detections_of
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
-from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
 from tests.unit.columns.drawn_tables import Drawn, drawn_tables, rounded, stored
 
 if TYPE_CHECKING:
@@ -102,15 +100,3 @@ def test_detections_of_common_types_need_no_reading_and_are_stored_but_for_round
     assert is_settled or any(every)
     for step in (0.0, 1e-6):
         compared(stored(drawn.table, step), drawn.messages, step)
-
-
-@pytest.mark.parametrize(
-    "folder",
-    [
-        pytest.param("recorded", marks=needs_recorded),
-        pytest.param("real", marks=needs_real),
-    ],
-)
-def test_columns_of_shared_bags_detect_what_their_messages_detect(folder: str) -> None:
-    for table, messages in shared_samples(folder):
-        compared(table, messages)

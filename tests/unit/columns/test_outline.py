@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -16,16 +17,11 @@ from hypothesis import strategies as st
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.stored import Letters
 from ros2_memory.columns.table import Texts
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.counts.matches import count_matches
-from ros2_memory.counts.numbers import count_range
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import TimeRange, View
-from ros2_memory.insights.fields import extremes_of
 from tests.support.bags import Msg, odom, text, write_mcap
 from tests.support.column_worlds import World
 from tests.support.examples import examples
+from tests.support.memories import asked, assert_same_counts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -52,10 +48,10 @@ def test_letters_rule_out_no_text_that_has_them(texts: list[str], needle: str) -
         assert (may == has).all()
 
 
-def write_world(folder: Path, draw: Random, hours: float = 1.5) -> None:
+def write_world(folder: Path, draw: Random) -> None:
     """A robot that drives, stands still, and tells in JSON what it sees; some bags are missing."""
     every = draw.choice([4, 10])
-    for number in range(round(hours * 60)):
+    for number in range(40):
         start = T0 + number * 60 * S
         if draw.random() < 0.05:
             continue
@@ -70,57 +66,28 @@ def write_world(folder: Path, draw: Random, hours: float = 1.5) -> None:
         write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
 
 
-def numbers_by(
-    memory: Memory, span: TimeRange, by: Literal["hour", "weekday"], *fields: str
-) -> object:
-    """The answer without its means, which are as exact as columns are."""
-    found = count_range(memory, Call(), "/odom", span, by, fields=fields)
-    rows = [*found.rows, ("", found.all)]
-    cells = [
-        (name, column, value)
-        for name, values in rows
-        for (column, _), value in zip(found.columns, values, strict=True)
-        if not column.endswith(".mean")
-    ]
-    return cells, found.notes
-
-
-def answers(memory: Memory, draw: Random) -> Iterator[object]:
-    first = T0 / S + draw.choice([0, 600, 1234.5])
-    span = TimeRange(first, first + draw.choice([1800, 5000, 9000]))
-    window = TimeWindow(round(first) * S, round(first + 6000) * S)
-    for fields in (["position.x"], ["position.y", "orientation.yaw_deg"], ["position.x", "stamp"]):
-        yield numbers_by(memory, span, "hour", *fields)
-        yield extremes_of(View(memory, Call()), "/odom", window, fields)
-    sought = (
-        "mug",
-        "MUG",
-        "big mug",
-        "tasse",
-        "straße",
-        "éclair",
-        "x7",
-        "seen",
-        "see",
-        "none",
-        "7",
-    )
-    for value in sought:
-        for kind in ("contains", "contains_word"):
-            start, end = span.start_s, span.end_s
-            yield count_matches(
-                memory, Call(), "/seen", kind, value, by="hour", start_s=start, end_s=end
-            )
+def questions(draw: Random) -> Iterator[tuple[str, dict[str, Any]]]:
+    start = T0 / S + draw.choice([0, 600, 1234.5])
+    window = {"start": start, "end": start + draw.choice([1800, 5000])}
+    for fields in (["position.x"], ["position.y", "orientation.yaw_deg"]):
+        asking = {"topic": "/odom", "fields": fields, **window}
+        yield "get_topic_in_range", {**asking, "by": "hour"}
+        yield "get_topic_in_range", asking
+    sought = "mug", "MUG", "big mug", "tasse", "straße", "éclair", "x7", "see", "none", "7"
+    for value, kind in product(sought, ("contains", "contains_word")):
+        condition = {"topic": "/seen", "condition_type": kind, "value": value}
+        yield "find_matches", {**condition, "by": "hour", **window}
 
 
 @pytest.mark.parametrize("seed", range(examples(2)))
 def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
-    with TemporaryDirectory() as folder:
-        write_world(Path(folder), Random(seed), hours=1.0)
-        share = Random(seed).choice([10.0, 0.001])
-        world = World.of(Path(folder), limits=StoreLimits(max_share=share))
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_world(folder, Random(seed))
+        world = World.of(folder, limits=StoreLimits(max_share=[10.0, 0.001][seed % 2]))
         world.fill()
-        plain = answers(world.unstored().memory, Random(seed))
-        started = World.of(Path(folder))  # what it knows it has from the store
-        for found, expected in zip(answers(started.memory, Random(seed)), plain, strict=True):
-            assert found == expected
+        plain = world.unstored().memory
+        started = World.of(folder).memory  # what it knows it has from the store
+        for tool, given_ in questions(Random(seed)):
+            expected = asked(plain, folder, tool, **given_)
+            assert_same_counts(asked(started, folder, tool, **given_), expected, of_means=0.02)

@@ -17,9 +17,8 @@ from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.zones import PartZones, Zones
 from tests.support.bags import make
-from tests.support.examples import LONG, examples
+from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
-from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
 from tests.unit.columns.drawn_tables import (
     Drawn,
     condition_on,
@@ -103,27 +102,6 @@ def test_truth_of_columns_is_that_of_each_message_or_unsure_where_they_were_roun
     for _ in range(4):
         condition = condition_on(values, random)
         judged(table, condition, values)
-
-
-@pytest.mark.parametrize(
-    "folder",
-    [
-        pytest.param("recorded", marks=needs_recorded),
-        pytest.param("real", marks=needs_real),
-    ],
-)
-def test_truth_of_shared_bags_is_that_of_each_message(folder: str) -> None:
-    random = Random(folder)
-    unsure = rows = 0
-    for table, messages in shared_samples(folder):
-        values = [EXTRACTOR.exact(each, table.channel.type) for each in messages]
-        for _ in range(200 if LONG else 4):
-            condition = condition_on(values, random)
-            judged(stored(table, 0.0), condition, values)
-            unsure += judged(table, condition, values)
-            rows += len(values)
-    # Long arrays alone (scans, covariances) are not in the columns.
-    assert 0 < unsure < rows / 10
 
 
 def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
