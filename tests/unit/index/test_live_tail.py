@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
-import anyio
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,10 +24,7 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
-from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.build import build_tools
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
@@ -300,27 +295,3 @@ def test_a_first_split_of_which_nothing_is_on_disk_yet_is_no_empty_memory(tail: 
     reply = tail.asked("get_position_seconds_ago", seconds_ago=1)
     assert reply["reason"] == "not_closed_yet"
     assert reply["detail"] == "nothing of the first split is on disk yet; ask again in 3 s"
-
-
-def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail: Tail) -> None:
-    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0], at=10 * S)
-    later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
-    tail.write("rec/rec_1.mcap", later[: len(later) * 6 // 10], at=12 * S)
-    dispatcher = Dispatcher(
-        tail.memory, build_tools(LIVE), Replies(tail.bag_dir, 24_000), call_timeout_s=25.0
-    )
-    old, new = {"timestamp": T0 / S + 5}, {"timestamp": T0 / S + 11}
-    from_active: list[bool] = []
-
-    async def ask(arguments: dict[str, float]) -> None:
-        reply = json.loads((await dispatcher.answer("get_position_at", arguments)).text)
-        from_active.append(reply.get("from_active", False))
-        assert reply.get("from_active", False) is (arguments is new), reply
-
-    async def go() -> None:
-        async with anyio.create_task_group() as group:
-            for arguments in (old, new) * 20:
-                group.start_soon(ask, arguments)
-
-    anyio.run(go)
-    assert from_active.count(True) == from_active.count(False) == 20

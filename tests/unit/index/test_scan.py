@@ -12,6 +12,7 @@ from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.index.scan import ScanResult, Tree
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import asked, each_way, memory_of
+from tests.unit.core.test_deep_directories import within
 
 S = 10**9
 NOW = 1_800_000_000 * S
@@ -90,7 +91,9 @@ def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_listed_is_damaged_and_hides_no_other(tmp_path: Path) -> None:
     _file(tmp_path / "rec" / "a.mcap")
-    deep = _beyond_the_longest_path(tmp_path)
+    deep = "d" * 250
+    with within(tmp_path, 18, deep):  # longer than any path may be
+        pass
     tree = Tree(tmp_path)
     first, second = tree.scan(NOW, ()), tree.scan(NOW, ())
     assert _names(first) == ["a.mcap"]
@@ -122,19 +125,6 @@ def test_a_root_that_is_no_directory_is_a_problem_and_empties_the_tree(
     bags.unlink(missing_ok=True)
     (tmp_path / "aside").rename(bags)
     assert _names(tree.scan(NOW, ())) == ["a.mcap"]
-
-
-def _beyond_the_longest_path(root: Path) -> str:
-    """Makes a chain of folders longer than any path may be; gives the name of its first."""
-    name = "d" * 250
-    here = os.open(root, os.O_RDONLY)
-    for _ in range(18):
-        os.mkdir(name, dir_fd=here)
-        below = os.open(name, os.O_RDONLY, dir_fd=here)
-        os.close(here)
-        here = below
-    os.close(here)
-    return name
 
 
 def write_odometry(path: Path, speed: float, later: int = 0) -> Path:

@@ -10,6 +10,7 @@ import pytest
 
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import FixedClock
+from tests.support.examples import examples
 from tests.support.plain_text_bags import PlainReader, plain
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def start(tmp_path: Path) -> Start:
     return begun
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(examples(40)))
 def test_whatever_happens_to_known_bags_the_index_is_that_of_one_that_read_them(
     start: Start, seed: int
 ) -> None:
