@@ -1,21 +1,15 @@
 """The shipped schema map, held against the real definitions of its types."""
 
-from __future__ import annotations
-
 from functools import cache
-from typing import TYPE_CHECKING
 
 import pytest
 from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys import get_types_from_msg
 
 from tests.support import bags
 from tests.support.memories import shipped_schemas
 from tests.unit.columns.drawn_tables import VISION_MSGS
-
-if TYPE_CHECKING:
-    from rosbags.interfaces.typing import FieldDesc, Typesdict
-
 
 SPEC = {
     "nav_msgs/msg/Odometry": {

@@ -1,9 +1,9 @@
-from __future__ import annotations
-
 import shutil
 import threading
+from collections.abc import Iterator
 from itertools import count
-from typing import TYPE_CHECKING, Any, cast
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -29,11 +29,6 @@ from tests.support.bags import (
     text,
     typestore,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
 
 RULE = "=" * 80
 CDR = b"\x00\x01\x00\x00"

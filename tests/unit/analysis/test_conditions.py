@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 import json
 import math
 from itertools import count
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -22,9 +19,7 @@ from ros2_memory.analysis.conditions import (
     refusal_for,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
-
-if TYPE_CHECKING:
-    from ros2_memory.core.model import JsonValue
+from ros2_memory.core.model import JsonValue
 
 SCENE: JsonValue = {
     "skill": "scene",

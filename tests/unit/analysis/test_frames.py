@@ -1,12 +1,10 @@
 """Frames in a target frame: tf2's rules, at one time and at many."""
 
-from __future__ import annotations
-
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -25,9 +23,6 @@ from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import StampedTransform, Transform
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, ns_from_unix
 from tests.support.strategies import transforms
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 S = NS_PER_S
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

@@ -1,7 +1,6 @@
-from __future__ import annotations
-
+from collections.abc import Sequence
 from itertools import count
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import pytest
 from hypothesis import given
@@ -17,9 +16,6 @@ from ros2_memory.analysis.silences import (
     usual_periods,
 )
 from ros2_memory.core.spans import united
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 S = 10**9
 MINUTE, HOUR = 60 * S, 3600 * S

@@ -1,17 +1,11 @@
 """Fixtures of the tests of columns."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import pytest
 
 from ros2_memory.columns import decode
+from ros2_memory.columns.plan import Plan
 from ros2_memory.columns.walk import LevelColumns, NotWalkedError, walked
-
-if TYPE_CHECKING:
-    from ros2_memory.columns.plan import Plan
-    from ros2_memory.storage.base import Batch
+from ros2_memory.storage.base import Batch
 
 
 @pytest.fixture

@@ -1,24 +1,19 @@
 """Bags as tables, and the same messages decoded one by one."""
 
-from __future__ import annotations
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
 
-from typing import TYPE_CHECKING, Final
+from mcap.writer import Writer
 
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.table import Table, joined
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import BagReader, Record
 from tests.support.leaves import Comparison
 from tests.support.mcap_surgery import raw_mcap
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from mcap.writer import Writer
-
-    from ros2_memory.storage.base import BagReader, Record
-    from tests.unit.columns.drawn_types import DrawnTypes
+from tests.unit.columns.drawn_types import DrawnTypes
 
 EVERYTHING: Final = TimeWindow.everything()
 

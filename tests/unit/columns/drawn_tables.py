@@ -1,17 +1,18 @@
 """Messages drawn at random as tables, and conditions drawn from what the messages say."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from random import Random
+from typing import Any, Final
 
 import numpy as np
 from hypothesis import strategies as st
+from hypothesis.strategies import DrawFn
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from ros2_memory.analysis.conditions import (
     Beyond,
@@ -28,17 +29,10 @@ from ros2_memory.columns.pack import pack
 from ros2_memory.columns.plan import plan_of
 from ros2_memory.columns.stored import Layout, StoredTable, columns_in, lazy_columns
 from ros2_memory.columns.table import Column, Table, Texts
+from ros2_memory.core.model import JsonValue
 from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import OTHER_ROBOTS, VISION_DEFINITIONS
-
-if TYPE_CHECKING:
-    from random import Random
-
-    from hypothesis.strategies import DrawFn
-    from rosbags.typesys.store import Typestore
-
-    from ros2_memory.core.model import JsonValue
 
 VISION_MSGS: Final = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",

@@ -1,16 +1,12 @@
 """Message types and messages of them, drawn by hypothesis, in the texts that bags hold."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from hypothesis import strategies as st
 from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 NUMBERS: Final = frozenset(
     (

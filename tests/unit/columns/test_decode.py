@@ -1,7 +1,5 @@
 """Decoding whole bags as columns, compared with rosbags leaf by leaf."""
 
-from __future__ import annotations
-
 import random
 import struct
 import tempfile

@@ -1,11 +1,10 @@
 """What decoding a bag as columns does with long, hostile, many, odd and bulky messages."""
 
-from __future__ import annotations
-
 import random
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.stored import columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Texts, order_of
 from ros2_memory.core.errors import BagError
+from ros2_memory.storage.base import Channel
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -41,11 +41,6 @@ from tests.unit.columns.decoded_bags import (
 )
 from tests.unit.columns.drawn_tables import message
 from tests.unit.columns.drawn_types import DrawnField, DrawnTypes
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from ros2_memory.storage.base import Channel
 
 
 def path_message(ns: int, points: int) -> Msg:

@@ -1,8 +1,6 @@
 """What columns say that messages detect: the same as each decoded message."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 from hypothesis import given, settings
@@ -13,10 +11,6 @@ from ros2_memory.messages.detections import Detection, detections_of
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import Drawn, drawn_tables, rounded, stored
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 EXTRACTOR = shipped_extractor()
 SETTLED = (

@@ -1,14 +1,13 @@
 """The queries that docs/reference/files.md shows answer what it says that they do."""
 
-from __future__ import annotations
-
 import os
 import random
 import re
 import sqlite3
 from contextlib import closing
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,9 +16,6 @@ from ros2_memory.columns.fill import StoreLimits
 from tests.support.bags import battery, odom, write_mcap
 from tests.support.column_worlds import World, store_file
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 T0 = 1_700_000_400 * S  # 2023-11-14, 22:20 UTC

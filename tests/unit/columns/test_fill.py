@@ -1,14 +1,13 @@
 """Which bags are stored, when, and for how long; nothing that is in doubt is."""
 
-from __future__ import annotations
-
 import os
 import random
 import sqlite3
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -19,21 +18,16 @@ from ros2_memory.columns import decode, fill, writing
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.fill import Progress, StoreLimits
 from ros2_memory.columns.forget import forget
+from ros2_memory.columns.plan import Plan
+from ros2_memory.columns.table import Table
 from ros2_memory.columns.walk import LevelColumns, walked
 from ros2_memory.columns.writing import ReadBag
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.storage.base import BagReader, Batch, Channel
 from ros2_memory.storage.mcap import bulk
 from tests.support.bags import McapLayout, odom, text, write_db3, write_mcap
 from tests.support.column_worlds import World, check_all, store_file, times
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from ros2_memory.columns.plan import Plan
-    from ros2_memory.columns.table import Table
-    from ros2_memory.storage.base import BagReader, Batch, Channel
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S

@@ -1,13 +1,11 @@
 """What is forgotten leaves no byte in the store's files, nor do bags that retention deleted."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -19,9 +17,6 @@ from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import battery, odom, text, write_mcap
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.fakes import files_limited_to
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S

@@ -1,17 +1,17 @@
 """What follows from parts: stored once, found by other processes, and gone with its parts."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
 
 from ros2_memory.columns.fragments import FragmentKind, from_bytes, to_bytes
 from ros2_memory.columns.pack import compressed
@@ -22,12 +22,6 @@ from ros2_memory.history.view import View
 from tests.support.bags import odom, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.support.examples import examples
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S

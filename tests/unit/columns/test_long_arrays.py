@@ -1,11 +1,11 @@
 """Arrays that are too long to be held: whether a condition holds is answered as from the bags."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import groupby
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import pytest
@@ -27,10 +27,6 @@ from tests.support.bags import (
 )
 from tests.support.column_worlds import World
 from tests.support.memories import asked, each_way, memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
 
 T0: Final = 1_790_000_000 * NS_PER_S
 

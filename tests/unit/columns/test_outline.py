@@ -1,13 +1,12 @@
 """What is known of the columns of a part without them: nothing that the bags do not say."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +21,6 @@ from tests.support.bags import Msg, odom, text, write_mcap
 from tests.support.column_worlds import World
 from tests.support.examples import examples
 from tests.support.memories import asked, assert_same_counts
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S

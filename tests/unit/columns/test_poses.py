@@ -1,22 +1,17 @@
 """The poses of a table are those of its messages, to what the store keeps of them."""
 
-from __future__ import annotations
-
 import math
 import random
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 
 from ros2_memory.columns.poses import NoPoseError, PoseColumns
+from ros2_memory.columns.table import Table
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import Drawn, drawn_of, drawn_tables, message, stored
-
-if TYPE_CHECKING:
-    from ros2_memory.columns.table import Table
 
 EXTRACTOR = shipped_extractor()
 POSED = (

@@ -1,7 +1,5 @@
 """What a scan yields is what the bags say, whatever of them is stored, and since when."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 from collections import Counter
@@ -9,11 +7,12 @@ from collections.abc import Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 from ros2_memory.columns.units import GoneError
+from ros2_memory.columns.zones import PartZones
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.history.view import View
@@ -23,9 +22,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, text, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, check_rows, store_file
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from ros2_memory.columns.zones import PartZones
 
 S = 10**9
 T0 = 1_700_000_000 * S

@@ -1,11 +1,9 @@
 """Extracted values as trees over columns: the same leaves as in each extracted value."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from random import Random
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -23,6 +21,7 @@ from ros2_memory.columns.values import (
     placed,
     seconds,
 )
+from ros2_memory.core.model import JsonValue, Quaternion
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
@@ -37,11 +36,6 @@ from tests.unit.columns.drawn_tables import (
     message,
     paths_of,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from ros2_memory.core.model import JsonValue, Quaternion
 
 EXTRACTOR = shipped_extractor()
 RANDOM = st.randoms(use_true_random=False)

@@ -1,20 +1,15 @@
 """What columns say that messages state: the same as each decoded message."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 from hypothesis import given, settings
 
 from ros2_memory.analysis.facts import LABEL, Facts, State, Word, state_of, stated_by
 from ros2_memory.columns.stated import StatedColumns
+from ros2_memory.columns.table import Table
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import Drawn, drawn_tables, stored
-
-if TYPE_CHECKING:
-    from ros2_memory.columns.table import Table
 
 EXTRACTOR = shipped_extractor()
 SETTLED = (

@@ -1,7 +1,5 @@
 """How exactly a column of floats is stored, by its name and type."""
 
-from __future__ import annotations
-
 import pytest
 
 from ros2_memory.columns.steps import (

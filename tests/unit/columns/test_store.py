@@ -1,12 +1,12 @@
 """The file of the store may be anything at any time, and what its rows mean is pinned."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing
-from typing import TYPE_CHECKING, NoReturn
+from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -29,11 +29,6 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.column_worlds import World, check_all, store_file, times
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
 
 S = 10**9
 T0 = 1_700_000_400 * S

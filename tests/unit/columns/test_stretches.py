@@ -1,14 +1,14 @@
 """What follows from whole parts is joined by stretches of the clock, and goes with any of these."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from ros2_memory.columns import scan
+from ros2_memory.columns.scan import Stretch
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -20,12 +20,6 @@ from ros2_memory.serving import backfill
 from tests.support.bags import McapLayout, Msg, boolean, odom, tf, transform, write_mcap
 from tests.support.column_worlds import World
 from tests.unit.columns.test_fragments import WORDS, Words
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ros2_memory.columns.scan import Stretch
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S

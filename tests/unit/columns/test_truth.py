@@ -1,10 +1,7 @@
 """Conditions over columns: the same as on each decoded message."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from random import Random
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,7 +12,9 @@ from ros2_memory.analysis.conditions import Beyond, Condition
 from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
+from ros2_memory.columns.values import TruthValues
 from ros2_memory.columns.zones import PartZones, Zones
+from ros2_memory.core.model import JsonValue
 from tests.support.bags import make
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
@@ -27,10 +26,6 @@ from tests.unit.columns.drawn_tables import (
     message,
     stored,
 )
-
-if TYPE_CHECKING:
-    from ros2_memory.columns.values import TruthValues
-    from ros2_memory.core.model import JsonValue
 
 EXTRACTOR = shipped_extractor()
 STRING = "std_msgs/msg/String"

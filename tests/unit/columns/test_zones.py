@@ -1,20 +1,14 @@
 """The zones of many parts say the same of each as the zone of that part alone."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys
-from typing import TYPE_CHECKING
 
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ros2_memory.columns.table import Zone, letters_of
 from ros2_memory.columns.zones import Zones
-
-if TYPE_CHECKING:
-    pass
 
 T0 = 1_700_000_000 * 10**9
 NUMBERS = st.one_of(

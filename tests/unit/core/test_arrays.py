@@ -1,7 +1,5 @@
 """Rows of arrays, and arrays that are gathered out of bytes."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

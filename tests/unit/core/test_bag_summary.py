@@ -1,7 +1,5 @@
 """What a bag holds, as numbers and a shape."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from hypothesis import given

@@ -1,11 +1,10 @@
 """Directories nested deeper than a program's stack, its open files or a path can be."""
 
-from __future__ import annotations
-
 import os
 import subprocess
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -15,10 +14,6 @@ from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import keeper_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 DEEP = 1100
 

@@ -1,7 +1,5 @@
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -19,9 +17,6 @@ from ros2_memory.core.geometry import (
 )
 from ros2_memory.core.model import Quaternion, Vector3
 from tests.support.strategies import angles, points, quaternions, ratios
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 paths = st.lists(points, min_size=1, max_size=60)
 # On a coarse grid points coincide, lines are straight and loops close.

@@ -1,7 +1,5 @@
 """The turn to hold much of a bag: one thread has it, the others wait for as long as they may."""
 
-from __future__ import annotations
-
 import threading
 from contextlib import nullcontext
 from functools import partial

@@ -1,12 +1,11 @@
 """Log events: where they go and what they look like."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections import Counter
+from collections.abc import Iterator
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import pytest
 import structlog
@@ -19,9 +18,6 @@ from ros2_memory.core.logging_setup import (
     withheld_warnings,
     withhold_warnings,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @pytest.fixture(autouse=True)

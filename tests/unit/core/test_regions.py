@@ -1,7 +1,5 @@
 """Regions of the plane, and when a path is inside of one."""
 
-from __future__ import annotations
-
 from random import Random
 
 import numpy as np

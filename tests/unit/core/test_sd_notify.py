@@ -1,7 +1,5 @@
 """What is sent to the service manager, over a real socket."""
 
-from __future__ import annotations
-
 import os
 import socket
 

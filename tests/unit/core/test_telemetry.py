@@ -1,7 +1,5 @@
 """What observers receive for each call."""
 
-from __future__ import annotations
-
 from ros2_memory.core.telemetry import Answered, Observer, Telemetry
 from ros2_memory.serving.dispatch import Dispatcher
 from tests.unit.serving.test_dispatch import served, tool, value

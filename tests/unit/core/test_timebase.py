@@ -1,9 +1,7 @@
-from __future__ import annotations
-
 import math
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta, timezone
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -24,9 +22,6 @@ from ros2_memory.core.timebase import (
     unix_rounded_up,
 )
 from tests.support.strategies import moments
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ZONES = ["UTC", "CET-1CEST,M3.5.0,M10.5.0/3", "EST5EDT,M3.2.0,M11.1.0", "<+0545>-5:45"]
 """Written out, so that they do not depend on the machine's time zone files."""

@@ -4,8 +4,6 @@ Questions go through the tools, and their JSON is compared: of memories whose st
 some order, while bags came late, changed and went; of the same bags without a store; of the same
 recordings as one bag each; and with what reading all messages with `mcap` and rosbags finds."""
 
-from __future__ import annotations
-
 import math
 import os
 import random
@@ -17,7 +15,8 @@ from datetime import datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from random import Random
+from typing import Any, Final, NamedTuple
 from unittest.mock import patch
 
 import pytest
@@ -52,9 +51,6 @@ from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of
 from tests.support.random_histories import LATCHED, MS, WORDS, S, write_history
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    from random import Random
 
 T0: Final = 1_700_006_330 * S
 """70 s later ten minutes are over; in most time zones an hour, and in UTC a day."""

@@ -1,8 +1,7 @@
 """An interruption explains what it cost, and no more of a gap."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,9 +15,6 @@ from ros2_memory.bag_dir.state_files import (
 )
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import asked, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 BEGIN = 1_784_000_000

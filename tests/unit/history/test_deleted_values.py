@@ -1,22 +1,17 @@
 """What a latched topic said is not known to hold where messages of it were deleted."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ros2_memory.bag_dir.state_files import Loss, append_losses
+from ros2_memory.history.context import Memory
 from tests.support.bags import McapLayout, Msg, boolean, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import NOW, T0, A, B, S, house_of, kept
 from tests.support.memories import asked, each_way, memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 T0_S = T0 // S
 DOCKED = "/docked"

@@ -1,14 +1,14 @@
 """Messages of one log time in recordings that overlap: one order, however they are stored."""
 
-from __future__ import annotations
-
 import random
 from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.columns import decode
 from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.history.context import Memory
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -33,12 +34,6 @@ from tests.support.bags import (
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
 from tests.support.random_histories import MS, S
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from random import Random
-
-    from ros2_memory.history.context import Memory
 
 T0: Final = 1_700_006_400 * S
 SPAN: Final = {"start": T0 / S - 5, "end": T0 / S + 200}

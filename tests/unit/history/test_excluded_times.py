@@ -1,18 +1,14 @@
 """What was excluded was recorded: it is no gap, no silence and no event of the recording."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.support.bags import Msg, odom, text
 from tests.support.memories import asked, memory_of
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, words
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 T0_S = T0 // S
 

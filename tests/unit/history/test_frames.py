@@ -1,14 +1,11 @@
 """Transforms: the same however they are cut or stored, and whose hold at which time."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 from unittest.mock import Mock
 
 import pytest
@@ -36,9 +33,6 @@ from tests.support.bags import (
 )
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
-
-if TYPE_CHECKING:
-    pass
 
 S = 10**9
 T0 = 1_784_000_000 * S

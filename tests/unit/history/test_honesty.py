@@ -1,9 +1,8 @@
 """What could not be read is part of every answer, and a wrong clock spoils none."""
 
-from __future__ import annotations
-
 import os
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,10 +22,6 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 S = 10**9
 T0_S = 1_784_023_200

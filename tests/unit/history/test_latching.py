@@ -1,10 +1,9 @@
 """Latched is what holds until the next message, and not all that is transient local."""
 
-from __future__ import annotations
-
 import json
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,11 +25,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.housekeepers import keeper_of
-from tests.support.memories import each_way, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
+from tests.support.memories import memory_of
 
 S = 10**9
 T0 = 1_790_000_000 * S
@@ -65,17 +60,6 @@ def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
     return shown
 
 
-@each_way
-def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls: bool) -> None:
-    telemetry = every(0.01, 7, TELEMETRY)
-    record(tmp_path, [*telemetry, *drive(T0, T0 + 60 * S)])
-    memory = remembered(tmp_path, recalls=recalls)
-    assert reply(memory, TELEMETRY, T0 + 3 * S)["timestamp"] == unix_from_ns(T0 + 3 * S)
-    assert "latched" not in reply(memory, TELEMETRY, T0 + 3 * S)
-    assert set(reply(memory, TELEMETRY, T0 + 30 * S)) == {"error"}
-    assert set(reply(memory, TELEMETRY, T0 + 365 * 86_400 * S)) == {"error"}
-
-
 @pytest.mark.parametrize(
     ("latched_s", "drive_s", "holds"),
     [
@@ -94,10 +78,11 @@ def test_what_is_published_every_five_seconds_or_less_often_holds(
 ) -> None:
     latched = [text(T0 + round(at * S), "office", MAP) for at in latched_s]
     record(tmp_path, [*latched, *drive(T0, T0 + drive_s * S)])
-    found = reply(remembered(tmp_path), MAP, latched[-1].log_time + 3 * S)
-    assert ("error" not in found) is holds
-    if holds:
-        assert (found["latched"], found["age_s"]) == (True, 3.0)
+    for recalls in (False, True):
+        found = reply(remembered(tmp_path, recalls=recalls), MAP, latched[-1].log_time + 3 * S)
+        assert ("error" not in found) is holds
+        if holds:
+            assert (found["latched"], found["age_s"]) == (True, 3.0)
 
 
 def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) -> None:

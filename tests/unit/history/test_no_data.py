@@ -3,10 +3,9 @@
 A window in which nothing was recorded has no answer: "never" and "none" would be false.
 """
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,9 +16,6 @@ from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import boolean, detections, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 T0_S = 1_784_023_200

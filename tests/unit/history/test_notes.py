@@ -1,7 +1,5 @@
 """Notes on what could not be read: one for each reason, and no reply cut into pieces."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from pathlib import Path

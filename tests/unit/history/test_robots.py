@@ -1,10 +1,9 @@
 """Robots that were plainly mixed into one history are named, and one robot never is."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,10 +13,6 @@ from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 S = 10**9
 T0_S = 1_700_000_000

@@ -1,9 +1,9 @@
 """Time 0 is a moment like any other, and what stands for no bound reaches no reply."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 
@@ -11,11 +11,6 @@ from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, replied
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
 
 S = 10**9
 Now = Literal["wall", "latest"]

@@ -1,14 +1,13 @@
 """Many bags read as one history, in which each message counts once."""
 
-from __future__ import annotations
-
 import os
 import random
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -26,10 +25,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, log_entry, odom, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
-    from pathlib import Path
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9

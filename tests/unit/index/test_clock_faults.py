@@ -1,12 +1,9 @@
 """Bags that a wrong clock dated, and the span that is reported without them."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.model import BagFile
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS
 from ros2_memory.index.clock_faults import (
     FIRST_BAGS_NS,
@@ -18,9 +15,6 @@ from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import StepBack
 from ros2_memory.index.timeline import Timeline
 from tests.support.listed_bags import odom_bag
-
-if TYPE_CHECKING:
-    from ros2_memory.core.model import BagFile
 
 S = 10**9
 HOUR = 3600 * S

@@ -1,7 +1,5 @@
 """How a bag file stands."""
 
-from __future__ import annotations
-
 import os
 from itertools import count
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Files that the recorder holds back: no index serves them, whatever they are."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +11,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.coverage import describe_excluded, unread_spans
 from ros2_memory.history.view import AtTime
 from ros2_memory.index.file_state import HELD_BACK
+from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.policy import RetentionLimits
@@ -22,11 +21,6 @@ from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, words
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.index.snapshot import Snapshot
 
 OPEN = McapLayout(latched=frozenset({"/privacy_mode"}), finish=False, chunk_size=256)
 

@@ -1,15 +1,13 @@
 """An index that followed every change knows what a fresh one finds."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,9 +22,6 @@ from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.heartbeats import beat
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 S = 10**9
 NOW = 1_800_000_000 * S

@@ -1,22 +1,16 @@
 """What metadata.yaml lists is read once."""
 
-from __future__ import annotations
-
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
+from ros2_memory.history.context import Memory
 from ros2_memory.index import listed_splits
 from ros2_memory.index.listed_splits import Absent
 from tests.support.bags import text, write_mcap
 from tests.support.memories import memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 T0 = 1_700_000_000 * 10**9
 LONG_AGO = (T0 / 1e9, T0 / 1e9)

@@ -1,12 +1,11 @@
 """What answers of a file that is still being written: all that is whole, and nothing else."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -30,10 +29,6 @@ from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 
 S = 10**9
 T0 = 1_784_023_200 * S

@@ -1,7 +1,5 @@
 """Recordings that overlap in time: which are answered together, and which are one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

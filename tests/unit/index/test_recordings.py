@@ -1,24 +1,18 @@
 """One recording of a bag directory: the index of it alone finds what a scan of it does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.recordings import name_of, recordings_of
+from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import LAST_WRITTEN
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.index.snapshot import Snapshot
 
 T0 = 1_700_000_000
 

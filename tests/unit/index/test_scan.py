@@ -1,7 +1,5 @@
 """Walking the bag directory."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

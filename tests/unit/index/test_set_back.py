@@ -1,7 +1,5 @@
 """A clock that is set back while one bag is being written."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,7 +1,5 @@
 """Bags in time order, and what follows from them."""
 
-from __future__ import annotations
-
 import random
 
 import pytest
@@ -10,6 +8,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index import timeline as timelines
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
@@ -41,6 +40,7 @@ def test_what_is_absent_within_a_bag_leaves_the_other_topics_of_it_alone() -> No
     assert [snapshot.longest_silence(topic) for topic in ("/odom", "/seen")] == [0, 300 * S]
 
 
+NAMES = ("rec/{}.mcap", "rec/rec_{:021}.mcap.zstd", "/bägs/._{}", "/{}", "a/{}.db3", "b/x{}y")
 bag_times = st.tuples(st.integers(0, 3000), st.integers(0, 200))
 
 
@@ -76,14 +76,24 @@ def _random_bag(chance: random.Random, number: int) -> BagFile:
     topics = chance.sample(["/odom", "/tf", "/tf_static", "/scan"], chance.randint(1, 3))
     spans = [(topic, start, start + chance.randrange(2000 if long else 20)) for topic in topics]
     type_name = chance.choice([ODOM, "std_msgs/msg/String"])
-    return _bag(f"rec/{number}.mcap", *spans, silent=("/idle",), type_name=type_name)
+    name = chance.choice(NAMES).format(number)
+    bag = _bag(name, *spans, silent=("/idle",), type_name=type_name)
+    if chance.random() < 0.8:
+        return bag
+    odd = BagSummary(bag.summary.topics, silent=("/idle",), notes=("odd",))
+    return bag._replace(summary=odd, size=2**62, mtime_ns=chance.choice([MIN_NS, MAX_NS]))
 
 
 def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[int, int]]) -> None:
     ordered = sorted(bags, key=lambda bag: (bag.start, bag.end, bag.path))
     held = [(bag, topic) for bag in ordered for topic in bag.summary.topics]
     names = sorted({topic.topic for _, topic in held})
-    assert [*timeline.bags] == ordered
+    assert [*timeline.bags] == [*reversed([*reversed(timeline.bags)])] == ordered
+    assert [timeline.bags.recording(at) for at in range(len(bags))] == [
+        bag.recording for bag in ordered
+    ]
+    everything = TimeWindow.everything()
+    assert {*timeline.faulty(everything)} == {bag for bag in bags if bag.summary.notes}
     snapshot = Snapshot(timeline)
     assert snapshot.earliest == min((bag.start for bag in bags), default=None)
     assert snapshot.latest == max((bag.end for bag in bags), default=None)

@@ -1,20 +1,15 @@
 """The order in which splits were written, and what it tells of clocks and of what lies between."""
 
-from __future__ import annotations
-
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.model import BagFile
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import split_names_of, split_of, stem_of, steps_of
 from ros2_memory.index.timeline import Timeline
 from tests.support.listed_bags import odom_bag
-
-if TYPE_CHECKING:
-    from ros2_memory.core.model import BagFile
 
 S = 10**9
 

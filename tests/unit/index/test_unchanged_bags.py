@@ -1,23 +1,17 @@
 """Bags that the catalogue knows are taken over unread, and woken by whatever happens to them."""
 
-from __future__ import annotations
-
 import os
 import random
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
+from ros2_memory.index.bag_rows import BagRows
+from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import FixedClock
 from tests.support.examples import examples
 from tests.support.plain_text_bags import PlainReader, plain
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.index.bag_rows import BagRows
-    from ros2_memory.index.snapshot import Snapshot
 
 S = 10**9
 NOW = 1_800_000_000 * S

@@ -1,7 +1,5 @@
 """When the messages of a file that cannot be read may have been recorded."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 

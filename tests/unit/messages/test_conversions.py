@@ -1,7 +1,5 @@
 """Fields of messages, and what is converted."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,18 +1,16 @@
 """Messages as JSON: exactly, and short, thinned and rounded for a reply."""
 
-from __future__ import annotations
-
 import json
 import math
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.model import JsonValue
 from ros2_memory.messages.to_json import (
     MAX_DEPTH,
     ExactJson,
@@ -23,9 +21,6 @@ from ros2_memory.messages.to_json import (
     round_single,
 )
 from tests.support import bags
-
-if TYPE_CHECKING:
-    from ros2_memory.core.model import JsonValue
 
 
 def shown(node: object, limit: int = 50, path: str = "") -> tuple[JsonValue, tuple[str, ...]]:

@@ -1,14 +1,13 @@
 """What `storage/base.py` promises of a `BagReader`, checked with every adapter."""
 
-from __future__ import annotations
-
 import os
 import tempfile
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import pytest
 from hypothesis import given, settings
@@ -24,10 +23,6 @@ from ros2_memory.storage.base import BagReader, Batch, Closing, Record
 from tests.support.bags import Msg, boolean, odom, text, tf, transform
 from tests.support.examples import examples
 from tests.support.reader_cases import FILES, Shelf
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
-
 
 on_every_shelf = pytest.mark.parametrize("shelf", FILES, ids=str)
 

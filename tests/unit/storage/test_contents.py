@@ -1,7 +1,5 @@
 """What the messages of a file amount to, however it is read."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st

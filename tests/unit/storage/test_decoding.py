@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from ros2_memory.core.errors import UndecodableError

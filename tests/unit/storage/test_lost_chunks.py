@@ -3,10 +3,10 @@
 A damaged index costs none, and is reported too.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,18 +17,13 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
+from ros2_memory.results import Match
+from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
 from tests.support.memories import memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from ros2_memory.results import Match
-    from ros2_memory.storage.base import BagReader
 
 S = 10**9
 T0 = 1_700_000_000 * S

@@ -1,8 +1,7 @@
-from __future__ import annotations
-
 import struct
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.opcode import Opcode
@@ -14,6 +13,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import BagReader, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.fuzz.records import message
@@ -30,11 +30,6 @@ from tests.support.mcap_surgery import (
     spoil_chunk,
 )
 from tests.support.memories import asked, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.storage.base import BagReader, Record
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"

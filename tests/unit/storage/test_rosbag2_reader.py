@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import gc
 import os
 import shutil
@@ -9,9 +7,9 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 import zstandard
@@ -34,10 +32,6 @@ from tests.support.bags import (
 from tests.support.mcap_surgery import chatter
 from tests.support.memories import asked, memory_of
 from tests.unit.storage.test_mcap_reader import read, times
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"

@@ -1,13 +1,12 @@
 """What a small file may make its reader do: hold no more, and work no longer, than it is worth."""
 
-from __future__ import annotations
-
 import random
 import sqlite3
 import struct
 import tracemalloc
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
@@ -44,10 +43,6 @@ from tests.fuzz.records import (
     without_summary,
 )
 from tests.support.bags import Msg, text, write_db3
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 MB = 1 << 20
 TOO_LONG = "a" * MAX_NAMES_CHARS

@@ -1,9 +1,8 @@
 """Files whose writer never finished them: killed, out of disk, or without power."""
 
-from __future__ import annotations
-
 import random
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from mcap.writer import CompressionType
@@ -13,10 +12,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
 from tests.unit.storage.test_mcap_reader import read, times
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 @pytest.mark.parametrize("layout", [McapLayout(), SMALL, McapLayout(chunk_size=None)])

@@ -1,28 +1,22 @@
 """Poses as arrays, and what is measured of them in slices of the clock."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     BLOCK_NS,
+    SpeedDrop,
     Standstill,
     stands_of,
     standstills_of,
 )
 from ros2_memory.analysis.motion.trajectory import SLICE_NS, PathSlice, joined_slices, path_slice
 from ros2_memory.analysis.poses import FrameCodes, Poses
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from ros2_memory.analysis.motion.standstills import SpeedDrop
-    from ros2_memory.core.model import Quaternion, Vector3
+from ros2_memory.core.model import Quaternion, Vector3
 
 
 def posed(

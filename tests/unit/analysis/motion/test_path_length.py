@@ -1,27 +1,21 @@
 """How far, how fast and where a robot drove, by poses with noise, gaps, resets and turns."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Callable, Iterable
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.analysis.motion.trajectory import Trajectory
+from ros2_memory.analysis.poses import Poses
+from ros2_memory.core.model import Vector3
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import examples
 from tests.support.strategies import points
 from tests.unit.analysis.motion.posed import posed, way_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.analysis.poses import Poses
-    from ros2_memory.core.model import Vector3
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S

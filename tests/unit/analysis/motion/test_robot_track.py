@@ -1,7 +1,5 @@
 """The track of the robot: few vertices, and near every pose at its time."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from random import Random

@@ -1,7 +1,5 @@
 """Where a robot stood still, or slowed down suddenly."""
 
-from __future__ import annotations
-
 import math
 import random
 from itertools import count, pairwise

@@ -1,11 +1,9 @@
 """Batches of MCAP files that are damaged, lie, or are made as few writers make them."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,6 +14,7 @@ from mcap.writer import CompressionType
 
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import Batch, Record
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap.bulk import ReadChunks
@@ -24,11 +23,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.examples import examples
 from tests.support.mcap_surgery import SMALL, chatter, damaged
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from ros2_memory.storage.base import Batch, Record
 
 EVERYTHING = TimeWindow.everything()
 TOPICS = ("/chatter", "/bumper")

@@ -1,8 +1,7 @@
-from __future__ import annotations
-
 import random
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -20,9 +19,6 @@ from tests.support.examples import examples
 from tests.support.fakes import files_limited_to
 from tests.support.reader_cases import LAYOUTS
 from tests.support.shared_bags import REAL, needs_real
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 T0 = 1_790_000_000 * S
