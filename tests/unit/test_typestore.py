@@ -1,5 +1,4 @@
 import shutil
-import threading
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -23,10 +22,7 @@ from ros2_memory.typestore import (
 from tests.support.bags import (
     VISION_DEFINITIONS,
     Msg,
-    definition,
     detections,
-    odom,
-    text,
     typestore,
 )
 
@@ -300,24 +296,6 @@ class TestFolders:
         missing.mkdir()
         with pytest.raises(ConfigError, match=r"missing holds no msg/\*\.msg file"):
             Typestores([missing])
-
-
-def test_threads_that_look_up_at_once_get_one_type() -> None:
-    stores = Typestores()
-    messages = [odom(1, 2.0, 3.0), detections(1, ["cup"]), text(1, "x")]
-    answers: list[tuple[str, str]] = []
-
-    def ask() -> None:
-        for message in messages:
-            found = stores.lookup(message.type, "ros2msg", definition(message.type).encode())
-            answers.append((message.type, repr(decoded(found, message.payload))))
-
-    threads = [threading.Thread(target=ask) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert sorted(answers) == sorted((m.type, oracle(m)) for m in messages * 8)
 
 
 def cached_texts(stores: Typestores) -> list[bytes]:

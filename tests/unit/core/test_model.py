@@ -1,7 +1,7 @@
 import math
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -10,21 +10,8 @@ from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     ns_from_unix,
     unix_from_ns,
-    unix_rounded_up,
 )
 from tests.support.strategies import moments
-
-small = st.integers(-20, 20)
-windows = st.builds(TimeWindow, small, small)
-
-
-@given(moments, st.integers(0, 10**15))
-@example(1_784_023_200_123_001_001, 0)  # is rounded up by almost a microsecond
-def test_a_window_of_two_timestamps_holds_both_of_their_messages(first: int, span: int) -> None:
-    last = first + span
-    window = TimeWindow.from_unix(unix_rounded_up(first), unix_rounded_up(last))
-    assert window.contains(first)
-    assert window.contains(last)
 
 
 @given(moments, st.integers(0, 10**15))
@@ -51,20 +38,3 @@ def test_a_window_whose_start_is_after_its_end_is_refused_with_both_bounds() -> 
 def test_a_bound_that_is_no_number_is_refused(bounds: tuple[float, float]) -> None:
     with pytest.raises(InvalidArgumentsError, match="Unix seconds"):
         TimeWindow.from_unix(*bounds)
-
-
-@given(windows, windows, small)
-def test_an_intersection_contains_what_both_contain(
-    a: TimeWindow, b: TimeWindow, moment: int
-) -> None:
-    assert a.intersect(b).contains(moment) == (a.contains(moment) and b.contains(moment))
-
-
-@given(windows, small, st.integers(0, 10))
-def test_overlapping_and_covering_count_the_moments_of_a_span(
-    window: TimeWindow, first: int, length: int
-) -> None:
-    inside = [window.contains(moment) for moment in range(first, first + length + 1)]
-    if not window.empty:
-        assert window.overlaps(first, first + length) == any(inside)
-    assert window.covers(first, first + length) == all(inside)

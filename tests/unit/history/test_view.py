@@ -52,27 +52,24 @@ def times(view: View, topic: str, *, newest_first: bool = False) -> list[int]:
     return [each.time for each in found]
 
 
-def test_a_bag_that_fails_is_named_and_the_others_still_answer(tmp_path: Path) -> None:
+def test_a_bag_that_fails_is_named_and_the_others_still_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     broken = recorded(tmp_path, "a", [odom(T0, 0, 0)])
     recorded(tmp_path, "b", [odom(T0 + 60 * S, 1, 0)])
+    records = McapReader.records
 
-    class Failing(McapReader):
-        def records(
-            self,
-            path: Path,
-            topics: Collection[str],
-            window: TimeWindow,
-            *,
-            newest_first: bool = False,
-        ) -> Iterator[Record]:
-            if path == broken:
-                raise BagError(str(path), "the disk returned an error")
-            return super().records(path, topics, window, newest_first=newest_first)
+    def failing(reader: McapReader, path: Path, *given: Any, **named: Any) -> Iterator[Record]:
+        if path == broken:
+            raise BagError(str(path), "the disk returned an error")
+        return records(reader, path, *given, **named)
 
-    view = View(memory_of(tmp_path, reader=Failing()), Call())
+    monkeypatch.setattr(McapReader, "records", failing)
+    view = view_of(tmp_path)
     assert times(view, "/odom") == [T0 + 60 * S]
-    [note] = view.notes.sentences()
-    assert note == "a/a_0.mcap could not be read to its end: the disk returned an error"
+    assert view.notes.sentences() == (
+        "a/a_0.mcap could not be read to its end: the disk returned an error",
+    )
     assert not view.notes.complete
 
 

@@ -14,18 +14,16 @@ from ros2_memory.messages.detections import (
 )
 from tests.support.strategies import json_values
 
-AT: JsonValue = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}}
+FLAT: dict[str, JsonValue] = {"x": 1.0, "y": 2.0, "z": 3.0}
+AT: JsonValue = {"position": FLAT}
 
 
 @pytest.mark.parametrize(
     ("value", "label", "frame"),
     [
-        pytest.param(
-            {"results": [{"id": "cup", "score": 0.5, "pose": {"pose": AT}}]},
-            *("cup", "camera"),
-            id="vision_msgs 2",
-        ),
-        pytest.param(
+        # vision_msgs 2, yolo_msgs, a number alone, aruco_msgs, and a stamped pose
+        ({"results": [{"id": "cup", "score": 0.5, "pose": {"pose": AT}}]}, "cup", "camera"),
+        (
             {
                 "class_id": 41,
                 "class_name": "cup",
@@ -33,30 +31,19 @@ AT: JsonValue = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}}
                 "id": "3",
                 "bbox3d": {"center": AT, "frame_id": "base_link"},
             },
-            *("cup", "base_link"),
-            id="yolo_msgs",
+            "cup",
+            "base_link",
         ),
-        pytest.param(
-            {"class_id": 41, "score": 0.5, "pose": AT}, "41", "camera", id="a number alone"
-        ),
-        pytest.param(
-            {"id": 7, "confidence": 0.5, "pose": {"pose": AT}}, "7", "camera", id="aruco_msgs"
-        ),
-        pytest.param(
+        ({"class_id": 41, "score": 0.5, "pose": AT}, "41", "camera"),
+        ({"id": 7, "confidence": 0.5, "pose": {"pose": AT}}, "7", "camera"),
+        (
             {"label": "cup", "score": 0.5, "pose": {"header": {"frame_id": "map"}, "pose": AT}},
-            *("cup", "map"),
-            id="a stamped pose",
+            "cup",
+            "map",
         ),
-        pytest.param(
-            {"name": "cup", "class": 41, "confidence": 0.5, "pose": {"x": 1, "y": 2, "z": 3}},
-            *("cup", "camera"),
-            id="JSON of ultralytics",
-        ),
-        pytest.param(
-            {"category": "cup", "confidence": 0.5, "x": 1, "y": 2, "z": 3},
-            *("cup", "camera"),
-            id="JSON with a flat place",
-        ),
+        # JSON of ultralytics, and with a flat place
+        ({"name": "cup", "class": 41, "confidence": 0.5, "pose": FLAT}, "cup", "camera"),
+        ({"category": "cup", "confidence": 0.5, **FLAT}, "cup", "camera"),
     ],
 )
 def test_detections_are_named_and_placed_as_common_packages_do(
@@ -70,29 +57,19 @@ def test_detections_are_named_and_placed_as_common_packages_do(
 
 
 @pytest.mark.parametrize(
-    ("value", "expected"),
+    ("value", "label", "place", "score"),
     [
-        pytest.param(
-            {"family": "tag36h11", "id": 7, "pose": {"pose": {"pose": AT}}},
-            Detection("7", (1.0, 2.0, 3.0), "camera"),
-            id="isaac_ros_apriltag_interfaces",
-        ),
-        pytest.param(
-            {"marker_id": 7, "pose": AT},
-            Detection("7", (1.0, 2.0, 3.0), "camera"),
-            id="aruco_opencv_msgs",
-        ),
-        pytest.param(
-            {"Class": "cup", "probability": 0.5, "xmin": 1, "id": 41},
-            Detection("cup", None, "camera", 0.5),
-            id="darknet_ros_msgs of ROS 1",
-        ),
+        # isaac_ros_apriltag_interfaces, aruco_opencv_msgs, and darknet_ros_msgs of ROS 1
+        ({"family": "tag36h11", "id": 7, "pose": {"pose": {"pose": AT}}}, "7", True, None),
+        ({"marker_id": 7, "pose": AT}, "7", True, None),
+        ({"Class": "cup", "probability": 0.5, "xmin": 1, "id": 41}, "cup", False, 0.5),
     ],
 )
 def test_detections_of_types_without_a_label_have_the_name_that_the_type_gives(
-    value: JsonValue, expected: Detection
+    value: JsonValue, label: str, place: bool, score: float | None
 ) -> None:
-    assert detections_of([value], "camera") == (expected,)
+    found = Detection(label, (1.0, 2.0, 3.0) if place else None, "camera", score)
+    assert detections_of([value], "camera") == (found,)
 
 
 @pytest.mark.parametrize(

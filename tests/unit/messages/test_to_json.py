@@ -2,7 +2,6 @@
 
 import json
 import math
-from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +14,6 @@ from ros2_memory.messages.to_json import (
     MAX_DEPTH,
     ExactJson,
     ReplyJson,
-    evenly,
     round_integer,
     round_real,
     round_single,
@@ -40,18 +38,6 @@ def test_exactly_nan_stays_and_shown_it_is_null() -> None:
     assert math.isnan(kept["a"])
     assert kept["b"] == [1.0, math.inf]
     assert shown(node) == ({"a": None, "b": [1, None]}, ())
-
-
-def test_a_magnetic_field_keeps_its_microtesla() -> None:
-    earth = bags.make(
-        "sensor_msgs/msg/MagneticField",
-        header=bags.header(0, "imu"),
-        magnetic_field=bags.vector3(2.15e-5, -1.2e-6, 4.31e-5),
-        magnetic_field_covariance=np.zeros(9),
-    )
-    value, _ = shown(earth)
-    assert isinstance(value, dict)
-    assert value["magnetic_field"] == {"x": 2.15e-5, "y": -1.2e-6, "z": 4.31e-5}
 
 
 def test_numpy_scalars_become_values_of_python() -> None:
@@ -188,13 +174,3 @@ def test_ints_of_64_bits_leave_as_they_are_and_longer_ones_as_floats() -> None:
     assert round_integer(-(2**63)) == -(2**63)
     assert round_integer(10**30) == 1e30
     assert round_integer(10**5000) is None
-
-
-@given(st.integers(0, 5000), st.integers(1, 600))
-def test_the_first_and_the_last_are_kept_and_steps_differ_by_one(count: int, at_most: int) -> None:
-    kept = evenly(count, at_most)
-    steps = [later - earlier for earlier, later in pairwise(kept)]
-    assert all(step >= 1 for step in steps)
-    assert not steps or max(steps) - min(steps) <= 1
-    # A single place goes to the newest.
-    assert not count or (kept[0], kept[-1]) == (0 if at_most > 1 else count - 1, count - 1)
