@@ -68,7 +68,6 @@ UNMEASURED: Final = (
     "test_region_visits.py",
     "test_reply_size.py",
     "test_repository.py",
-    "test_same_answers.py",
     "test_standstills.py",
     "test_storage_limits.py",
     "test_thinned_moments.py",

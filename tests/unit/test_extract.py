@@ -59,20 +59,6 @@ def test_more_detections_than_the_limit_are_thinned_with_a_note_and_whole_for_co
 # Types without an entry, and JSON
 
 
-def test_a_type_without_an_entry_is_shown_with_all_its_fields() -> None:
-    body = bags.make(
-        "sensor_msgs/msg/Temperature",
-        header=bags.header(1_500_000_000, "engine"),
-        temperature=21.5,
-        variance=0.0,
-    )
-    assert shown(body, "sensor_msgs/msg/Temperature") == {
-        "header": {"stamp": 1.5, "frame_id": "engine"},
-        "temperature": 21.5,
-        "variance": 0,
-    }
-
-
 def test_a_type_named_as_before_2019_is_found_in_the_map() -> None:
     assert shown(odometry(), "nav_msgs/Odometry") == shown(odometry(), ODOMETRY)
 
@@ -165,25 +151,16 @@ def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> Non
         )
 
 
-def tf_message(*transforms: object) -> object:
-    return decoded(bags.tf(NS, *transforms))
-
-
 def test_transforms_that_tf_refuses_are_left_out() -> None:
-    good = bags.transform(NS, "odom", "base_link", (0.0, 0.0, 0.0))
-    bad: list[Any] = [bags.transform(NS, "a", "b", (0.0, 0.0, 0.0)) for _ in range(2)]
-    bad[0].transform.rotation = quaternion(0.0, 0.0, 0.0, 0.0)
-    bad[1].transform.rotation = quaternion(math.nan, 0.0, 0.0, 1.0)
-    message = tf_message(
-        *bad,
-        bags.transform(NS, "a", "b", (math.nan, 0.0, 0.0)),
-        bags.transform(NS, "a", "b", (0.0, math.inf, 0.0)),
-        bags.transform(NS, "same", "/same", (0.0, 0.0, 0.0)),
-        bags.transform(NS, "", "b", (0.0, 0.0, 0.0)),
-        bags.transform(NS, "a", "", (0.0, 0.0, 0.0)),
-        good,
-    )
-    left = EXTRACTOR.transforms(message, NS, static=False)
+    edges = [("same", "/same"), ("", "b"), ("a", ""), ("odom", "base_link")]
+    moved = [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0)]
+    made: list[Any] = [
+        *(bags.transform(NS, "a", "b", xyz) for xyz in [*moved, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)]),
+        *(bags.transform(NS, *edge, (0.0, 0.0, 0.0)) for edge in edges),
+    ]
+    made[2].transform.rotation = quaternion(0.0, 0.0, 0.0, 0.0)
+    made[3].transform.rotation = quaternion(math.nan, 0.0, 0.0, 1.0)
+    left = EXTRACTOR.transforms(decoded(bags.tf(NS, *made)), NS, static=False)
     # an edge without a parent is part of what was recorded, though no lookup goes through it
     assert [edge.child for edge in left] == ["b", "base_link"]
 

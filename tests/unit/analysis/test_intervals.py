@@ -10,7 +10,6 @@ from ros2_memory.analysis.intervals import (
     SILENCE_NS,
     IntervalPart,
     VisibleInterval,
-    joined,
     united,
     visible_in,
 )
@@ -87,23 +86,6 @@ def test_a_thing_is_in_view_as_long_as_it_is_missed_for_a_moment_only(messages: 
     assert [*seen.scoring(0.7).intervals()] == [
         each for each in rounded if each.best is None or each.best >= 0.7
     ]
-
-
-@given(histories(), st.data())
-def test_where_messages_are_cut_into_parts_changes_nothing(
-    messages: Messages, data: st.DataObject
-) -> None:
-    cuts = sorted(
-        data.draw(st.sets(st.integers(1, len(messages) - 1), max_size=6))
-        if len(messages) > 1
-        else []
-    )
-    edges = zip([0, *cuts], [*cuts, len(messages)], strict=True)
-    parts = [watched(messages[begin:end]) for begin, end in edges]
-    assert joined(parts) == watched(messages)
-    if len(parts) > 2:
-        at = data.draw(st.integers(1, len(parts) - 1))
-        assert joined([joined(parts[:at]), joined(parts[at:])]) == watched(messages)
 
 
 @given(st.lists(histories(), min_size=1, max_size=3))

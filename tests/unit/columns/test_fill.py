@@ -3,10 +3,9 @@
 import os
 import random
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.bootstrap import build_repairer
-from ros2_memory.columns import decode, fill, writing
+from ros2_memory.columns import decode, fill
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.fill import Progress, StoreLimits
 from ros2_memory.columns.forget import forget
@@ -24,7 +23,7 @@ from ros2_memory.columns.walk import LevelColumns, walked
 from ros2_memory.columns.writing import ReadBag
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.storage.base import BagReader, Batch, Channel
+from ros2_memory.storage.base import BagReader, Batch
 from ros2_memory.storage.mcap import bulk
 from tests.support.bags import McapLayout, odom, text, write_db3, write_mcap
 from tests.support.column_worlds import World, check_all, store_file, times
@@ -73,35 +72,6 @@ def test_bags_that_cannot_be_stored_together_are_stored_alone_but_for_the_faulty
     check_all(world)
 
 
-def test_copies_of_a_long_bag_are_recognised_before_it_is_stored_again(tmp_path: Path) -> None:
-    """Its parts of ten minutes have some of its messages each."""
-    poses = [odom(T0 + n * 5 * S, n / 7, 0.0) for n in range(300)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
-    world = World.of(tmp_path)
-    world.fill()
-    assert count(world, "part") == 3
-    again = [
-        odom(T0 + n * 5 * S, n / 7, 0.0, log_time=T0 + n * 5 * S + 99) for n in range(150, 160)
-    ]
-    write_mcap(tmp_path / "rec_b" / "rec_b_0.mcap", again)
-    assert check_all(world) == 300
-
-
-def test_a_topic_with_many_messages_has_several_parts_and_those_of_one_time_are_in_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writing, "_MOST_ROWS", 10)
-    poses = [odom(T0 + n // 4 * S, n / 7, 0.0) for n in range(50)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
-    world = World.of(tmp_path)
-    world.fill()
-    with closing(sqlite3.connect(store_file(tmp_path))) as base:
-        parts = base.execute("SELECT messages, first_ns, last_ns FROM part ORDER BY id").fetchall()
-    assert [messages for messages, *_ in parts] == [8, 12, 8, 12, 10]
-    assert all(before[2] < after[1] for before, after in pairwise(parts))
-    assert check_all(world) == 50
-
-
 # Bags that a crash cut short
 
 
@@ -141,29 +111,6 @@ def test_a_database_beside_its_journal_is_not_stored(tmp_path: Path) -> None:
 
 
 # Erasing, screening
-
-
-def test_nothing_is_stored_while_messages_are_taken_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_bag(tmp_path, 0)
-    world = World.of(tmp_path)
-    assert world.store.path is not None
-    erasing = tmp_path / ERASING_FILE
-
-    def then_erasing(
-        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool], number: int
-    ) -> Iterator[Group]:
-        yield from undecoded(reader, path, hashed=hashed, number=number)
-        erasing.write_text("{}")
-
-    monkeypatch.setattr(fill, "undecoded", then_erasing)
-    assert world.fill() == 0
-    assert count(world, "bag") == 0
-    assert world.fill() == 0
-    monkeypatch.setattr(fill, "undecoded", undecoded)
-    erasing.unlink()
-    assert world.fill() == 1
 
 
 # Retention
@@ -258,6 +205,7 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
     write_long_bag(tmp_path)
     world = World.of(tmp_path)
     halves: list[int] = []
+    erasing = tmp_path / ERASING_FILE
 
     def with_fault(reader: BagReader, path: Path, **options: object) -> Iterator[Group]:
         for nth, group in enumerate(undecoded(reader, path)):
@@ -267,14 +215,19 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
                 check_all(world)
                 if fault == "undecodable":
                     raise ValueError("of a test")
-                (tmp_path / ERASING_FILE).write_text("{}")
+                erasing.write_text("{}")
             yield group
 
     monkeypatch.setattr(fill, "undecoded", with_fault)
-    world.fill()
+    assert world.fill() == 0
     assert halves[0] > 0
     assert (count(world, "part"), count(world, "part_column"), count(world, "bag")) == (0, 0, 0)
     check_all(world)
+    monkeypatch.setattr(fill, "undecoded", undecoded)
+    if fault == "erasing":  # nothing is stored while messages are taken out
+        assert world.fill() == 0
+        erasing.unlink()
+        assert world.fill() == 1
 
 
 @pytest.mark.usefixtures("small_groups")

@@ -6,11 +6,10 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import NoReturn
 
 import pytest
 
-from ros2_memory.columns.pack import FORMAT, Packed, decompressed
+from ros2_memory.columns.pack import FORMAT, decompressed
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
 from ros2_memory.columns.units import GoneError
@@ -28,7 +27,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.column_worlds import World, check_all, store_file, times
+from tests.support.column_worlds import World, check_all, store_file
 
 S = 10**9
 T0 = 1_700_000_400 * S
@@ -123,7 +122,7 @@ def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     "statement",
-    ["PRAGMA user_version = 99", "PRAGMA user_version = 0", "DROP TABLE part_column"],
+    ["PRAGMA user_version = 99", "DROP TABLE part_column"],
 )
 def test_a_file_of_another_version_or_without_a_table_is_set_aside_and_made_anew(
     world: World, tmp_path: Path, statement: str
@@ -197,41 +196,6 @@ def test_where_the_folder_cannot_be_written_the_next_one_is_used_or_memory(tmp_p
     assert in_memory.fill() == 4
     assert check_all(in_memory) == 4 * 24
     assert len(in_memory.stored()) == 4
-
-
-def full_disk(_: sqlite3.Connection) -> NoReturn:
-    error = sqlite3.OperationalError("database or disk is full")
-    error.sqlite_errorcode = sqlite3.SQLITE_FULL
-    raise error
-
-
-def test_a_disk_has_room_again_also_where_nothing_is_left_to_store(tmp_path: Path) -> None:
-    write_bags(tmp_path, 2)
-    world = World.of(tmp_path)
-    assert not world.store.write(full_disk)
-    assert world.store.trouble == "cannot be used: database or disk is full"
-    assert World.of(tmp_path).fill() == 2
-    assert world.fill() == 0
-    world.store.write_again()
-    assert not world.store.is_failing
-    assert world.store.trouble is None
-
-
-def test_a_write_that_fails_meanwhile_costs_no_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_bags(tmp_path)
-    World.of(tmp_path).fill()
-    world = World.of(tmp_path)
-    read = world.store.zones
-
-    def read_while_a_write_fails(topic: int, path: str, after: int) -> dict[int, Packed]:
-        assert not world.store.write(full_disk)
-        return read(topic, path, after)
-
-    monkeypatch.setattr(world.store, "zones", read_while_a_write_fails)
-    assert times(world, "/odom") == times(world.unstored(), "/odom")
-    assert world.store.is_failing
 
 
 def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,16 @@ def mounted(parent: str, at: int = T0) -> Msg:
     return tf(at, transform(at, parent, "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
 
 
+MIXED = re.compile("as from several robots.*blue, red")
+
+
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def both(tmp_path_factory: pytest.TempPathFactory) -> Memory:
     """The bags of two robots that drive at once, 10 m apart."""
     folder = tmp_path_factory.mktemp("both")
     for number, robot in enumerate(("red", "blue")):
         write_mcap(folder / robot / f"{robot}_0.mcap", drive(10.0 * number))
-    return folder
+    return memory_of(folder)
 
 
 def driven(memory: Memory, start: int, stop: int) -> Any:
@@ -91,37 +95,30 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
     assert len(warned(memory_of(tmp_path))) == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "asks"),
-    [
-        ("visits", {"x": 0, "y": 0, "radius_m": 1}),
-        ("visits", {"x": 0, "y": 0, "radius_m": 1, "by": "day"}),
+WINDOW = {"start": T0_S, "end": T0_S + 60}
+PLACE = {"x": 0, "y": 0, "radius_m": 1}
+ABOVE = {"condition_type": "above", "field": "position.x", "value": 5}
+FOUND = {"topic": "/odom", **ABOVE}
+DRIVEN = {"topic": "/odom", **WINDOW}
+
+
+def test_answers_from_messages_of_both_robots_say_so(both: Memory) -> None:
+    for tool, given in (
+        ("visits", PLACE),
+        ("visits", {**PLACE, "by": "day"}),
         ("find_things", {}),
-        ("find_matches", {}),
-        ("find_matches", {"by": "hour"}),
-        ("get_topic_in_range", {}),
-        ("get_topic_in_range", {"fields": ["position.x"]}),
-        ("get_topic_in_range", {"by": "hour", "fields": ["position.x"]}),
-        ("find_last_match", {}),
-        ("get_value_when", {}),
+        ("find_matches", FOUND),
+        ("find_matches", {**FOUND, "by": "hour"}),
+        ("find_last_match", FOUND),
+        ("get_value_when", {"value_topic": "/odom", "condition_topic": "/odom", **ABOVE}),
+        ("get_topic_in_range", DRIVEN),
+        ("get_topic_in_range", {**DRIVEN, "fields": ["position.x"]}),
+        ("get_topic_in_range", {**DRIVEN, "fields": ["position.x"], "by": "hour"}),
         ("get_position_at", {"timestamp": T0_S + 9}),
-        ("recap", {"start": T0_S, "end": T0_S + 60}),
-    ],
-)
-def test_answers_from_messages_of_both_robots_say_so(
-    both: Path, name: str, asks: dict[str, object]
-) -> None:
-    condition = {"condition_type": "above", "field": "position.x", "value": 5}
-    if name.startswith("find_") and name != "find_things":
-        asks = {"topic": "/odom", **condition, **asks}
-    if name == "get_value_when":
-        asks = {"value_topic": "/odom", "condition_topic": "/odom", **condition}
-    if name == "get_topic_in_range":
-        asks = {"topic": "/odom", "start": T0_S, "end": T0_S + 60, **asks}
-    answer = asked(memory_of(both), both, name, **asks)
-    assert [
-        note for note in answer["notes"] if re.search("as from several robots.*blue, red", note)
-    ]
+        ("recap", WINDOW),
+    ):
+        notes = asked(both, both.index.bag_dir, tool, **given)["notes"]
+        assert any(MIXED.search(note) for note in notes), (tool, given)
 
 
 def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robots(
@@ -130,25 +127,21 @@ def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robot
     for number, robot in enumerate(("red", "blue")):
         said = [text(T0 + (60 * n + 30 * number) * S, f"{robot} {n}") for n in range(9)]
         write_mcap(tmp_path / robot / f"{robot}_0.mcap", said)
-    for condition in ("blue 4", "red 5"):
-        asks = {"topic": "/chatter", "condition_type": "equals", "value": condition}
+    for word in ("blue 4", "red 5"):
+        asks = {"topic": "/chatter", "condition_type": "equals", "value": word}
         answer = asked(memory_of(tmp_path), tmp_path, "find_last_match", **asks)
-        named = re.compile("as from several robots.*blue, red")
-        assert [note for note in answer["notes"] if named.search(note)]
+        assert [note for note in answer["notes"] if MIXED.search(note)]
 
 
-@pytest.mark.parametrize(
-    "asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}], ids=["all", "where"]
-)
-def test_a_way_over_both_robots_is_not_known(both: Path, asks: dict[str, object]) -> None:
-    memory = memory_of(both)
-    window = {"start": T0_S, "end": T0_S + 60, **asks}
-    told = asked(memory, both, "recap", **window)
+@pytest.mark.parametrize("asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}])
+def test_a_way_over_both_robots_is_not_known(both: Memory, asks: dict[str, object]) -> None:
+    ask = partial(asked, both, both.index.bag_dir, **WINDOW, **asks)
+    told, unknown = ask("recap"), "the path is unknown: 2 recordings"
     assert [told.get(each) for each in ("distance_m", "max_speed", "stood_s")] == [None] * 3
     assert not [each for each in told["events"] if each["kind"] in {"stop", "drop"}]
-    assert any("the path is unknown: 2 recordings" in note for note in told["notes"])
-    compared = asked(memory, both, "compare", **window, with_start=T0_S, with_end=T0_S + 30)
-    assert any("the path is unknown: 2 recordings" in note for note in compared["notes"])
+    assert any(unknown in note for note in told["notes"])
+    compared = ask("compare", with_start=T0_S, with_end=T0_S + 30)
+    assert any(unknown in note for note in compared["notes"])
     assert "distance_m" not in compared.get("way", {})
 
 

@@ -4,7 +4,6 @@ import os
 import random
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,7 +18,6 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
-from ros2_memory.messages.to_json import evenly
 from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, log_entry, odom, write_mcap
@@ -33,11 +31,6 @@ MS = 10**6
 
 def view_of(bag_dir: Path) -> View:
     return View(memory_of(bag_dir), Call())
-
-
-def shifted(message: Msg, by: int) -> Msg:
-    """The same message as another recording logged it."""
-    return Msg(message.topic, message.type, message.log_time + by, message.body, message.published)
 
 
 def recorded(
@@ -71,50 +64,6 @@ def test_a_bag_that_fails_is_named_and_the_others_still_answer(
         "a/a_0.mcap could not be read to its end: the disk returned an error",
     )
     assert not view.notes.complete
-
-
-@st.composite
-def takeovers(draw: st.DrawFn) -> tuple[list[list[Msg]], list[int]]:
-    """Recordings that take over from each other, and what they recorded, each message once."""
-    gaps = draw(st.lists(st.integers(1, 400), min_size=1, max_size=60))
-    published = [T0]
-    for gap in gaps:
-        published.append(published[-1] + gap * MS)
-    recordings: list[list[Msg]] = []
-    earliest: dict[int, int] = {}
-    edges = sorted(draw(st.lists(st.integers(0, len(published)), min_size=1, max_size=3)))
-    for start, stop in pairwise([0, *edges, len(published)]):
-        reach = min(len(published), stop + draw(st.integers(0, 4)))
-        messages = []
-        for number in range(start, reach):
-            late = draw(st.integers(0, 900)) * 1000
-            messages.append(shifted(boolean(published[number], number % 3 == 0), late))
-            known = earliest.get(number, published[number] + late)
-            earliest[number] = min(known, published[number] + late)
-        if messages:
-            recordings.append(messages)
-    return recordings, sorted(earliest.values())
-
-
-@settings(
-    max_examples=examples(60),
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(takeovers())
-def test_every_message_counts_exactly_once_however_recordings_overlap(
-    tmp_path_factory: pytest.TempPathFactory, case: tuple[list[list[Msg]], list[int]]
-) -> None:
-    recordings, expected = case
-    bag_dir = tmp_path_factory.mktemp("bags")
-    for number, messages in enumerate(recordings):
-        recorded(bag_dir, f"r{number}", messages)
-    view = view_of(bag_dir)
-    assert times(view, "/bumper") == expected
-    assert times(view, "/bumper", newest_first=True) == expected[::-1]
-    assert view.census("/bumper")["std_msgs/msg/Bool"].messages == len(expected)
-    total, chosen = pick(view, "/bumper", TimeWindow.everything(), 8)
-    assert total == len(expected)
-    assert [each.time for each in chosen] == [expected[i] for i in evenly(total, 8)]
 
 
 TOPIC = "/rosout"

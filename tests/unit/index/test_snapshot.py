@@ -89,11 +89,17 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     held = [(bag, topic) for bag in ordered for topic in bag.summary.topics]
     names = sorted({topic.topic for _, topic in held})
     assert [*timeline.bags] == [*reversed([*reversed(timeline.bags)])] == ordered
+    in_turn = range(-len(bags), len(bags))
+    assert [timeline.bags[at] for at in in_turn] == 2 * timeline.bags[:] == 2 * ordered
     assert [timeline.bags.recording(at) for at in range(len(bags))] == [
         bag.recording for bag in ordered
     ]
-    everything = TimeWindow.everything()
-    assert {*timeline.faulty(everything)} == {bag for bag in bags if bag.summary.notes}
+    for rows in (segment.bags for segment in timeline.segments):
+        odd = [bag for bag in rows if bag.summary.notes]
+        some = rows.some(rows.with_schema(lambda schema: schema.notes))
+        assert [*(some or ())] == odd
+        assert (some is rows) == (len(odd) == len(rows))
+        assert rows.files() == [bag.file for bag in rows]
     snapshot = Snapshot(timeline)
     assert snapshot.earliest == min((bag.start for bag in bags), default=None)
     assert snapshot.latest == max((bag.end for bag in bags), default=None)
