@@ -16,8 +16,7 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
-from ros2_memory.history.view import TimeRange, View
-from ros2_memory.insights.recap import recap
+from ros2_memory.history.view import View
 from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, log_entry, odom, write_mcap
@@ -170,27 +169,6 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         last = View(memory, Call()).stream.newest(TOPIC, TimeWindow.everything())
         assert last is not None
         assert last.time == counted[-1][0]
-
-
-def test_what_was_an_original_no_longer_matters_once_its_recording_is_gone(tmp_path: Path) -> None:
-    """No joined answer outlives the bags that it depends on."""
-    write_splits(tmp_path / "a", [(1_001 * S, 1_001 * S, "lost")], 1_000 * S, 1_005 * S)
-    write_splits(
-        tmp_path / "b",
-        [(2_001 * S, 1_001 * S, "lost"), (2_120 * S, 2_120 * S, "lost")],
-        2_000 * S,
-        2_125 * S,
-    )
-    memory = with_store(memory_of(tmp_path, reader=McapReader()), tmp_path)
-
-    def errors() -> list[int]:
-        events = recap(memory, Call(), TimeRange(0.0, 1e5)).events
-        return [each.start // S for each in events if each.kind == "error"]
-
-    before = errors()
-    (tmp_path / "a" / "a_0.mcap").unlink()
-    memory.index.refresh()
-    assert (before, errors()) == ([1_001], [2_001])
 
 
 def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(

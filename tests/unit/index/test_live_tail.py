@@ -168,16 +168,6 @@ def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, re
     assert not any("crash" in note for note in notes)
 
 
-def test_what_a_killed_recorder_left_is_incomplete_and_answers_the_same(tail: Tail) -> None:
-    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
-    tail.beat("rec")
-    before = tail.ticks()
-    assert tail.states() == [BagState.ACTIVE]
-    tail.beat("another")
-    assert tail.states() == [BagState.INCOMPLETE]
-    assert tail.ticks() == before
-
-
 def growth(bag_dir: Path) -> Iterator[tuple[str, bytes]]:
     """What two splits of a recording look like one after another: file by file, as it grows.
 

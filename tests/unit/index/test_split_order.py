@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.model import BagFile
 from ros2_memory.index.segment import Segment
-from ros2_memory.index.split_order import split_names_of, split_of, stem_of, steps_of
+from ros2_memory.index.split_order import steps_of
 from ros2_memory.index.timeline import Timeline
 from tests.support.listed_bags import odom_bag
 
@@ -46,23 +46,6 @@ def test_steps_are_those_between_neighbours_however_the_history_is_parted(
         if a.end - b.start > S
     ]
     assert sorted(steps(bags, size)) == sorted(expected)
-
-
-@given(
-    st.lists(
-        st.builds(
-            "{}{}{}".format,
-            st.sampled_from(("rec_", "rec_00", "other_", "rec", "")),
-            st.sampled_from((0, 1, 2, 8, 9, 10, 2**63 - 1, "")),
-            st.sampled_from((".mcap", ".db3", ".mcap.zstd")),
-        )
-    )
-)
-def test_the_names_of_bags_say_together_what_each_says_alone(names: list[str]) -> None:
-    bags = [bag(name, 0, 1) for name in names]
-    stems, positions, numbers = split_names_of(bag.file for bag in bags)
-    said = [(stems[at].series, number) for at, number in zip(positions, numbers, strict=True)]
-    assert said == [split_of(bag.file) or (stem_of(bag.file), -1) for bag in bags]
 
 
 def test_dates_with_microseconds_are_numbers_of_splits() -> None:

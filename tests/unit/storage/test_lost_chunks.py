@@ -66,18 +66,6 @@ def test_reading_goes_on_behind_a_damaged_chunk(
     assert all((time > lost[-1]) == newest_first for time in before)
 
 
-def test_the_newest_message_is_before_the_damaged_chunk_where_that_is_the_last(
-    tmp_path: Path,
-) -> None:
-    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
-    view = View(memory_of(tmp_path), Call())
-    found = view.stream.newest("/chatter", TimeWindow.until(lost[-1]))
-    assert found is not None
-    assert found.time == lost[0] - 1
-    [notes] = view.notes.sentences()
-    assert notes.startswith(f"rec/{path.name} could not be read whole: ")
-
-
 def overlapping(folder: Path) -> Memory:
     """A damaged bag up to 1 s, one of its recording from 2 s on, and one that overlaps this."""
     first = write_mcap(folder / "a" / "a_0.mcap", [text(S, "hello")])
