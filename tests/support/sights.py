@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from ros2_memory.analysis.sights import TABLES, DetectorMessages, Sights, sights_of
 from ros2_memory.columns.sights import JoinedSights, joined, packed
 from ros2_memory.columns.table import Texts
-from ros2_memory.core.arrays import Columns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -64,12 +62,6 @@ def seen_in(messages: Sequence[Message]) -> DetectorMessages:
         np.array([one.place or nowhere for _, one in every], np.float64).reshape(-1, 3),
         np.array(scores, np.float64),
     )
-
-
-def rows_of_tables(sights: JoinedSights) -> list[list[list[int]]]:
-    """The rows of each table of joined sights."""
-    tables = (getattr(sights, field.name) for field in fields(JoinedSights))
-    return [table[:].tolist() for table in tables if isinstance(table, Columns)]
 
 
 def whole(parts: Sequence[Sights]) -> JoinedSights:

@@ -59,6 +59,20 @@ def test_more_detections_than_the_limit_are_thinned_with_a_note_and_whole_for_co
 # Types without an entry, and JSON
 
 
+def test_a_type_without_an_entry_is_shown_with_all_its_fields() -> None:
+    body = bags.make(
+        "sensor_msgs/msg/Temperature",
+        header=bags.header(1_500_000_000, "engine"),
+        temperature=21.5,
+        variance=0.0,
+    )
+    assert shown(body, "sensor_msgs/msg/Temperature") == {
+        "header": {"stamp": 1.5, "frame_id": "engine"},
+        "temperature": 21.5,
+        "variance": 0,
+    }
+
+
 def test_a_type_named_as_before_2019_is_found_in_the_map() -> None:
     assert shown(odometry(), "nav_msgs/Odometry") == shown(odometry(), ODOMETRY)
 

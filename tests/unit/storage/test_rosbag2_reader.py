@@ -79,67 +79,64 @@ def size_of(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
-class TestSqliteSchemas:
-    def test_the_bag_of_2018_has_no_format_column_short_type_names_and_no_index(
-        self, tmp_path: Path
-    ) -> None:
-        hello = text(0, "hello").payload.hex()
-        path = change(
-            tmp_path / "old.db3",
-            "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL)",
-            "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
-            "timestamp INTEGER NOT NULL, data BLOB NOT NULL)",
-            "INSERT INTO topics VALUES (1, '/chatter', 'std_msgs/String')",
-            *(
-                f"INSERT INTO messages VALUES (NULL, 1, {at}, x'{hello}')"  # noqa: S608
-                for at in (3, 1, 2, 1)
-            ),
-        )
-        reader = Rosbag2Reader()
-        (topic,) = reader.summarize(path).topics
-        assert (topic.type, topic.encoding, topic.count, topic.latched) == (STRING, "cdr", 4, False)
-        records = read(reader, path)
-        assert times(records) == [1, 1, 2, 3]
-        assert getattr(reader.decode(records[0]), "data", "") == "hello"
+def test_the_bag_of_2018_has_no_format_column_short_type_names_and_no_index(tmp_path: Path) -> None:
+    hello = text(0, "hello").payload.hex()
+    path = change(
+        tmp_path / "old.db3",
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL)",
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
+        "timestamp INTEGER NOT NULL, data BLOB NOT NULL)",
+        "INSERT INTO topics VALUES (1, '/chatter', 'std_msgs/String')",
+        *(
+            f"INSERT INTO messages VALUES (NULL, 1, {at}, x'{hello}')"  # noqa: S608
+            for at in (3, 1, 2, 1)
+        ),
+    )
+    reader = Rosbag2Reader()
+    (topic,) = reader.summarize(path).topics
+    assert (topic.type, topic.encoding, topic.count, topic.latched) == (STRING, "cdr", 4, False)
+    records = read(reader, path)
+    assert times(records) == [1, 1, 2, 3]
+    assert getattr(reader.decode(records[0]), "data", "") == "hello"
 
-    @pytest.mark.parametrize("asked_first", ["newest", "records", "summarize"])
-    def test_an_index_that_is_declared_descending_and_stored_ascending_is_not_believed(
-        self, tmp_path: Path, asked_first: str
-    ) -> None:
-        path = write_db3(tmp_path / "a.db3", [text(at, "x") for at in range(1000, 1400)])
-        change(
-            path,
-            "PRAGMA writable_schema = 1",
-            "UPDATE sqlite_master SET sql = replace(sql, 'ASC', 'DESC') WHERE type = 'index'",
-        )
-        upto, reader = TimeWindow(0, 1200), Rosbag2Reader()
-        if asked_first == "newest":
-            with pytest.raises(BagError, match="index by time is damaged"):
-                reader.newest(path, "/chatter", upto)
-        if asked_first == "records":
-            with pytest.raises(BagContradictionError):
-                read(reader, path)
-        assert any("index by time is damaged" in note for note in reader.summarize(path).notes)
-        for newest_first in (False, True):
-            records = reader.records(path, ["/chatter"], upto, newest_first=newest_first)
-            with pytest.raises(BagContradictionError):
-                next(records)
-            assert times([*records]) == sorted(range(1000, 1200), reverse=newest_first)
 
-    @pytest.mark.parametrize("time", [2**63 - 1, -(2**63), -7])
-    def test_a_time_that_no_clock_shows_is_left_out_and_reported(
-        self, tmp_path: Path, time: int
-    ) -> None:
-        path = write_db3(tmp_path / "a.db3", chatter(3))
-        change(path, f"UPDATE messages SET timestamp = {time} WHERE id = 2")  # noqa: S608
-        reader = Rosbag2Reader()
-        summary = reader.summarize(path)
-        assert summary.count == len(read(reader, path)) == 2
-        assert summary.notes == ("left out: 1 message without a possible log time",)
-        # Its distance to the others may not fit into 64 bits.
-        memory = memory_of(tmp_path, storage="rosbag2")
-        reply = asked(memory, tmp_path, "data_time_range")
-        assert (reply["bags"], reply["gaps"], reply["earliest"]) == (1, [], 0)
+@pytest.mark.parametrize("asked_first", ["newest", "records", "summarize"])
+def test_an_index_that_is_declared_descending_and_stored_ascending_is_not_believed(
+    tmp_path: Path, asked_first: str
+) -> None:
+    path = write_db3(tmp_path / "a.db3", [text(at, "x") for at in range(1000, 1400)])
+    change(
+        path,
+        "PRAGMA writable_schema = 1",
+        "UPDATE sqlite_master SET sql = replace(sql, 'ASC', 'DESC') WHERE type = 'index'",
+    )
+    upto, reader = TimeWindow(0, 1200), Rosbag2Reader()
+    if asked_first == "newest":
+        with pytest.raises(BagError, match="index by time is damaged"):
+            reader.newest(path, "/chatter", upto)
+    if asked_first == "records":
+        with pytest.raises(BagContradictionError):
+            read(reader, path)
+    assert any("index by time is damaged" in note for note in reader.summarize(path).notes)
+    for newest_first in (False, True):
+        records = reader.records(path, ["/chatter"], upto, newest_first=newest_first)
+        with pytest.raises(BagContradictionError):
+            next(records)
+        assert times([*records]) == sorted(range(1000, 1200), reverse=newest_first)
+
+
+@pytest.mark.parametrize("time", [2**63 - 1, -(2**63), -7])
+def test_a_time_that_no_clock_shows_is_left_out_and_reported(tmp_path: Path, time: int) -> None:
+    path = write_db3(tmp_path / "a.db3", chatter(3))
+    change(path, f"UPDATE messages SET timestamp = {time} WHERE id = 2")  # noqa: S608
+    reader = Rosbag2Reader()
+    summary = reader.summarize(path)
+    assert summary.count == len(read(reader, path)) == 2
+    assert summary.notes == ("left out: 1 message without a possible log time",)
+    # Its distance to the others may not fit into 64 bits.
+    memory = memory_of(tmp_path, storage="rosbag2")
+    reply = asked(memory, tmp_path, "data_time_range")
+    assert (reply["bags"], reply["gaps"], reply["earliest"]) == (1, [], 0)
 
 
 @pytest.fixture
@@ -155,124 +152,129 @@ def live(tmp_path: Path) -> Iterator[tuple[Path, sqlite3.Connection]]:
         yield path, base
 
 
-class TestJournals:
-    def test_what_is_in_the_wal_is_read_and_the_folder_left_as_it_was(
-        self, live: tuple[Path, sqlite3.Connection], tmp_path: Path
-    ) -> None:
-        left = tmp_path / "left"
-        shutil.copytree(live[0].parent, left, ignore=shutil.ignore_patterns("*-shm"))
-        before = {file: file.read_bytes() for file in left.iterdir()}
-        assert len(before) == 2
-        path, reader = left / live[0].name, Rosbag2Reader()
-        summary = reader.summarize(path)
-        assert times(read(reader, path)) == [0, 1, 5]
-        assert (summary.count, summary.complete) == (3, False)
-        assert summary.notes[0].startswith("its writer did not finish it")
-        assert {file: file.read_bytes() for file in left.iterdir()} == before
-
-    def test_a_wal_that_grows_is_read_anew(self, live: tuple[Path, sqlite3.Connection]) -> None:
-        path, base = live
-        reader = Rosbag2Reader()
-        assert times(read(reader, path)) == [0, 1, 5]
-        base.execute("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,9,x'00')")
-        base.commit()
-        assert times(read(reader, path)) == [0, 1, 5, 9]
-
-    def test_a_transaction_that_was_cut_off_is_rolled_back(self, tmp_path: Path) -> None:
-        path, killed = write_db3(tmp_path / "live" / "a.db3", chatter(2)), tmp_path / "killed"
-        with closing(sqlite3.connect(path, isolation_level=None)) as base:
-            base.execute("PRAGMA cache_size=1").fetchall()
-            base.execute("BEGIN")
-            rows = [(time, b"\0" * 4000) for time in range(100, 300)]
-            base.executemany("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,?,?)", rows)
-            shutil.copytree(path.parent, killed)
-        assert (killed / "a.db3-journal").stat().st_size
-        reader = Rosbag2Reader()
-        assert reader.closing(killed / "a.db3") is Closing.OPEN
-        assert times(read(reader, killed / "a.db3")) == [0, 1]
+def test_what_is_in_the_wal_is_read_and_the_folder_left_as_it_was(
+    live: tuple[Path, sqlite3.Connection], tmp_path: Path
+) -> None:
+    left = tmp_path / "left"
+    shutil.copytree(live[0].parent, left, ignore=shutil.ignore_patterns("*-shm"))
+    before = {file: file.read_bytes() for file in left.iterdir()}
+    assert len(before) == 2
+    path, reader = left / live[0].name, Rosbag2Reader()
+    summary = reader.summarize(path)
+    assert times(read(reader, path)) == [0, 1, 5]
+    assert (summary.count, summary.complete) == (3, False)
+    assert summary.notes[0].startswith("its writer did not finish it")
+    assert {file: file.read_bytes() for file in left.iterdir()} == before
 
 
-class TestCompressedFiles:
-    def test_a_file_of_several_frames_is_read_whole(self, tmp_path: Path) -> None:
-        path = compressed(write_mcap(tmp_path / "a.mcap", chatter(50)), frames=3)
-        skippable = b"\x50\x2a\x4d\x18\x04\x00\x00\x00note"
-        path.write_bytes(skippable + path.read_bytes())
-        reader = Rosbag2Reader()
-        assert reader.closing(path) is Closing.CLOSED
-        assert times(read(reader, path)) == list(range(50))
-        assert reader.summarize(path).complete
+def test_a_wal_that_grows_is_read_anew(live: tuple[Path, sqlite3.Connection]) -> None:
+    path, base = live
+    reader = Rosbag2Reader()
+    assert times(read(reader, path)) == [0, 1, 5]
+    base.execute("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,9,x'00')")
+    base.commit()
+    assert times(read(reader, path)) == [0, 1, 5, 9]
 
-    def test_it_is_closed_only_at_the_very_end_of_its_frames(self, tmp_path: Path) -> None:
-        whole = compressed(write_mcap(tmp_path / "a.mcap", chatter(3)), frames=2).read_bytes()
-        path = tmp_path / "cut.mcap.zstd"
-        reader = Rosbag2Reader()
-        closed = []
-        for size in range(len(whole) + 1):
-            path.write_bytes(whole[:size])
-            if reader.closing(path) is Closing.CLOSED:
-                closed.append(size)
-        # A cut between two whole frames cannot be told from a file that ends there.
-        assert closed == [_block_starts(whole)[-1], len(whole)]
 
-    def test_of_a_file_that_is_cut_the_first_messages_are_read(self, tmp_path: Path) -> None:
-        messages = [Msg("/noise", STRING, time, os.urandom(4000)) for time in range(300)]
-        layout = McapLayout(chunk_size=50_000)
-        path = compressed(write_mcap(tmp_path / "a.mcap", messages, layout))
-        path.write_bytes(path.read_bytes()[:600_000])
-        reader = Rosbag2Reader()
-        summary = reader.summarize(path)
-        assert reader.closing(path) is Closing.OPEN
-        assert 50 < summary.count < 200
-        assert not summary.complete
-        assert summary.notes[0] == "its compressed file ends early"
-        records = read(reader, path, "/noise")
-        assert [r.payload for r in records] == [m.payload for m in messages[: summary.count]]
+def test_a_transaction_that_was_cut_off_is_rolled_back(tmp_path: Path) -> None:
+    path, killed = write_db3(tmp_path / "live" / "a.db3", chatter(2)), tmp_path / "killed"
+    with closing(sqlite3.connect(path, isolation_level=None)) as base:
+        base.execute("PRAGMA cache_size=1").fetchall()
+        base.execute("BEGIN")
+        rows = [(time, b"\0" * 4000) for time in range(100, 300)]
+        base.executemany("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,?,?)", rows)
+        shutil.copytree(path.parent, killed)
+    assert (killed / "a.db3-journal").stat().st_size
+    reader = Rosbag2Reader()
+    assert reader.closing(killed / "a.db3") is Closing.OPEN
+    assert times(read(reader, killed / "a.db3")) == [0, 1]
 
-    def test_decompressed_files_stay_within_their_bound_and_none_in_use_is_deleted_for_it(
-        self, tmp_path: Path, scratch_root: Path
-    ) -> None:
-        paths = [
-            compressed(write_mcap(tmp_path / f"{n}.mcap", [text(1, "0" * size)]))
-            for n, size in enumerate((400_000, 400_000, 400_000, 700_000))
-        ]
-        reader = Rosbag2Reader(unpack_max_mb=1)
-        for path in (*paths, *paths):
-            assert len(read(reader, path)) == 1
-            assert 400_000 < size_of(scratch_root) <= 1 << 20
-        held = reader.records(paths[-1], ["/chatter"], EVERYTHING)
-        next(held)
-        with pytest.raises(BagError, match=r"more than the 1 MiB allowed .* raise unpack_max_mb"):
-            reader.summarize(paths[0])
-        assert list(held) == []
-        assert reader.summarize(paths[0]).count == 1
 
-    def test_a_reading_may_end_while_its_thread_unpacks_another_file(self) -> None:
-        """As where garbage is collected meanwhile: a lock that no thread takes twice would hang."""
-        scratch = Scratch(1 << 20)
+def test_a_file_of_several_frames_is_read_whole(tmp_path: Path) -> None:
+    path = compressed(write_mcap(tmp_path / "a.mcap", chatter(50)), frames=3)
+    skippable = b"\x50\x2a\x4d\x18\x04\x00\x00\x00note"
+    path.write_bytes(skippable + path.read_bytes())
+    reader = Rosbag2Reader()
+    assert reader.closing(path) is Closing.CLOSED
+    assert times(read(reader, path)) == list(range(50))
+    assert reader.summarize(path).complete
 
-        def fill(folder: Path, _reserve: Callable[[int], None]) -> tuple[Path, str]:
-            held.close()
-            return folder, ""
 
-        def two_files() -> None:
-            with held, scratch.use("other", fill) as (folder, _):
-                assert folder.is_dir()
+def test_a_compressed_file_is_closed_only_at_the_very_end_of_its_frames(tmp_path: Path) -> None:
+    whole = compressed(write_mcap(tmp_path / "a.mcap", chatter(3)), frames=2).read_bytes()
+    path = tmp_path / "cut.mcap.zstd"
+    reader = Rosbag2Reader()
+    closed = []
+    for size in range(len(whole) + 1):
+        path.write_bytes(whole[:size])
+        if reader.closing(path) is Closing.CLOSED:
+            closed.append(size)
+    # A cut between two whole frames cannot be told from a file that ends there.
+    assert closed == [_block_starts(whole)[-1], len(whole)]
 
-        held = ExitStack()
-        held.enter_context(scratch.use("one", lambda folder, _reserve: (folder, "")))
-        thread = threading.Thread(target=two_files, daemon=True)
-        thread.start()
-        thread.join(20)
-        assert not thread.is_alive()
 
-    def test_temporary_files_go_with_the_reader(self, tmp_path: Path, scratch_root: Path) -> None:
-        path = compressed(write_db3(tmp_path / "a.db3", chatter(3)))
-        reader = Rosbag2Reader()
-        assert len(read(reader, path)) == 3
-        assert list(scratch_root.iterdir())
-        del reader
-        gc.collect()
-        assert list(scratch_root.iterdir()) == []
+def test_of_a_file_that_is_cut_the_first_messages_are_read(tmp_path: Path) -> None:
+    messages = [Msg("/noise", STRING, time, os.urandom(4000)) for time in range(300)]
+    layout = McapLayout(chunk_size=50_000)
+    path = compressed(write_mcap(tmp_path / "a.mcap", messages, layout))
+    path.write_bytes(path.read_bytes()[:600_000])
+    reader = Rosbag2Reader()
+    summary = reader.summarize(path)
+    assert reader.closing(path) is Closing.OPEN
+    assert 50 < summary.count < 200
+    assert not summary.complete
+    assert summary.notes[0] == "its compressed file ends early"
+    records = read(reader, path, "/noise")
+    assert [r.payload for r in records] == [m.payload for m in messages[: summary.count]]
+
+
+def test_decompressed_files_stay_within_their_bound_and_none_in_use_is_deleted_for_it(
+    tmp_path: Path, scratch_root: Path
+) -> None:
+    paths = [
+        compressed(write_mcap(tmp_path / f"{n}.mcap", [text(1, "0" * size)]))
+        for n, size in enumerate((400_000, 400_000, 400_000, 700_000))
+    ]
+    reader = Rosbag2Reader(unpack_max_mb=1)
+    for path in (*paths, *paths):
+        assert len(read(reader, path)) == 1
+        assert 400_000 < size_of(scratch_root) <= 1 << 20
+    held = reader.records(paths[-1], ["/chatter"], EVERYTHING)
+    next(held)
+    with pytest.raises(BagError, match=r"more than the 1 MiB allowed .* raise unpack_max_mb"):
+        reader.summarize(paths[0])
+    assert list(held) == []
+    assert reader.summarize(paths[0]).count == 1
+
+
+def test_a_reading_may_end_while_its_thread_unpacks_another_file() -> None:
+    """As where garbage is collected meanwhile: a lock that no thread takes twice would hang."""
+    scratch = Scratch(1 << 20)
+
+    def fill(folder: Path, _reserve: Callable[[int], None]) -> tuple[Path, str]:
+        held.close()
+        return folder, ""
+
+    def two_files() -> None:
+        with held, scratch.use("other", fill) as (folder, _):
+            assert folder.is_dir()
+
+    held = ExitStack()
+    held.enter_context(scratch.use("one", lambda folder, _reserve: (folder, "")))
+    thread = threading.Thread(target=two_files, daemon=True)
+    thread.start()
+    thread.join(20)
+    assert not thread.is_alive()
+
+
+def test_temporary_files_go_with_the_reader(tmp_path: Path, scratch_root: Path) -> None:
+    path = compressed(write_db3(tmp_path / "a.db3", chatter(3)))
+    reader = Rosbag2Reader()
+    assert len(read(reader, path)) == 3
+    assert list(scratch_root.iterdir())
+    del reader
+    gc.collect()
+    assert list(scratch_root.iterdir()) == []
 
 
 def test_what_a_killed_program_had_unpacked_is_deleted_by_the_next(

@@ -57,91 +57,88 @@ def cut(whole: Path, size: int) -> Path:
     return target
 
 
-class TestRewriting:
-    @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-    def test_keeps_every_message_with_its_times_sequence_and_channel(
-        self, tmp_path: Path, layout: McapLayout
-    ) -> None:
-        layout = replace(layout, chunk_size=layout.chunk_size and 2000, profile="ros2")
-        source = write_mcap(tmp_path / "a.mcap", messages(), layout)
-        target = tmp_path / "b.mcap"
-        result = McapWriter().rewrite(source, target)
-        complete = write_mcap(tmp_path / "c.mcap", messages())
-        assert raw_contents(target) == raw_contents(complete)
-        assert (result.messages, result.lost_bytes) == (len(messages()), 0)
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_a_copy_keeps_every_message_with_its_times_sequence_and_channel(
+    tmp_path: Path, layout: McapLayout
+) -> None:
+    layout = replace(layout, chunk_size=layout.chunk_size and 2000, profile="ros2")
+    source = write_mcap(tmp_path / "a.mcap", messages(), layout)
+    target = tmp_path / "b.mcap"
+    result = McapWriter().rewrite(source, target)
+    complete = write_mcap(tmp_path / "c.mcap", messages())
+    assert raw_contents(target) == raw_contents(complete)
+    assert (result.messages, result.lost_bytes) == (len(messages()), 0)
 
-    @settings(
-        suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(60)
-    )
-    @given(share=st.floats(0.0, 1.0), name=st.sampled_from(["small chunks", "zstd", "unchunked"]))
-    def test_wherever_a_file_is_cut_what_was_readable_is_in_the_copy(
-        self, tmp_path: Path, share: float, name: str
-    ) -> None:
-        layout = replace(LAYOUTS[name], profile="ros2", chunk_size=LAYOUTS[name].chunk_size and 900)
-        whole = write_mcap(tmp_path / "a.mcap", messages(12), layout)
-        source = cut(whole, max(8, round(share * whole.stat().st_size)))
-        target = tmp_path / "b.mcap"
-        target.unlink(missing_ok=True)
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(60))
+@given(share=st.floats(0.0, 1.0), name=st.sampled_from(["small chunks", "zstd", "unchunked"]))
+def test_wherever_a_file_is_cut_what_was_readable_is_in_the_copy(
+    tmp_path: Path, share: float, name: str
+) -> None:
+    layout = replace(LAYOUTS[name], profile="ros2", chunk_size=LAYOUTS[name].chunk_size and 900)
+    whole = write_mcap(tmp_path / "a.mcap", messages(12), layout)
+    source = cut(whole, max(8, round(share * whole.stat().st_size)))
+    target = tmp_path / "b.mcap"
+    target.unlink(missing_ok=True)
+    McapWriter().rewrite(source, target)
+    reader = McapReader()
+    assert contents(target) == contents(source)
+    after = reader.summarize(target)
+    assert (after.complete, after.notes) == (True, ())
+
+
+def test_metadata_attachments_and_the_profile_are_kept(tmp_path: Path) -> None:
+    source, target = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    with source.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="some recorder")
+        writer.add_metadata("rosbag2", {"serialized_metadata": "version: 9"})
+        writer.add_attachment(1, 2, "map.png", "image/png", b"pixels")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/a", "cdr", schema, {"any": "thing"})
+        writer.add_message(channel, 5, b"\0\1\0\0", 4, 77)
+        writer.flush()
+    McapWriter().rewrite(source, target)
+    with target.open("rb") as stream:
+        reader = make_reader(stream)
+        [metadata], [attachment] = reader.iter_metadata(), reader.iter_attachments()
+        header = reader.get_header()
+    assert metadata.metadata == {"serialized_metadata": "version: 9"}
+    assert (attachment.name, attachment.data) == ("map.png", b"pixels")
+    assert header.profile == "ros2"
+    assert header.library.startswith("some recorder")
+    [(topic, found, _, message)] = raw_contents(target)
+    assert (topic, found) == ("/a", {"any": "thing"})
+    assert (message.sequence, message.log_time, message.publish_time) == (77, 5, 4)
+
+
+def test_a_file_of_the_targets_name_is_not_overwritten(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "a.mcap", messages())
+    target = tmp_path / "b.mcap"
+    target.write_bytes(b"somebody's")
+    with pytest.raises(BagError, match="File exists"):
         McapWriter().rewrite(source, target)
-        reader = McapReader()
-        assert contents(target) == contents(source)
-        after = reader.summarize(target)
-        assert (after.complete, after.notes) == (True, ())
+    assert target.read_bytes() == b"somebody's"
 
-    def test_metadata_attachments_and_the_profile_are_kept(self, tmp_path: Path) -> None:
-        source, target = tmp_path / "a.mcap", tmp_path / "b.mcap"
-        with source.open("wb") as stream:
-            writer = Writer(stream)
-            writer.start(profile="ros2", library="some recorder")
-            writer.add_metadata("rosbag2", {"serialized_metadata": "version: 9"})
-            writer.add_attachment(1, 2, "map.png", "image/png", b"pixels")
-            schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
-            channel = writer.register_channel("/a", "cdr", schema, {"any": "thing"})
-            writer.add_message(channel, 5, b"\0\1\0\0", 4, 77)
-            writer.flush()
+
+@needs_real
+def test_what_anybody_recorded_is_the_same_afterwards(tmp_path: Path) -> None:
+    sources = [path for path in sorted(REAL.rglob("*.mcap")) if path.name != "Dockerfile.mcap"]
+    for number, source in enumerate(sources):
+        target = tmp_path / f"{number}.mcap"
         McapWriter().rewrite(source, target)
-        with target.open("rb") as stream:
-            reader = make_reader(stream)
-            [metadata], [attachment] = reader.iter_metadata(), reader.iter_attachments()
-            header = reader.get_header()
-        assert metadata.metadata == {"serialized_metadata": "version: 9"}
-        assert (attachment.name, attachment.data) == ("map.png", b"pixels")
-        assert header.profile == "ros2"
-        assert header.library.startswith("some recorder")
-        [(topic, found, _, message)] = raw_contents(target)
-        assert (topic, found) == ("/a", {"any": "thing"})
-        assert (message.sequence, message.log_time, message.publish_time) == (77, 5, 4)
-
-    def test_a_file_of_the_targets_name_is_not_overwritten(self, tmp_path: Path) -> None:
-        source = write_mcap(tmp_path / "a.mcap", messages())
-        target = tmp_path / "b.mcap"
-        target.write_bytes(b"somebody's")
-        with pytest.raises(BagError, match="File exists"):
-            McapWriter().rewrite(source, target)
-        assert target.read_bytes() == b"somebody's"
-
-    @needs_real
-    def test_what_anybody_recorded_is_the_same_afterwards(self, tmp_path: Path) -> None:
-        sources = [path for path in sorted(REAL.rglob("*.mcap")) if path.name != "Dockerfile.mcap"]
-        for number, source in enumerate(sources):
-            target = tmp_path / f"{number}.mcap"
-            McapWriter().rewrite(source, target)
-            assert contents(target) == contents(source), source
+        assert contents(target) == contents(source), source
 
 
-class TestWriting:
-    def test_a_time_that_the_format_cannot_hold_is_refused_and_leaves_nothing(
-        self, tmp_path: Path
-    ) -> None:
-        with pytest.raises(BagError):
-            McapWriter().write(tmp_path / "b.mcap", [Record(CHANNEL, -1, -1, b"")])
-        assert not list(tmp_path.iterdir())
+def test_a_time_that_the_format_cannot_hold_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(BagError):
+        McapWriter().write(tmp_path / "b.mcap", [Record(CHANNEL, -1, -1, b"")])
+    assert not list(tmp_path.iterdir())
 
-    def test_a_disk_that_takes_no_more_is_reported_and_nothing_is_left(
-        self, tmp_path: Path
-    ) -> None:
-        noise = random.Random(1)
-        records = [Record(CHANNEL, n, n, noise.randbytes(100_000)) for n in range(20)]
-        with files_limited_to(500_000), pytest.raises(BagError, match="cannot be written: File"):
-            McapWriter().write(tmp_path / "b.mcap", records)
-        assert not list(tmp_path.iterdir())
+
+def test_a_disk_that_takes_no_more_is_reported_and_nothing_is_left(tmp_path: Path) -> None:
+    noise = random.Random(1)
+    records = [Record(CHANNEL, n, n, noise.randbytes(100_000)) for n in range(20)]
+    with files_limited_to(500_000), pytest.raises(BagError, match="cannot be written: File"):
+        McapWriter().write(tmp_path / "b.mcap", records)
+    assert not list(tmp_path.iterdir())
