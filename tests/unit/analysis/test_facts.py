@@ -31,27 +31,22 @@ def stated(value: JsonValue, type_name: str) -> dict[Word, float]:
     return {word: 0 if math.isnan(value) else value for word, value in facts}
 
 
-def test_statuses_and_goals_have_a_value_each() -> None:
+def test_statuses_and_goals_have_a_value_each_and_what_is_none_has_none() -> None:
     status: JsonValue = {
         "status": [
-            {"name": "motor", "level": 1, "message": "hot"},
             {"name": "camera", "level": 0, "message": "30 frames/s"},
             {"name": "arm", "level": 2, "message": "stuck"},
-            {"name": "imu", "level": 3, "message": "stale"},
             {"name": 5, "level": 0},
             "none",
         ]
     }
     assert stated(status, DIAGNOSTICS) == {
-        Word(STATUS, "motor", "hot"): 1,
         Word(STATUS, "camera"): 0,
         Word(STATUS, "arm", "stuck"): 2,
         Word(ERROR, "arm: stuck"): 0,
-        Word(STATUS, "imu", "stale"): 3,
     }
     goal: JsonValue = {"goal_info": {"goal_id": {"uuid": [0, 255]}}, "status": 2}
-    listed: JsonValue = {"status_list": [goal, {"status": 1}, None]}
-    assert stated(listed, GOALS) == {Word(GOAL, "00ff"): 2}
+    assert stated({"status_list": [goal, {"status": 1}, None]}, GOALS) == {Word(GOAL, "00ff"): 2}
     assert stated(None, DIAGNOSTICS) == stated(7, GOALS) == {}
 
 

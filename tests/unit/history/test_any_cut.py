@@ -449,7 +449,7 @@ def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(see
         check_all(world)
         again = world_of(bag_dir)
         check_all(again)
-        check_stored(again, questions(draw, again.topics(), moments, most=10))
+        check_stored(again, questions(draw, again.topics(), moments, most=8))
         for topic in again.topics():
             begin = draw.choice([*moments, MIN_NS])
             window = TimeWindow(begin, max(begin, draw.choice(moments)) + draw.randrange(40 * S))
@@ -459,7 +459,7 @@ def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(see
                 assert View(memory, Call()).stream.newest(topic, window) == first
         without_columns = world_of(bag_dir, StoreLimits(max_share=0.0, least_bytes_per_s=0))
         without_columns.fill()
-        check_stored(without_columns, questions(draw, again.topics(), moments, most=20))
+        check_stored(without_columns, questions(draw, again.topics(), moments, most=12))
 
 
 def draw_recordings(draw: Random) -> Splits:
