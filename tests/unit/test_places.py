@@ -1,8 +1,6 @@
 """The file of named places."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -10,9 +8,6 @@ from ros2_memory.bootstrap import places_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def places(folder: Path, text: str) -> tuple[Place, ...]:

@@ -1,11 +1,10 @@
 """Positions come from whatever carries one, and refusals name what does."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,27 +17,16 @@ from tests.support.bags import (
     Msg,
     header,
     make,
-    point,
-    quaternion,
     tf,
     transform,
     write_mcap,
 )
 from tests.support.memories import asked, each_way, memory_of
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 S = 10**9
 T0_S = 1_784_000_000
 T0 = T0_S * S
 YAW = math.radians(30)
-
-
-def pose_stamped(ns: int, x: float, y: float, topic: str = "/pose") -> Msg:
-    pose = make("geometry_msgs/msg/Pose", position=point(x, y), orientation=quaternion(YAW))
-    body = make("geometry_msgs/msg/PoseStamped", header=header(ns, "map"), pose=pose)
-    return Msg(topic, "geometry_msgs/msg/PoseStamped", ns, body)
 
 
 def vehicle(ns: int, x: float, y: float) -> Msg:
@@ -62,20 +50,6 @@ def vehicle(ns: int, x: float, y: float) -> Msg:
         quality=100,
     )
     return Msg("/fmu/out/vehicle_odometry", "px4_msgs/msg/VehicleOdometry", ns, body)
-
-
-def local(ns: int, x: float, y: float) -> Msg:
-    body = make(
-        "px4_msgs/msg/VehicleLocalPosition",
-        timestamp=ns // 1000,
-        xy_valid=True,
-        x=x,
-        y=y,
-        z=-2.0,
-        heading=YAW,
-    )
-    kind = "px4_msgs/msg/VehicleLocalPosition"
-    return Msg("/fmu/out/vehicle_local_position", kind, ns, body)
 
 
 def fix(ns: int, north: float, east: float, status: int = 0) -> Msg:

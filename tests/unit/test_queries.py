@@ -1,8 +1,6 @@
 """Questions whose honest answer takes care."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -21,10 +19,6 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.memories import asked, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9

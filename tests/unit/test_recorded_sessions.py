@@ -3,13 +3,11 @@
 That one the tests write: without the shared bags there is no other of its length.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections import defaultdict
 from functools import cache
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from rosbags.rosbag2 import Reader
@@ -33,9 +31,6 @@ from tests.support.closed_form import (
 )
 from tests.support.memories import memory_of
 from tests.support.shared_bags import needs_recorded
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 WRITTEN = "written"
 """In place of a session: the one that the test writes."""

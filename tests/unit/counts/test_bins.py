@@ -1,15 +1,9 @@
-from __future__ import annotations
-
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tests.support.bags import boolean, odom, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    pass
 
 S = 10**9
 BEGIN = 1_784_059_400 * S

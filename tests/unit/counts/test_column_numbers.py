@@ -1,12 +1,9 @@
 """Numbers of fields: as exact as by the bags, whatever is stored."""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -17,14 +14,10 @@ from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
+from ros2_memory.results import Bins
 from tests.support.bags import Msg, battery, make, odom, write_mcap, write_splits
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.results import Bins
 
 S = 10**9
 BEGIN = 1_783_998_000 * S

@@ -1,12 +1,10 @@
 """What counts, and how long it held; by label, as the messages say that the test wrote."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -14,7 +12,6 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import (
-    Msg,
     boolean,
     detections,
     odom,
@@ -26,11 +23,6 @@ from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
 
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 
@@ -108,14 +100,6 @@ def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[s
 
 
 T: Final = 1_790_000_000
-
-
-def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) -> dict[str, Any]:
-    ordered = sorted(messages, key=lambda each: each.log_time)
-    write_mcap(folder / "run" / "run_0.mcap", ordered)
-    condition = {"topic": topic, "start": T, "end": T + 300, "by": "day", **given}
-    reply = asked(memory_of(folder), folder, "find_matches", **condition)
-    return table(reply)["all"]
 
 
 @each_way

@@ -1,17 +1,13 @@
 """How long a state lasts that one message states, and no other message repeats."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.support.bags import McapLayout, battery, boolean, odom, text, write_splits
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 T0 = 1_790_000_000 * S

@@ -1,10 +1,7 @@
 """Metres, visits and what else is counted, by hour and by place."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -13,9 +10,6 @@ from ros2_memory.history.context import Memory
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 WEST = Place("west", "map", Rectangle(-3.0, 2.0, -3.0, 6.0))
 EAST = Place("east", "map", Rectangle(2.0, 8.0, -3.0, 6.0))

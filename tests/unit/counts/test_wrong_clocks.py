@@ -1,8 +1,6 @@
 """Bins leave bags out that a wrong clock dated, unless the window has nothing else."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -11,10 +9,6 @@ from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 S = 10**9
 TRUE = 1_784_030_400

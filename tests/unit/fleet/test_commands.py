@@ -1,17 +1,12 @@
 """What the commands that look at bags say where the configuration is that of a fleet."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from ros2_memory import cli
 from tests.support.fleets import seeded, write_robot
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture

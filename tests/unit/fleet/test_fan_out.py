@@ -1,11 +1,10 @@
 """One question to many robots: none waits for one, and their answers become one reply."""
 
-from __future__ import annotations
-
 import json
 import threading
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -21,9 +20,6 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.robots import FanOut, Robot
 from ros2_memory.fleet.tools import Page, RobotReply, merged
 from ros2_memory.history.context import Call
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
 
 
 def robots(count: int) -> list[Robot]:

@@ -3,11 +3,10 @@
 The oracle is a server of each robot alone.
 """
 
-from __future__ import annotations
-
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -36,10 +35,6 @@ from tests.support.fleets import (
     write_robot,
 )
 from tests.support.memories import asked
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 NAMES = ("r1", "r2", "r3")
 

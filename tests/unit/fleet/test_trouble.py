@@ -4,30 +4,25 @@ One is damaged, one offline, one goes offline while the server runs, the clock o
 ahead, and the disk of one hangs.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.declaration import Tool
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, reply_of, seeded, tools_of, write_robot
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.tools.declaration import Tool
 
 YEAR_S = 365 * 86_400
 ROBOTS = {

@@ -3,29 +3,23 @@
 The oracle is a fleet that does not have the other one: every reply is the same, byte for byte.
 """
 
-from __future__ import annotations
-
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import anyio
 import pytest
 
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.fleet.tools import fleet_tools
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from tests.support.fleets import CALLS, TOOLS, fleet_over, seeded, write_robot
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 OTHER = "zq7"
 MINE = ("r1", "r3")

@@ -1,19 +1,14 @@
 """Several moments in one question: each is answered as if it were asked alone."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.core.errors import NoDataReason
+from ros2_memory.history.context import Memory
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of, replied
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 T0 = 1_700_000_000

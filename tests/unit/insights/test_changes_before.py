@@ -1,7 +1,9 @@
-from __future__ import annotations
+from pathlib import Path
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
+import pytest
 
+from ros2_memory.history.context import Memory
 from tests.support.bags import (
     Msg,
     battery,
@@ -15,12 +17,8 @@ from tests.support.bags import (
 )
 from tests.support.memories import asked, each_way, memory_of
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 S = 10**9
 BEGIN = 1_784_000_000 * S
-RUNNING, SUCCEEDED, ABORTED = 2, 4, 6
 
 
 def at(seconds: float) -> int:
@@ -33,14 +31,9 @@ def driving(until: int, stops: float) -> list[Msg]:
     return [odom(at(t), 0.4 * min(t, stops), 0.0, 0.0) for t in times]
 
 
-def commanded(until: int, stops: float) -> list[Msg]:
-    times = [nth / 10 for nth in range(until * 10)]
-    return [command(at(t), 0.4 if t < stops else 0.0) for t in times]
-
-
-def before(folder: Path, around: float, *, recalls: bool = False, **given: float) -> dict[str, Any]:
-    memory = memory_of(folder, recalls=recalls)
-    reply: dict[str, Any] = asked(memory, folder, "recap", around=BEGIN / S + around, **given)
+def before(memory: Memory, around: float, **given: float) -> dict[str, Any]:
+    folder, moment = memory.index.bag_dir, BEGIN / S + around
+    reply: dict[str, Any] = asked(memory, folder, "recap", around=moment, **given)
     return reply
 
 
@@ -50,21 +43,27 @@ def told(reply: dict[str, Any]) -> list[tuple[str, float]]:
 
 ALL = [
     *driving(60, 43),
-    *commanded(60, 43),
+    *(command(at(t / 10), 0.4 if t < 430 else 0.0) for t in range(600)),
     *(boolean(at(t), 42.6 <= t < 43.4) for t in range(60)),
     boolean(at(42.6), True),
     *(diagnostics(at(t), motor=(1, "hot") if t > 38 else (0, "ok")) for t in range(0, 60, 3)),
-    goals(at(5), {1: RUNNING}),
+    goals(at(5), {1: 2}),
     *(battery(at(t), 0.25 - t * 0.00125) for t in range(60)),
     log_entry(at(41.5), 30, "motor", "81 C"),
     log_entry(at(42.0), 20, "motor", "nothing of interest"),
 ]
 
 
+@pytest.fixture(scope="module")
+def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bags")
+    write_splits(folder, ALL)
+    return folder
+
+
 @each_way
-def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool) -> None:
-    write_splits(tmp_path, ALL)
-    reply = before(tmp_path, 43.0, recalls=recalls)
+def test_what_changed_is_listed_the_nearest_first(bag_dir: Path, recalls: bool) -> None:
+    reply = before(memory_of(bag_dir, recalls=recalls), 43.0)
     assert told(reply) == [
         ("/cmd_vel went to zero while a goal was active", 0.0),
         ("/bumper became true", 0.4),
@@ -82,9 +81,16 @@ def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool)
     assert "notes" not in reply
 
 
-def test_a_window_that_begins_with_the_stop_knows_what_changed_before(tmp_path: Path) -> None:
-    write_splits(tmp_path, ALL)
-    reply = asked(memory_of(tmp_path), tmp_path, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
+def test_how_far_back_can_be_asked_and_a_stop_knows_what_changed_before_the_window(
+    bag_dir: Path,
+) -> None:
+    memory = memory_of(bag_dir)
+    assert told(before(memory, 43.0, seconds_before=1)) == [
+        ("/cmd_vel went to zero while a goal was active", 0.0),
+        ("/bumper became true", 0.4),
+    ]
+    assert before(memory, 43.0, seconds_before=61)["error"] == "invalid_arguments"
+    reply = asked(memory, bag_dir, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
     assert "/bumper became true" in [each["text"] for each in stop["before"]]
 
@@ -92,7 +98,7 @@ def test_a_window_that_begins_with_the_stop_knows_what_changed_before(tmp_path: 
 def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path) -> None:
     trembling = [battery(at(t), 0.209 - t * 0.0002 + 0.008 * (-1) ** t) for t in range(60)]
     write_splits(tmp_path, [*trembling, boolean(at(59), True)])
-    reply = before(tmp_path, 60.0, seconds_before=60)
+    reply = before(memory_of(tmp_path), 60.0, seconds_before=60)
     below = [each for each in reply["before"] if "fell below" in each["text"]]
     assert [each["text"] for each in below] == ["/battery_state fell below 20%"]
 
@@ -103,7 +109,7 @@ def test_levels_without_a_name_are_numbers_and_long_texts_end_with_an_ellipsis(
     text = "the current is above what is allowed " * 3
     levels = [diagnostics(at(t), motor=(7, text) if t > 38 else (0, "ok")) for t in range(60)]
     write_splits(tmp_path, [*driving(60, 43), *levels])
-    reply = before(tmp_path, 43.0)
+    reply = before(memory_of(tmp_path), 43.0)
     [(sentence, _)] = told(reply)
     assert sentence.startswith("status of motor became level 7: the current is above")
     assert sentence.endswith("…")
@@ -111,26 +117,16 @@ def test_levels_without_a_name_are_numbers_and_long_texts_end_with_an_ellipsis(
     assert reply["state"] == {"status of motor": "level 7"}
 
 
-def test_how_far_back_can_be_asked(tmp_path: Path) -> None:
-    write_splits(tmp_path, ALL)
-    assert told(before(tmp_path, 43.0, seconds_before=1)) == [
-        ("/cmd_vel went to zero while a goal was active", 0.0),
-        ("/bumper became true", 0.4),
-    ]
-    assert ("/drive goal accepted", 38.0) not in told(before(tmp_path, 43.0))
-    refused = before(tmp_path, 43.0, seconds_before=61)
-    assert refused["error"] == "invalid_arguments"
-
-
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:
     late = [log_entry(at(40 + t), 30, name, "late") for t, name in ((0.4, "a"), (5.2, "f"))]
     late += [log_entry(at(41 + 0.7 * nth), 30, name, "late") for nth, name in enumerate("bcde")]
     write_splits(tmp_path, [*driving(60, 40), *late])
-    reply = before(tmp_path, 40.0)
+    memory = memory_of(tmp_path)
+    reply = before(memory, 40.0)
     assert told(reply) == [("warning of a: late", 0.0)]
     assert [(each["text"], each["s_after"]) for each in reply["after"]] == [
         ("warning of b: late", 1.0),
         ("warning of c: late", 1.7),
         ("warning of d: late", 2.4),
     ]
-    assert before(tmp_path, 50.0)["after"] == []
+    assert before(memory, 50.0)["after"] == []

@@ -1,23 +1,18 @@
 """A clock that was set while the robot drove, and what only looks like it."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ros2_memory.history import clock_steps
+from ros2_memory.history.context import Memory
 from tests.support.bags import McapLayout, Msg, battery, boolean, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -240,16 +235,8 @@ def test_a_step_back_that_several_bags_show_is_listed_once(tmp_path: Path, recor
     assert recap["counts"]["clock steps"] == 1
 
 
-WHEN = 54.95
-FLAG = {"topic": "/bumper", "condition_type": "equals", "value": False}
-
-
-def set_ahead(folder: Path) -> Memory:
-    return recorded(folder, shown=lambda t: t + 8.0 * (t > WHEN))
-
-
 def test_windows_that_adjoin_within_a_step_add_up(tmp_path: Path) -> None:
-    memory = set_ahead(tmp_path)
+    memory = recorded(tmp_path, shown=lambda t: t + 8.0 * (t > 54.95))
     cuts = [BEGIN + each for each in (0.0, 30.0, 56.0, 60.0, 63.5, 100.0)]
     lengths = [
         asked(memory, tmp_path, "recap", start=start, end=end)["duration_s"]

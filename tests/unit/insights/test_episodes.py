@@ -1,14 +1,14 @@
 """Texts and states that hold until the next: intervals, what is beside them, how often, changes."""
 
-from __future__ import annotations
-
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.history import held_values
+from ros2_memory.history.context import Memory
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
 from tests.support.bags import (
@@ -21,11 +21,6 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.memories import asked, each_way, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_784_000_000

@@ -1,22 +1,17 @@
 """Gaps within bags: a recorder that stalled, and what only looks like it."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from ros2_memory.history.context import Memory
 from ros2_memory.serving.health import Health
 from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_795_161_600

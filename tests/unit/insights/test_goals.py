@@ -1,7 +1,5 @@
 """What became of the goals of actions, in recaps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,31 +1,25 @@
 """`between`: one question about the same hours of each day, as if each were asked by itself."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterator
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.at_each import hours_of_days, in_each
 from ros2_memory.insights.sightings import find_matches
+from ros2_memory.results import Sightings
 from ros2_memory.tools.arguments import _as_hours
 from ros2_memory.tools.replies import as_json
 from tests.support.bags import odom, text, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.rooms import S, asked_of, draw, write
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
-    from ros2_memory.results import Sightings
 
 DAYS = 3
 SECONDS = 400

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +12,7 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
-from ros2_memory.results import Event, Recap
+from ros2_memory.results import Recap
 from tests.support.bags import (
     Msg,
     boolean,
@@ -38,10 +36,6 @@ BEGIN = 1_784_000_000 * S
 def over(memory: Memory, begin: float, end: float) -> Recap:
     """Of so many seconds after BEGIN."""
     return recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
-
-
-def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
-    return [(each.text, (each.start - BEGIN) / S) for each in events if each.kind == kind]
 
 
 @settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])

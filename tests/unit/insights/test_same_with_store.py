@@ -1,7 +1,5 @@
 """Every tool answers as without a store, in whatever history, and however much of it is stored."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory

@@ -1,11 +1,10 @@
 """What a planner is answered when it asks to save a moment, and for those that are saved."""
 
-from __future__ import annotations
-
 import errno
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,6 +27,7 @@ from ros2_memory.insights.saved_moments import (
     list_moments,
     remember_moment,
 )
+from ros2_memory.results import RememberedMoment
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
@@ -36,11 +36,6 @@ from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import keeper_of, recorder_at_work
 from tests.support.memories import asked, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.results import RememberedMoment
 
 S = 10**9
 T0 = 1_790_000_000 * S

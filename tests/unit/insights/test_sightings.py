@@ -1,17 +1,16 @@
-from __future__ import annotations
-
 import json
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 from ros2_memory import queries
 from ros2_memory.analysis.conditions import parse_condition
@@ -31,12 +30,10 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
-    Msg,
     boolean,
     detections,
     diagnostics,
     log_entry,
-    make,
     odom,
     text,
     tf,
@@ -48,27 +45,9 @@ from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.random_histories import write_history
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from mcap.writer import Writer
-
-
 S = 10**9
 BEGIN = 1_784_000_000 * S
 OBJECTS = "/vision/scene/scene_objects"
-
-
-def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:
-    """Detections at so many seconds after BEGIN: names separated by blanks."""
-    messages = [detections(BEGIN + round(at * S), names.split()) for at, names in said]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    return memory_of(tmp_path)
-
-
-def seconds(memory: Memory, value: str, topic: str, **given: object) -> list[tuple[float, float]]:
-    answer = find_matches(memory, Call(), OBJECTS, "contains", value, **given)  # type: ignore[arg-type]
-    return [((each.first - BEGIN) / S, (each.last - BEGIN) / S) for each in answer.sightings]
 
 
 def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
@@ -213,7 +192,7 @@ def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
         write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(at, True) for at in times])
     memory = memory_of(tmp_path)
     counts = []
-    for looks in range(1, 60):  # how often the clock may be looked at before the time is over
+    for looks in range(1, 60, 3):  # how often the clock may be looked at before the time is over
         call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
         try:
             answer = find_matches(memory, call, "/bumper", "equals", value=True)
@@ -261,7 +240,7 @@ ASKED: tuple[tuple[str, str, JsonValue], ...] = (
 )
 
 
-@settings(max_examples=examples(40), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.0, 0.5, 1.0]))
 def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
     seed: int, part: float
@@ -301,20 +280,17 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
     assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
-    for level, message in (("WARN", "slow"), ("Error", "lost")):
-        named = {"topic": "/rosout", "condition_type": "equals", "value": level}
-        newest = asked(memory, tmp_path, "find_last_match", **named)
-        assert newest["value"]["msg"] == message
     slow = find_matches(memory, Call(), "/rosout", "contains", "lo", oldest_first=True)
     assert [each.messages for each in slow.sightings] == [1, 1, 1]
-    warned = {"condition_type": "equals", "value": "WARN", "field": "status.level"}
-    assert asked(memory, tmp_path, "find_last_match", topic="/diagnostics", **warned) is not None
-    bare = {"condition_type": "equals", "value": "WARN", "topic": "/diagnostics"}
-    assert asked(memory, tmp_path, "find_last_match", **bare) is not None
-    refused = asked(
-        memory, tmp_path, "find_last_match", topic="/rosout", **warned | {"value": "OK"}
-    )
-    assert refused["error"] == "invalid_arguments"
+
+    def newest(topic: str, level: str, **more: object) -> Any:
+        named = {"topic": topic, "condition_type": "equals", "value": level, **more}
+        return asked(memory, tmp_path, "find_last_match", **named)
+
+    assert newest("/rosout", "Error")["value"]["msg"] == "lost"
+    for more in ({}, {"field": "status.level"}):
+        assert newest("/diagnostics", "WARN", **more)["timestamp"] == BEGIN / S + 5
+    assert newest("/rosout", "OK")["error"] == "invalid_arguments"
 
 
 def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_are_left_out(
@@ -362,52 +338,3 @@ def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
     refused = asked(memory, tmp_path, name, **asks, **{topic: "/bumper"})
     assert refused["error"] == "invalid_arguments"
     assert "names of levels are not known of std_msgs/msg/Bool" in refused["detail"]
-
-
-FLOAT = "std_msgs/msg/Float64"
-LATEST = QuerySettings(now="latest")
-
-
-def write_overlapping(folder: Path, messages: list[Msg], draw: Random) -> None:
-    """Writes messages as splits of any length, of recordings of which some overlap."""
-    number, recording = 0, 0
-    again: list[Msg] = []
-    while messages:
-        size = draw.randint(1, 12)
-        some, messages = messages[:size], messages[size:]
-        # A recording that took over logged later what the one before has, too.
-        copies = [
-            replace(each, log_time=each.log_time + 1000, publish_time=each.published)
-            for each in again
-        ]
-        path = folder / f"rec_{recording}" / f"rec_{recording}_{number}.mcap"
-        write_mcap(path, [*copies, *some])
-        number, again = number + 1, []
-        if draw.random() < 0.4:
-            recording, number = recording + 1, 0
-            again = [each for each in some[-3:] if some[-1].log_time - each.log_time < S]
-
-
-@settings(deadline=None, max_examples=examples(20), suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
-# One split, all of which is stored.
-@example(seed=4, part=1.0)
-def test_messages_of_one_log_time_are_told_apart(seed: int, part: float) -> None:
-    """With simulated time many share one; stored numbers are rounded, which bags have to settle.
-
-    Publish times differ: equal messages of one of these are copies where recordings overlap.
-    """
-    draw = Random(seed)
-    thirds = [draw.randint(0, 8) / 3 for _ in range(draw.randint(2, 40))]
-    messages = [
-        Msg("/load", FLOAT, BEGIN + nth // 3 * S, make(FLOAT, data=third), BEGIN + nth)
-        for nth, third in enumerate(thirds)
-    ]
-    with TemporaryDirectory() as folder:
-        bags = Path(folder)
-        write_overlapping(bags, messages, draw)
-        plain = memory_of(bags, limits=LATEST)
-        for memory in (plain, with_store(plain, bags, part=part)):
-            for asked_for in {*thirds[:3]}:
-                found = find_matches(memory, Call(), "/load", "equals", asked_for, limit=50)
-                assert sum(each.messages for each in found.sightings) == thirds.count(asked_for)

@@ -1,21 +1,15 @@
 """A detector that was blind for a while, as each tool reports it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from ros2_memory.bag_dir.state_files import LOST, Loss, append_losses
+from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, detections, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_784_000_000

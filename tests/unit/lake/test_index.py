@@ -1,7 +1,5 @@
 """What is read again of a lake, and what stays, when more is shipped; how far back searches go."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from datetime import date, timedelta
 from functools import partial

@@ -1,7 +1,5 @@
 """Bags of which a lake has some and a robot the others answer as all of them in one directory."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A fleet's server with a lake: what was shipped answers, also where no bag is left."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil

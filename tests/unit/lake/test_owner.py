@@ -1,7 +1,5 @@
 """A lake belongs to one state directory, whatever becomes of the process that writes it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a lake has of a robot's bags is read as its bags are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from random import Random

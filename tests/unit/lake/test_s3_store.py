@@ -4,8 +4,6 @@ moto is in no lock, since its server brings forty packages for this one test:
 `EPISODIC_LONG=1 uv run --with "moto[s3,server]" pytest -n0 tests/unit/lake/test_s3_store.py`.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One SELECT over a lake: whoever writes it sees the rows of some robots, and nothing else."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal

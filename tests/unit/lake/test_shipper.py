@@ -1,7 +1,5 @@
 """Each bag comes into the lake once, whatever happens while it is shipped."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """A lake answers as the bags do about robots that have little in common; and so does SQL."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

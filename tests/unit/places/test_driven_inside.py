@@ -1,7 +1,5 @@
 """What the robot drove while it was in a place, waypoints in another frame, the farthest pose."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from tempfile import TemporaryDirectory

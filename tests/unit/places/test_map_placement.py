@@ -1,9 +1,7 @@
 """Which frame places are told in, however much of the history is in the catalogue."""
 
-from __future__ import annotations
-
 from itertools import count
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
@@ -12,9 +10,6 @@ from ros2_memory.history.view import View
 from ros2_memory.places.pose_frames import map_placement
 from tests.support.memories import memory_of
 from tests.support.moving_map import write_moving_map
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_a_map_of_which_it_is_not_known_whether_transforms_lead_there_is_not_denied(

@@ -1,7 +1,5 @@
 """Visits to places of any shape, in a map that moves under odometry."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

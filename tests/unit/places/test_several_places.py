@@ -3,8 +3,6 @@
 What is expected is counted from the drawn world itself, second by second.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

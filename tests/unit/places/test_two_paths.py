@@ -1,10 +1,8 @@
 """Two ways of the robot, against points that are laid along them one by one."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -21,9 +19,6 @@ from ros2_memory.places.two_paths import (
     stood_at,
 )
 from tests.support.examples import examples
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 S = 10**9
 EVER = TimeWindow.everything()

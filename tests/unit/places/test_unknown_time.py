@@ -1,13 +1,12 @@
 """For how long it is not known where the robot was, or what another topic said (`unknown_s`)."""
 
-from __future__ import annotations
-
 import random
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -18,10 +17,6 @@ from tests.support.bags import Msg, boolean, odom, text, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.support.tables import table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
 
 S = 10**9
 T0 = 1_784_000_000

@@ -1,11 +1,10 @@
 """What the gate lets in; the token that it asks for: where it comes from, what it must be."""
 
-from __future__ import annotations
-
 import hmac
 import os
 import traceback
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import httpx2
 import pytest
@@ -26,9 +25,6 @@ from ros2_memory.serving.auth import (
     is_admitted,
     take_token,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 GOOD = "kJ7-x._~+/0123456789=="
 

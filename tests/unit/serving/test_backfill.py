@@ -1,14 +1,12 @@
 """The store of columns is filled bag by bag."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import anyio
 import anyio.lowlevel
@@ -32,10 +30,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 
 T0 = 1_700_000_000 * NS_PER_S
 

@@ -1,10 +1,10 @@
 """A query that nobody waits for any more stops: it reads no further than the bag it is in."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 
@@ -12,16 +12,11 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.storage.base import Batch, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.build import build_tools
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ros2_memory.storage.base import Batch, Record
 
 S: Final = 10**9
 BEGIN_S: Final = 1_700_000_000

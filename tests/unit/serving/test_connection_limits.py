@@ -1,19 +1,19 @@
 """Clients that keep the server waiting, on real sockets; and how much of a request is read."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket
 import struct
 import threading
 from collections import deque
+from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import anyio
 import anyio.lowlevel
 import pytest
+import uvicorn
 from starlette.responses import PlainTextResponse
 from structlog.testing import capture_logs
 
@@ -32,11 +32,6 @@ from tests.unit.serving.test_web_app import (
     client,
     running,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    import uvicorn
 
 GET = b"GET / HTTP/1.1\r\nhost: a\r\n\r\n"
 HALF = b"GET / HTTP/1.1\r\nhost: a\r\nx: "

@@ -1,15 +1,14 @@
 """Calls are dispatched: each has its turn, its time, its reply and its log event."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json
 import re
 import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import anyio
 import pytest
@@ -31,16 +30,12 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import Sample
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.results import Answer
 from ros2_memory.serving.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher
 from ros2_memory.serving.fair_queue import MOST_WAITING, FairQueue
 from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Replies, Reply
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from ros2_memory.results import Answer
 
 NOBODY = cast("Memory", SimpleNamespace(large=LargeReads()))
 """The tools of these tests ask nothing of a memory."""

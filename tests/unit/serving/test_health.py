@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import json
 import os
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import anyio
 import anyio.from_thread
@@ -15,16 +12,14 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Memory
+from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.health import NAMED, Health, keep_fresh
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
-    from ros2_memory.index.snapshot import Snapshot
 
 T0 = 1_784_023_200 * NS_PER_S
 

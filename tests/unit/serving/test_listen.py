@@ -1,7 +1,5 @@
 """Who can reach an address, and the error where the server cannot listen on it."""
 
-from __future__ import annotations
-
 import socket
 
 import pytest

@@ -1,10 +1,9 @@
 """What a client reads besides tools: resources, the prompt, and the view of MCP Apps."""
 
-from __future__ import annotations
-
 import json
 import re
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from mcp import Client
@@ -28,10 +27,6 @@ from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import VIEW_URI, EpisodicServer, view
 from ros2_memory.tools.build import build_tools, readable_tools
 from tests.support.robot_run import CALLS, write_run
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 T0 = 1_795_161_600 * NS_PER_S
 

@@ -1,18 +1,18 @@
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import httpx2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
@@ -27,6 +27,7 @@ from ros2_memory.cli.plot import asked_in
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
@@ -49,13 +50,6 @@ from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ros2_memory.core.reply import JsonObject
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S

@@ -1,22 +1,17 @@
-from __future__ import annotations
-
 import socket
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import anyio
 import httpx2
 import pytest
+from starlette.types import ASGIApp
 
 from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.serving.web_app import web_app
 from tests.unit.serving.test_dispatch import served, tool, value
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from starlette.types import ASGIApp
 
 HOME = "http://127.0.0.1:9203"
 EVERYWHERE = ".".join("0000")

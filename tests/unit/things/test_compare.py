@@ -1,8 +1,8 @@
 """What differs between two times, over bags of a robot whose map moves under its odometry."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from tests.support.bags import Msg, write_splits
 from tests.support.memories import asked, memory_of
@@ -13,11 +13,6 @@ from tests.unit.things.test_find import (
     NAMED,
     looked,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
 
 MUG = ("mug", 3.0, 0.5)
 BOOK = ("book", 3.5, -1.0)

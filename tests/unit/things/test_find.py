@@ -1,12 +1,12 @@
 """Questions about things over bags, with a robot whose map moves under its odometry."""
 
-from __future__ import annotations
-
 import json
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,11 +31,6 @@ from tests.support.bags import (
 )
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, replied
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
 
 S = 10**9
 BEGIN = 1_784_000_000

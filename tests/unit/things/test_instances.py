@@ -1,7 +1,5 @@
 """When a thing is missed, and which name it has, by its sights alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

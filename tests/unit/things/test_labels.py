@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from ros2_memory.things.labels import Labels, moves_by_itself

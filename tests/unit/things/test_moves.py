@@ -1,9 +1,9 @@
 """Things that were moved a little, and things that were not: over bags, and as sightings."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import pytest
@@ -16,10 +16,6 @@ from tests.support.bags import Msg, header, make, point, quaternion, write_split
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.unit.things.test_find import BEGIN, NAMED, S, scene
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 DAY: Final = 86_400
 DAYS: Final = 6

@@ -1,11 +1,11 @@
 """Where the catalogue is not complete and the time is short: an answer that says how far it got."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
-from typing import TYPE_CHECKING, TypeVar
+from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
@@ -20,11 +20,6 @@ from ros2_memory.things.find import find_things
 from tests.support.bags import write_splits
 from tests.support.memories import memory_of, with_store
 from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable
-    from pathlib import Path
-
 
 T = TypeVar("T")
 

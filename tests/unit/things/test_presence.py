@@ -1,7 +1,5 @@
 """When a label was at a place: which looks are evidence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, Final
 

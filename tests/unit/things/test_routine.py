@@ -1,20 +1,14 @@
 """Where a thing that moves usually is: told where it is right more often than the last place."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final, TypeAlias
+from collections.abc import Callable
+from typing import Final, TypeAlias
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from ros2_memory.results import UsualPlace
 from ros2_memory.things.routine import usual_places
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from ros2_memory.results import UsualPlace
 
 HOUR: Final = 3600 * 10**9
 DAY: Final = 24 * HOUR

@@ -1,8 +1,6 @@
 """What detectors saw, ten minutes after the other: however it is cut, and stored once."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -13,9 +11,6 @@ from ros2_memory.things.seen import Watching
 from tests.support.bags import write_splits
 from tests.support.column_worlds import World
 from tests.unit.things.test_find import HERE, looked
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize("apart_s", [0, 3 * 10**8])

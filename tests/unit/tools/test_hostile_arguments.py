@@ -1,7 +1,5 @@
 """Whatever a client sends as arguments is answered: with an answer, or with what is wrong."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

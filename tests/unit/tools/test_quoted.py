@@ -1,12 +1,13 @@
 """Texts of messages in replies: each tool that repeats one says where, whatever the text is."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 
+from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import Quoted, named, quote, quoted_keys
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
@@ -25,12 +26,6 @@ from tests.support.bags import (
 )
 from tests.support.fleets import fleet_over
 from tests.support.memories import asked, memory_of, replied, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ros2_memory.core.model import JsonValue
 
 S: Final = 10**9
 T0_S: Final = 1_784_000_000

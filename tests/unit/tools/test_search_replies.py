@@ -1,8 +1,7 @@
 """What a planner reads where it searched: a match, `null`, or what could not be searched."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,11 +20,6 @@ from tests.support.bags import (
 from tests.support.housekeepers import described, own_all
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary
 from tests.support.memories import asked, each_way, memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
 
 S = 10**9
 T0_S = 1_784_000_000

@@ -1,26 +1,20 @@
 """Times in replies: local beside Unix time over days, and as text that finds its message again."""
 
-from __future__ import annotations
-
 import json
 import re
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from ros2_memory import cli
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.rooms import BEGIN, asked_of, draw, write
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 DAY_S = 86_400
 
