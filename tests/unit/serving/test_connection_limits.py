@@ -1,11 +1,8 @@
 """Clients that keep the server waiting, on real sockets; and how much of a request is read."""
 
 import asyncio
-import json
 import socket
 import struct
-import threading
-from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import Any
@@ -24,11 +21,8 @@ from ros2_memory.serving.connection_limits import MAX_BODY_BYTES, RequestLimits
 from ros2_memory.serving.dispatch import MAX_DEPTH, MAX_VALUES, excess_in_arguments
 from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import (
-    GOOD,
     MCP_HEADERS,
-    SHOWN,
     app,
-    call_tool,
     client,
     running,
 )
@@ -290,54 +284,6 @@ async def test_a_body_in_chunks_that_are_few_or_large_enough_is_taken(size: int)
         writer.close()
 
 
-def flood(port: int, stop: threading.Event) -> int:
-    """Opens connections, sends one byte on each, and leaves it at that; how many it opened."""
-    opened = 0
-    kept: deque[socket.socket] = deque()
-    while not stop.is_set():
-        with suppress(OSError):
-            kept.append(socket.create_connection(("127.0.0.1", port), timeout=BOUND_S))
-            opened += 1
-            kept[-1].sendall(b"P")
-        if len(kept) > 300:
-            kept.popleft().close()
-    for each in kept:
-        each.close()
-    return opened
-
-
-async def test_strangers_do_not_lock_out_whoever_shows_the_token() -> None:
-    web = app(api_token=GOOD)
-    body = json.dumps(call_tool("ask"))
-    headers = {"host": "127.0.0.1", "connection": "close", "content-type": "application/json"}
-    headers |= MCP_HEADERS | SHOWN | {"content-length": str(len(body))}
-    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
-    request = f"POST /mcp HTTP/1.1\r\n{lines}\r\n{body}".encode()
-    statuses, stop = [], threading.Event()
-    async with listening(web, lifespan="on") as server:
-        port = server.servers[0].sockets[0].getsockname()[1]
-        with ExitStack() as silent:
-            for _ in range(257):
-                each = silent.enter_context(socket.create_connection(("127.0.0.1", port)))
-                each.sendall(b"P")
-                await asyncio.sleep(0)
-            flooding = asyncio.create_task(asyncio.to_thread(flood, port, stop))
-            try:
-                for _ in range(50):
-                    # Each over a connection of its own.
-                    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-                    writer.write(request)
-                    async with asyncio.timeout(BOUND_S):
-                        statuses.append((await reader.readline()).split()[1])
-                        await reader.read()
-                    writer.close()
-            finally:
-                stop.set()
-                opened = await flooding
-    assert opened
-    assert statuses == [b"200"] * 50
-
-
 @pytest.mark.usefixtures("hurried")
 async def test_peers_that_are_gone_fill_no_log(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -347,14 +293,14 @@ async def test_peers_that_are_gone_fill_no_log(
     chunked = b"POST /early HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\nzz\r\n"
     with capture_logs() as logged:
         async with serving() as served:
-            for sent in (*garbage, chunked) * 12:
+            for sent in (*garbage, chunked) * 2:
                 with socket.create_connection(("127.0.0.1", served.port)) as client:
                     # Closing then resets, so nothing can be sent any more.
                     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                     client.sendall(sent)
                     await asyncio.sleep(0)
             await served.gone()
-            for sent in (*garbage, chunked) * 12:
+            for sent in (*garbage, chunked) * 2:
                 await served.reply(sent)
             await served.gone()
     assert {each["event"] for each in logged} == {"connection_refused"}

@@ -2,7 +2,6 @@ import json
 import time
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -33,7 +32,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
 from ros2_memory.serving.page import drawn_path, span
-from ros2_memory.serving.page.drawn_path import Box, Line, path_in_box
+from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import (
     box_asked,
@@ -42,7 +41,7 @@ from ros2_memory.serving.page.routes import (
     span_request,
     window_asked,
 )
-from ros2_memory.serving.page.span import MOST_POINTS, span_shown
+from ros2_memory.serving.page.span import span_shown
 from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
@@ -84,7 +83,7 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(span, "_QUICK_S", 60.0)
 
 
-@pytest.fixture(params=["plain", "store"])
+@pytest.fixture(scope="module", params=["plain", "store"])
 def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
     found = memory_of(bag_dir)
     return with_store(found, bag_dir) if request.param == "store" else found
@@ -136,34 +135,22 @@ def test_a_span_asked_for_again_keeps_its_ends_and_what_it_holds(tmp_path: Path)
         assert (each["start"], each["end"]) == (first["start"], first["end"])
 
 
-def test_what_is_new_since_a_look_joins_what_was_shown(memory: Memory) -> None:
-    whole = shown(memory, "last=1000")
-    since = BEGIN_S + 20  # where the bag begins that is in question
-    more = shown(
-        memory, f"last=1000&since={since + 5}&things=0&status=0&version={whole['version']}x"
-    )
-    assert not {"things", "status", "range"} & set(more)
-    assert more["latest"] == whole["range"]["latest"]
-    assert more["since"] == since
-    assert more["path"]["t"][0] == since
-    assert more["path"]["continues"]
-    later = [each for each in whole["path"]["t"] if each > since]
-    assert more["path"]["t"][1:] == later
-    assert more["events_since"] == since
-    assert "whole_ms" not in more
-
-
-def test_totals_and_events_of_the_whole_span_come_with_things(memory: Memory) -> None:
+def test_a_later_look_has_what_is_new_and_totals_of_the_whole_span(memory: Memory) -> None:
     """A page that stays open would else show the length of path of its first look for ever."""
     whole = shown(memory, "last=1000")
-    more = shown(memory, f"last=1000&since={BEGIN_S + 25}&status=0")
-    assert more["events_since"] == more["start"] < more["since"] == BEGIN_S + 20
+    since = BEGIN_S + 20  # where the bag begins that is in question
+    look = f"last=1000&since={since + 5}&status=0"
+    with_things = shown(memory, look)
+    assert with_things["events_since"] == with_things["start"] < with_things["since"] == since
     for key in ("distance_m", "counts", "max_speed", "stood_s", "events"):
-        assert more[key] == whole[key]
-    assert more["whole_ms"] >= 0
-
-
-def test_nothing_is_looked_up_where_nothing_is_new(memory: Memory) -> None:
+        assert with_things[key] == whole[key]
+    assert with_things["whole_ms"] >= 0
+    more = shown(memory, f"{look}&things=0&version={whole['version']}x")
+    assert not {"things", "status", "range", "whole_ms"} & set(more)
+    assert more["latest"] == whole["range"]["latest"]
+    assert more["since"] == more["events_since"] == since
+    assert more["path"]["continues"]
+    assert more["path"]["t"] == [since, *(each for each in whole["path"]["t"] if each > since)]
     version = shown(memory)["version"]
     assert set(shown(memory, f"version={version}")) == {"version", "unchanged", "now"}
 
@@ -256,19 +243,6 @@ def test_a_track_that_is_cut_is_where_the_whole_one_is(
         assert found.times[0] == window.start
 
 
-@given(st.integers(1, 5_000), st.floats(0, 1), st.integers(0, 2**32 - 1))
-def test_points_of_a_long_path_are_bounded_and_reach_from_its_first_to_its_last(
-    count: int, pieces: float, seed: int
-) -> None:
-    random = np.random.default_rng(seed)
-    x, y = random.normal(size=(2, count)).cumsum(axis=1)
-    times = BEGIN + np.cumsum(random.integers(1, 10**9, count))
-    kept = Line(times, x, y, random.random(count) < pieces).simplified(0.05, MOST_POINTS).tolist()
-    assert len(kept) <= MOST_POINTS
-    assert all(one < other for one, other in pairwise(kept))
-    assert {0, count - 1} <= {*kept}
-
-
 def test_a_path_of_many_corners_is_drawn_by_a_bounded_number_of_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -337,37 +311,35 @@ def paths_in(memory: Memory, start_s: int, stop_s: int) -> Any:
     return Recordings(memory).paths(memory, Call(), window)["paths"]
 
 
-def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
-    tmp_path: Path,
+@pytest.mark.parametrize(
+    ("driven", "expected"),
+    [
+        # Wren's two recordings follow each other, robin drives beside them, and jay long before.
+        (
+            {"jay": (-900, 0), "robin": (0, 10), "wren/a": (0, 20), "wren/b": (11, 30)},
+            {
+                (0, 30): {"robin": (10, 20), "wren": (20, 40)},
+                (-1000, 30): {"jay": (0, 10), "robin": (10, 20), "wren": (20, 40)},
+                (-1000, -800): {},
+            },
+        ),
+        (
+            {"hall/robin": (0, 0), "hall/wren": (0, 100), "yard/jay": (0, 200)},
+            {(0, 30): {"hall/robin": (0, 10), "hall/wren": (100, 110), "yard": (200, 210)}},
+        ),
+    ],
+    ids=["a folder of recordings", "a folder of robots"],
+)
+def test_robots_that_overlap_have_a_path_each(
+    tmp_path: Path, driven: dict[str, tuple[int, int]], expected: dict[tuple[int, int], object]
 ) -> None:
-    """Wren's two recordings follow each other, robin drives beside them, and jay long before."""
-    for name, begins, x in (
-        ("jay", -900, 0),
-        ("robin", 0, 10),
-        ("wren/a", 0, 20),
-        ("wren/b", 11, 30),
-    ):
-        at_s = [n / 10 for n in range(101)]
-        messages = [odom(BEGIN + int((begins + s) * S), x + s, 0.0) for s in at_s]
-        write_mcap(tmp_path / name / "0.mcap", messages)
+    for name, (begins, x) in driven.items():
+        poses = [odom(BEGIN + begins * S + n * S // 10, x + n / 10, 0.0) for n in range(101)]
+        write_mcap(tmp_path / name / "0.mcap", poses)
     memory = memory_of(tmp_path)
-
-    def paths(start_s: int, stop_s: int) -> dict[str, tuple[float, float]]:
-        found = paths_in(memory, start_s, stop_s)
-        return {each["name"]: (each["x"][0], each["x"][-1]) for each in found}
-
-    assert paths(0, 30) == {"robin": (10, 20), "wren": (20, 40)}
-    assert paths(-1000, 30) == {"jay": (0, 10), "robin": (10, 20), "wren": (20, 40)}
-    assert paths(-1000, -800) == {}
-
-
-def test_robots_within_one_folder_have_a_path_each_beside_another_folder(tmp_path: Path) -> None:
-    for name, x in (("hall/robin", 0), ("hall/wren", 100), ("yard/jay", 200)):
-        messages = [odom(BEGIN + n * S // 10, x + n / 10, 0.0) for n in range(101)]
-        write_mcap(tmp_path / name / "0.mcap", messages)
-    found = paths_in(memory_of(tmp_path), 0, 30)
-    ends = {path["name"]: (path["x"][0], path["x"][-1]) for path in found}
-    assert ends == {"hall/robin": (0, 10), "hall/wren": (100, 110), "yard": (200, 210)}
+    for span_s, ends in expected.items():
+        found = paths_in(memory, *span_s)
+        assert {each["name"]: (each["x"][0], each["x"][-1]) for each in found} == ends
 
 
 def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
