@@ -64,7 +64,6 @@ UNMEASURED: Final = (
     "test_outline.py",
     "test_path_length.py",
     "test_real_bags.py",
-    "test_recorded_sessions.py",
     "test_region_visits.py",
     "test_reply_size.py",
     "test_repository.py",

@@ -1,7 +1,6 @@
 from datetime import datetime
 from zoneinfo import ZoneInfo
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -46,17 +45,6 @@ windows = st.builds(
     st.integers(1_700_000_000 * S, 1_800_000_000 * S),
     st.integers(1, 50 * 86_400 * S),
 )
-
-
-@given(windows, st.sampled_from(["day", "hour", "weekday"]), st.sampled_from(ZONES))
-def test_bins_partition_the_window(window: TimeWindow, by: ClockBin, name: str) -> None:
-    bins = time_bins(window, by, zone(name))
-    assert bins.edges[0] == window.start
-    assert bins.edges[-1] == window.stop
-    assert (np.diff(bins.edges) > 0).all()
-    assert bins.member.any(axis=0).all()
-    assert (bins.member.sum(axis=1) == 1).all()
-    assert bins.lengths([window.start], [window.stop]).sum() == window.stop - window.start
 
 
 @given(windows, st.sampled_from(["day", "hour", "weekday"]), st.sampled_from(ZONES), st.data())

@@ -129,6 +129,7 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
     own = {robot: alone(folder, robot, name, given) for robot in NAMES}
     times = sorted((newest(row) for one in own.values() for row in one[rows]), reverse=True)
     assert [newest(row) for row in found[rows]] == times[:limit]
+    assert found.get("more", False) is (len(times) > limit)
     for key in {"total", "minutes"} & found.keys():
         assert found[key] == pytest.approx(sum(one[key] for one in own.values()))
     labels = sum((Counter(one.get("labels", {})) for one in own.values()), Counter[str]())
@@ -163,7 +164,7 @@ def test_a_topic_has_one_row_with_the_robots_that_record_it(folder: Path) -> Non
 
 
 @pytest.mark.parametrize("oldest_first", [False, True])
-@pytest.mark.parametrize("limit", [1, 2, 3])
+@pytest.mark.parametrize("limit", [1, 3])
 def test_rows_that_have_no_place_are_left_out_but_count(
     folder: Path, limit: int, oldest_first: bool
 ) -> None:

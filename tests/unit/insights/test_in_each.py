@@ -65,7 +65,7 @@ QUESTIONS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("tool", QUESTIONS)
 @pytest.mark.parametrize(
     ("hours", "first", "last"),
-    [("23:59-00:02", -60, 120), ("00:01 to 00:03:30", 60, 210), ("23:00-23:59", -3600, -60)],
+    [("23:59-00:02", -60, 120), ("23:00-23:59", -3600, -60)],
 )
 def test_each_window_has_the_answer_that_it_has_alone(
     memory: Memory, folder: Path, tool: str, hours: str, first: int, last: int
@@ -105,15 +105,6 @@ def _without_ages(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_ages(each) for key, each in value.items() if key != "ago_s"}
     return value
-
-
-def test_without_bounds_it_is_all_that_is_recorded(memory: Memory, folder: Path) -> None:
-    reply = asked(memory, folder, "visits", where="kitchen", between=["23:00", "01:00"])
-    assert [row["local"] for row in reply["windows"]] == [
-        "Tue 2026-07-14 23:58:00 - Wed 2026-07-15 01:00:00",
-        "Wed 2026-07-15 23:00:00 - Thu 2026-07-16 01:00:00",
-        "Thu 2026-07-16 23:00:00 - Fri 2026-07-17 00:04:39",
-    ]
 
 
 def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory, folder: Path) -> None:

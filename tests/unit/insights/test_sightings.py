@@ -1,34 +1,23 @@
 import json
 import math
-import random
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from ros2_memory import queries
-from ros2_memory.analysis.conditions import parse_condition
-from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
-    NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.reverse_search import ReverseSearch
-from ros2_memory.history.view import View
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     boolean,
     detections,
@@ -40,10 +29,8 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.examples import examples
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, memory_of, with_store
-from tests.support.random_histories import write_history
+from tests.support.memories import asked, memory_of
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -207,65 +194,6 @@ def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
     assert counts[0] < bags * 10 == counts[-1]
 
 
-def grouped(
-    memory: Memory, topic: str, kind: str, value: JsonValue
-) -> list[tuple[str, int, int, int]]:
-    """What sightings are, read off all messages in order."""
-    condition = parse_condition(kind, value, memory.limits.position_tolerance_m)
-    view = View(memory, Call(), memory.clock.now())
-    search = ReverseSearch(view, topic, condition)
-    rows: list[list[tuple[str, int]]] = []
-    under_way: dict[str, list[tuple[str, int]]] = {}
-    backwards = view.stream.messages(search.topics, TimeWindow.everything(), newest_first=True)
-    for each in reversed(list(backwards)):
-        name = each.record.channel.topic
-        row = under_way.get(name)
-        if not search.matches(each):
-            under_way.pop(name, None)
-        elif row is None or each.time - row[-1][1] > SILENCE_NS:
-            under_way[name] = [(name, each.time)]
-            rows.append(under_way[name])
-        else:
-            row.append((name, each.time))
-    told = [(row[0][0], row[0][1], row[-1][1], len(row)) for row in rows]
-    return sorted(told, key=lambda each: (-each[2], each[0]))
-
-
-ASKED: tuple[tuple[str, str, JsonValue], ...] = (
-    ("/vision/*", "contains", "cup"),
-    ("/vision/a", "contains", "e"),
-    ("/bumper", "equals", True),
-    ("/odom", "near_position", {"x": 0.0, "y": 0.0}),
-    ("/dock", "contains", "docked"),
-)
-
-
-@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.0, 0.5, 1.0]))
-def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
-    seed: int, part: float
-) -> None:
-    draw = random.Random(seed)
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        write_history(bag_dir, draw)
-        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
-        memory = with_store(plain, bag_dir, part=part)
-        for topic, kind, value in ASKED:
-            try:
-                expected = grouped(plain, topic, kind, value)
-            except NoDataError:
-                continue
-            answer = find_matches(memory, Call(), topic, kind, value, limit=100)
-            told = [(each.topic, each.first, each.last, each.messages) for each in answer.sightings]
-            assert sorted(told, key=lambda each: (-each[2], each[0])) == expected, (topic, value)
-            assert [each[2] for each in told] == sorted((each[2] for each in told), reverse=True)
-            assert find_matches(memory, Call(), topic, kind, value, limit=100) == answer
-            oldest = find_matches(memory, Call(), topic, kind, value, limit=2, oldest_first=True)
-            assert oldest.sightings == tuple(reversed(answer.sightings))[:2]
-            assert oldest.total == len(answer.sightings)
-
-
 def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) -> None:
     lines = [(20, "begins"), (30, "slow"), (40, "lost"), (30, "slow"), (20, "ends")]
     logged = [log_entry(BEGIN + n * S, level, "nav", said) for n, (level, said) in enumerate(lines)]
@@ -280,8 +208,12 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
     assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
-    slow = find_matches(memory, Call(), "/rosout", "contains", "lo", oldest_first=True)
-    assert [each.messages for each in slow.sightings] == [1, 1, 1]
+    slow = find_matches(memory, Call(), "/rosout", "contains", "lo", oldest_first=True, limit=2)
+    assert [((each.first - BEGIN) / S, each.messages) for each in slow.sightings] == [
+        (1, 1),
+        (2, 1),
+    ]
+    assert slow.total == 3
 
     def newest(topic: str, level: str, **more: object) -> Any:
         named = {"topic": topic, "condition_type": "equals", "value": level, **more}
@@ -290,7 +222,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
     assert newest("/rosout", "Error")["value"]["msg"] == "lost"
     for more in ({}, {"field": "status.level"}):
         assert newest("/diagnostics", "WARN", **more)["timestamp"] == BEGIN / S + 5
-    assert newest("/rosout", "OK")["error"] == "invalid_arguments"
+    assert newest("/rosout", "OK", field="status.level")["error"] == "invalid_arguments"
 
 
 def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_are_left_out(
@@ -321,18 +253,22 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
     assert not [each for each in recap.get("notes", ()) if "foxglove.Log" in each]
 
 
-@pytest.mark.parametrize("name", ["find_matches", "find_last_match", "get_value_when", "by"])
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [
+        ("find_matches", {}),
+        ("find_matches", {"by": "day"}),
+        ("find_last_match", {}),
+        ("get_value_when", {"value_topic": "/odom"}),
+    ],
+)
 def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
-    tmp_path: Path, name: str
+    tmp_path: Path, name: str, more: dict[str, str]
 ) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(BEGIN, 0.0, 0.0), boolean(BEGIN, True)])
     memory = memory_of(tmp_path)
-    asks = {"condition_type": "above", "field": "level", "value": "WARN"}
-    topic = "condition_topic" if name == "get_value_when" else "topic"
-    if name == "get_value_when":
-        asks["value_topic"] = "/odom"
-    if name == "by":
-        name, asks["by"] = "find_matches", "day"
+    asks = {"condition_type": "above", "field": "level", "value": "WARN", **more}
+    topic = "condition_topic" if "value_topic" in more else "topic"
     missing = asked(memory, tmp_path, name, **asks, **{topic: "/rosout"})
     assert (missing["error"], missing["reason"]) == ("no_data", "topic_not_recorded")
     refused = asked(memory, tmp_path, name, **asks, **{topic: "/bumper"})

@@ -33,10 +33,10 @@ from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
 
 S = 10**9
-DAY = 86_400 * S
 BEGIN = 1_784_000_000 * S
 
 
+SOUND = "no loss or fault was found"
 DRIVEN = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)]
 
 
@@ -72,36 +72,43 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     assert shown(memory, tmp_path)["newest_age_s"] == 50.0
 
 
-def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole(
-    tmp_path: Path,
+def lost(kind: str, begin_s: float, stop_s: float, count: int = 0, topic: str = "/odom") -> Loss:
+    return Loss(topic, BEGIN + round(begin_s * S), BEGIN + round(stop_s * S), count, kind)
+
+
+@pytest.mark.parametrize(
+    ("now", "losses", "doubts"),
+    [
+        (
+            "wall",
+            [lost("stamps", 10, 11, 4), lost("counter", 20, 21, 3)],
+            (
+                "3 messages lost before they were recorded: /odom (3); 4 messages missing by the "
+                "cadence of header stamps (never published, or lost): /odom (4)"
+            ),
+        ),
+        (
+            "wall",
+            [lost("refused", 10, 11.5), lost("refused", 13, 14.5)],
+            (
+                f"messages of a publisher of /odom were not recorded from {BEGIN // S + 10}.000000"
+                f" to {BEGIN // S + 14}.500000 (4.5 s), as its QoS or type did not fit the "
+                "subscription: how many is not known"
+            ),
+        ),
+        # A simulation has another clock than the recorder that ended unexpectedly.
+        ("latest", [lost("died", 51, 52, topic="*")], SOUND),
+    ],
+)
+def test_what_was_lost_is_a_doubt(
+    tmp_path: Path, now: Literal["wall", "latest"], losses: list[Loss], doubts: str
 ) -> None:
     memory = remembering(tmp_path)
+    memory = replace(memory, limits=replace(memory.limits, now=now))
     beat(tmp_path, BEGIN + 59 * S, lost={"/odom": 7})
-    append_losses(
-        tmp_path,
-        [
-            Loss("/odom", BEGIN + 10 * S, BEGIN + 11 * S, 4, "stamps"),
-            Loss("/odom", BEGIN + 20 * S, BEGIN + 21 * S, 3, "counter"),
-        ],
-    )
+    append_losses(tmp_path, losses)
     told = shown(memory, tmp_path)
-    assert told["lost_last_hour"] == {"/odom": 7}
-    assert told["doubts"] == (
-        "3 messages lost before they were recorded: /odom (3); 4 messages missing by the cadence "
-        "of header stamps (never published, or lost): /odom (4)"
-    )
-
-
-def test_what_a_publisher_sent_that_did_not_fit_is_said_to_be_missing(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
-    spans = [(BEGIN + 10 * S, BEGIN + 11 * S + 1), (BEGIN + 13 * S, BEGIN + 14 * S + 1)]
-    append_losses(tmp_path, [Loss("/odom", *span, 0, "refused") for span in spans])
-    sentence = (
-        f"messages of a publisher of /odom were not recorded from {BEGIN // S + 10}.000000 to "
-        f"{BEGIN // S + 14}.000000 (4 s), as its QoS or type did not fit the subscription: "
-        "how many is not known"
-    )
-    assert shown(memory, tmp_path)["doubts"] == sentence
+    assert (told["doubts"], told["lost_last_hour"]) == (doubts, {"/odom": 7})
 
 
 def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Path) -> None:
@@ -111,8 +118,8 @@ def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Pat
         write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
     memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 36 * S))
     beat(tmp_path, BEGIN + 35 * S)
-    assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
-    append_losses(tmp_path, [Loss("*", BEGIN + 9 * S, BEGIN + 24 * S, 0, "hung")])
+    assert shown(memory, tmp_path)["doubts"] == SOUND
+    append_losses(tmp_path, [lost("hung", 9, 24, topic="*")])
     assert shown(memory, tmp_path)["doubts"] == (
         f"nothing was recorded from {BEGIN // S + 9}.500000 to {BEGIN // S + 18}.500000 (9 s), "
         "because ros2 bag record hung"
@@ -124,14 +131,12 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
 ) -> None:
     memory = remembering(tmp_path)  # up to 49 s; asked at 60 s
     beat(tmp_path, BEGIN + 59 * S)
-    assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
     append_losses(
         tmp_path,
         [
-            Loss("*", BEGIN + 51 * S, BEGIN + 52 * S + 1, 0, "died"),
-            Loss("*", BEGIN + 53 * S, BEGIN + 54 * S + 1, 0, "unclean"),
-            # The clock was ahead then.
-            Loss("*", BEGIN + 7 * DAY, BEGIN + 8 * DAY, 0, "hung"),
+            lost("died", 51, 52, topic="*"),
+            lost("unclean", 53, 54, topic="*"),
+            lost("hung", 7 * 86_400, 8 * 86_400, topic="*"),  # the clock was ahead then
         ],
     )
     after = f"after {BEGIN // S + 49}.000000 messages may be missing, because "
@@ -148,28 +153,15 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     assert after not in shown(memory, tmp_path)["doubts"]
 
 
-def test_a_simulation_has_another_clock_than_what_ended_unexpectedly(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
-    memory = replace(memory, limits=replace(memory.limits, now="latest"))
-    append_losses(tmp_path, [Loss("*", BEGIN + 51 * S, BEGIN + 52 * S + 1, 0, "died")])
-    assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
-
-
 def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
-    append_losses(
-        tmp_path,
-        [
-            Loss("/odom", BEGIN + 10 * S, BEGIN + 11 * S, 1, "counter"),
-            Loss("/odom", BEGIN + 30 * S, BEGIN + 31 * S, 6, "counter"),
-        ],
-    )
+    append_losses(tmp_path, [lost("counter", 10, 11, 1), lost("counter", 30, 31, 6)])
     begin = BEGIN / S
-    for start, lost in ((0, 1), (12, 0), (25, 6)):
+    for start, count in ((0, 1), (12, 0), (25, 6)):
         window = {"start": begin + start, "end": begin + start + 15}
         found = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", **window)
         notes = [note for note in found.get("notes", ()) if "lost" in note]
-        assert [int(note[0]) for note in notes] == [lost] * bool(lost)
+        assert [int(note[0]) for note in notes] == [count] * bool(count)
     asks = {"start": begin, "end": begin + 20, "with_start": begin + 21, "with_end": begin + 45}
     notes = asked(memory, tmp_path, "compare", **asks)["notes"]
     assert "from start to end: 1 message lost before it was recorded: /odom (1)" in notes
@@ -216,16 +208,13 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
 
 
 def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, kept=RetentionLimits(10**6, 7 * DAY))
+    memory = remembering(tmp_path, kept=RetentionLimits(10**6, 7 * 86_400 * S))
     beat(tmp_path, BEGIN + 59 * S, counted_bytes=4_900_000, state_bytes=4_700_000)
     budget = shown(memory, tmp_path)["budget"]
     assert (budget["used_gb"], budget["state_gb"]) == (0.0049, 0.0047)
     beat(tmp_path, BEGIN + 59 * S, counted_bytes=200_000, state_bytes=50_000)
     budget = shown(memory, tmp_path)["budget"]
     assert (budget["used_gb"], budget["state_gb"]) == (0.0002, 0.00005)
-
-
-SOUND = "no loss or fault was found"
 
 
 @pytest.mark.parametrize("fills", [False, True])
@@ -289,24 +278,27 @@ class TestWhatIsMissingIsNamedAndCounted:
         assert young not in doubts(memory_of(tmp_path, clock=clock))
 
     @pytest.mark.parametrize(
-        ("listed", "doubts"),
+        ("listed", "beside", "doubts"),
         [
             (
                 [("rec_0.mcap", 5), *((f"rec_{n}.mcap", 20) for n in range(1, 14))],
+                "other.json",
                 "lists 12 missing files and 255 messages that no file here contains",
             ),
             (
                 [("rec_0.mcap", 5), ("rec_1.mcap", 255)],
+                "other.json",
                 "metadata.yaml of rec lists 250 messages that no file here contains",
             ),
-            ([("rec_0.mcap", 5), ("rec_1.mcap", 5)], SOUND),
-            ([("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5)], SOUND),  # compressed by file
+            ([("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5)], "other.json", SOUND),  # compressed
+            ([("rec_0.mcap", 9), ("rec_1.mcap", 9)], "handover.json", SOUND),  # cut by a handover
         ],
     )
     def test_splits_and_messages_that_metadata_lists(
-        self, tmp_path: Path, listed: list[tuple[str, int]], doubts: str
+        self, tmp_path: Path, listed: list[tuple[str, int]], beside: str, doubts: str
     ) -> None:
         self.recording(tmp_path / "rec", *listed)
+        (tmp_path / "rec" / beside).write_text("{}")
         assert self.doubts(tmp_path).endswith(doubts)
 
     def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
@@ -331,8 +323,3 @@ class TestWhatIsMissingIsNamedAndCounted:
         (tmp_path / "bags" / "rec").symlink_to(tmp_path / "outside")
         (absent,) = memory.absent_splits(snapshot)
         assert (absent.files, absent.unreadable) == ((), True)
-
-    def test_splits_cut_by_a_handover_hold_fewer_than_listed(self, tmp_path: Path) -> None:
-        self.recording(tmp_path / "rec", ("rec_0.mcap", 9), ("rec_1.mcap", 9))
-        (tmp_path / "rec" / "handover.json").write_text("{}")
-        assert self.doubts(tmp_path) == SOUND

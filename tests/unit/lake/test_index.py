@@ -100,19 +100,6 @@ def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
         assert shipping.lake.days_read() == looked_at
 
 
-def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shipping) -> None:
-    """A question that is under way reads the bag that it found."""
-    shipping.ship([START_S])
-    robot = shipping.robot()
-    [bag] = robot.index.refresh().bags
-    shipping.ship([START_S - 60], label="fork")
-    late, same = robot.index.refresh().bags
-    assert same == bag
-    assert late.file != bag.file
-    [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(bag.start, bag.end + 1))
-    assert b"cup" in record.payload
-
-
 def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     shipping: Shipping, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,14 +155,19 @@ def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_r
 
 
 def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:
-    """As of a robot that was set up again: its recordings may have names of before."""
+    """As of a robot that was set up again: its recordings may have names of before.
+
+    A question that is under way reads the bag that it found.
+    """
     robot = shipping.robot()
     shipping.ship([START_S - 2 * DAY_S], name="rec_0")
     shipping.ship([START_S], name="rec_0")
-    assert len({bag.file for bag in robot.index.refresh().bags}) == 2
+    before = robot.index.refresh().bags
+    assert len({bag.file for bag in before}) == 2
     shipping.ship([START_S - DAY_S], name="rec_0")
     bags = robot.index.refresh().bags
     assert len({bag.file for bag in bags}) == 3
+    assert [bags[0], bags[2]] == [*before]
     for bag in bags:
         [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
         assert record.log_time == bag.start

@@ -4,7 +4,6 @@ import importlib.util
 import json
 import shutil
 import threading
-from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -101,21 +100,6 @@ def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
     nothing = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 500})
     assert nothing["error"] == "no_data"
     assert ("lake" in json.dumps(nothing)) is not left
-
-
-def test_what_is_not_shipped_yet_is_answered_from_the_robots_own_bags(tmp_path: Path) -> None:
-    write_bag(tmp_path / "hall", 0)
-    ship_from(tmp_path)
-    new = write_bag(tmp_path / "hall", 1)
-    write_mcap(new.with_name("rec_2.mcap"), [text((START_S + 20) * NS_PER_S, "on", "/light")])
-    fleet, cup = served(tmp_path), {**CUP, "robot": "hall"}
-    for begin in (START_S + 10, datetime.fromtimestamp(START_S + 10, UTC).isoformat()):
-        found = reply(fleet, "find_matches", {**cup, "start": begin})
-        assert (found["total"], "from the lake" in str(found)) == (1, False)
-    recap = reply(fleet, "recap", {"around": START_S + 12, "robot": "hall"})
-    assert "the memory ends" not in str(recap)
-    light: dict[str, object] = {"topic": "/light", "condition_type": "contains", "value": "on"}
-    assert reply(fleet, "find_last_match", light)["matches"][0]["timestamp"] == START_S + 20
 
 
 def test_what_retention_deleted_and_what_is_not_shipped_yet_are_in_one_answer(

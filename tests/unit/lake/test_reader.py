@@ -16,7 +16,7 @@ from ros2_memory.history.context import Memory
 from ros2_memory.lake.memory import LakeIndex
 from ros2_memory.lake.tables import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
-from ros2_memory.storage.base import BagReader, Channel, Schema
+from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lakes import (
@@ -58,30 +58,6 @@ def both(tmp_path: Path) -> tuple[Memory, Memory]:
             messages.append(Msg("/camera", "sensor_msgs/msg/Image", at + 3, image, at - 5))
         write_mcap(tmp_path / "bags" / f"r{recording}" / "one_0.mcap", messages)
     return shipped(tmp_path)
-
-
-def test_bags_and_their_messages_are_those_of_the_robot(both: tuple[Memory, Memory]) -> None:
-    bags, robot = both
-    theirs, own = bags.index.snapshot().bags, robot.index.snapshot().bags
-    folder = str(bags.index.bag_dir)
-    assert [bag.file for bag in own] == [bag.file.replace(folder, "/hall") for bag in theirs]
-    for bag, other in zip(theirs, own, strict=True):
-        assert other[1:7] == bag[1:7]
-        topics = ["/chatter", "/even", "/nothing"]
-        for window in (EVERYTHING, TimeWindow(bag.start + 2 * NS_PER_S, bag.end)):
-            for newest_first in (False, True):
-                found = robot.reader.records(other.path, topics, window, newest_first=newest_first)
-                expected = bags.reader.records(bag.path, topics, window, newest_first=newest_first)
-                assert [*found] == [*expected]
-            for topic in (*topics, "/camera"):
-                times = times_of(robot.reader, other.path, topic, window)
-                assert times == times_of(bags.reader, bag.path, topic, window)
-        assert {*robot.reader.channels(other.path)} == {*bags.reader.channels(bag.path)}
-
-
-def times_of(reader: BagReader, path: Path, topic: str, window: TimeWindow) -> list[int]:
-    batches = reader.batches(path, [topic], window, bare=[topic])
-    return sorted(time for batch in batches for time in batch.log_times.tolist())
 
 
 def test_recordings_that_a_handover_joins_are_one_run_of_odometry(tmp_path: Path) -> None:

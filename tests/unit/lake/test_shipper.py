@@ -17,7 +17,6 @@ from ros2_memory.bag_dir.state_files import append_receipts, read_receipts
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.store import FILE
 from ros2_memory.columns.units import GoneError
-from ros2_memory.core.errors import LakeError
 from ros2_memory.lake import shipper as shipper_module
 from ros2_memory.lake.rows import RowMaker
 from ros2_memory.lake.tables import TABLES
@@ -251,28 +250,6 @@ def test_read_only_bags_are_shipped_and_reported_and_nothing_is_written_beside_t
         done = ship(tmp_path / "lake", [robot])
         assert (done.bags, done.problems, values(tmp_path / "lake")) == (1, [], [])
     assert not (own / "shipped.jsonl").exists()
-
-
-def test_a_store_that_fails_loses_nothing(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robots = [robot_bags(name, fleet / name) for name in ROBOTS]
-    commit = SqlCatalog.commit_table
-    calls = 0
-
-    def full(*given: object) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == 4:
-            raise OSError(28, "No space left on device")
-        return commit(*given)  # type: ignore[arg-type]
-
-    with shipping(tmp_path, robots) as shipper:
-        monkeypatch.setattr(SqlCatalog, "commit_table", full)
-        with pytest.raises(LakeError, match="No space left on device"):
-            shipper.run()
-        assert shipper.run().bags == 2 * BAGS
-    assert values(tmp_path) == EXPECTED
 
 
 def test_what_pyiceberg_refuses_is_committed_from_a_fresh_look(

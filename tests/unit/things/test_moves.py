@@ -7,13 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.core.arrays import Ints
 from ros2_memory.things.places import Sightings, stays_in
 from tests.support.bags import Msg, header, make, point, quaternion, write_splits
-from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.unit.things.test_find import BEGIN, NAMED, S, scene
 
@@ -76,7 +73,7 @@ NOISE: Final = [
 @pytest.mark.parametrize("noise", NOISE)
 def test_nearly_all_small_moves_are_found_and_none_is_made_up(noise: dict[str, Any]) -> None:
     right = 0
-    for seed in range(40):
+    for seed in range(20):
         draw = np.random.default_rng(seed)
         still = [sightings(draw, [(0.0, 0.0)] * 12, **noise) for _ in LABELS]
         assert not any(stay.any() for stay in stays_of(still))
@@ -87,24 +84,7 @@ def test_nearly_all_small_moves_are_found_and_none_is_made_up(noise: dict[str, A
             moved.append(sightings(draw, [(0.0, 0.0)] * 10 + [new] * 2, **noise))
         truth = [0] * 20 + [1] * 4
         right += sum(stay.tolist() == truth for stay in stays_of(moved))
-    assert right >= 0.99 * 40 * len(LABELS)
-
-
-@settings(max_examples=examples(40), deadline=None)
-@given(
-    seed=st.integers(0, 2**32),
-    turn=st.floats(0, 2 * math.pi),
-    off=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
-)
-def test_stays_do_not_depend_on_where_the_map_begins(
-    seed: int, turn: float, off: tuple[float, float]
-) -> None:
-    draw = np.random.default_rng(seed)
-    moved = [(0.0, 0.0)] * 6 + [(draw.uniform(0, 600), 0.0)] * 4
-    seen = sightings(draw, moved, bias_mm=50.0, sides=5)
-    turned = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
-    other = seen._replace(xy=seen.xy @ turned + np.array(off), side=seen.side @ turned)
-    assert stays_of([seen])[0].tolist() == stays_of([other])[0].tolist()
+    assert right >= 0.99 * 20 * len(LABELS)
 
 
 # -- while localisation was poor -----------------------------------------------------------------

@@ -57,39 +57,6 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
             )
 
 
-@given(_looks, _unplaced, _looks, st.lists(st.booleans(), min_size=120, max_size=120))
-def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
-    given_looks: list[tuple[int, int, int, int]],
-    unplaced: dict[int, int],
-    others: list[tuple[int, int, int, int]],
-    is_second: list[bool],
-) -> None:
-    cells, hits = _seen([*given_looks, *others], unplaced)
-    place = np.array(is_second, np.int64)[: len(hits)]
-    places = np.array([[3000.0, 100.0], [500.0, -2000.0]])
-    found = evidence_at(cells, _ANYWHERE, places, hits, place, **UNPLACED)
-    stays = [*stays_at(cells, found)]
-
-    assert stays == sorted(stays, key=lambda each: each[0])
-    for nth in (0, 1):
-        mine = hits[place == nth]
-        alone = evidence_at(
-            cells,
-            _ANYWHERE,
-            places[[nth]],
-            mine,
-            np.zeros(len(mine), np.int64),
-            **UNPLACED,
-        )
-        at_once = found.at(nth)
-        assert at_once.looks.tolist() == alone.looks.tolist()
-        assert at_once.hits.tolist() == alone.hits.tolist()
-        assert at_once.fair.tolist() == alone.fair.tolist()
-        assert [stay for of, stay in stays if of == nth] == [
-            stay for _, stay in stays_at(cells, alone)
-        ]
-
-
 @pytest.mark.parametrize(("every", "sees"), [(50, False), (2, True)])
 def test_a_cell_sees_a_place_if_some_hits_come_close_to_each_other(every: int, sees: bool) -> None:
     """From a dock, a detector of 1 Hz has false detections at a place now and then."""

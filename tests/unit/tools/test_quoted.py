@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import Quoted, named, quote, quoted_keys
 from ros2_memory.fleet.tools import fleet_tools
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
@@ -25,7 +25,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.fleets import fleet_over
-from tests.support.memories import asked, memory_of, replied, with_store
+from tests.support.memories import asked, memory_of, replied
 
 S: Final = 10**9
 T0_S: Final = 1_784_000_000
@@ -146,14 +146,17 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("stored", [False, True], ids=["bags", "store"])
+@pytest.fixture(scope="module", params=[False, True], ids=["bags", "store"])
+def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
+    return memory_of(bag_dir, recalls=request.param)
+
+
 @pytest.mark.parametrize("what", CALLS)
 def test_a_reply_says_first_where_it_repeats_what_messages_say(
-    bag_dir: Path, what: str, stored: bool
+    memory: Memory, bag_dir: Path, what: str
 ) -> None:
     tool, given, places = CALLS[what]
-    memory = memory_of(bag_dir)
-    reply = asked(with_store(memory, bag_dir) if stored else memory, bag_dir, tool, **given)
+    reply = asked(memory, bag_dir, tool, **given)
     require_marked(reply)
     assert {*places} <= {*reply["quoted"]}
 
@@ -195,10 +198,11 @@ def test_a_frame_that_is_named_by_a_sentence_is_marked(
     require_marked({key: part for key, part in reply.items() if key != "notes"})
 
 
-@pytest.mark.parametrize("most", [500, 700, 1500])
+@pytest.mark.parametrize("most", [500, 1500])
 def test_a_reply_that_is_shortened_keeps_its_mark(bag_dir: Path, most: int) -> None:
+    memory = memory_of(bag_dir)
     for tool, given, _ in CALLS.values():
-        text = replied(memory_of(bag_dir), bag_dir, tool, given, max_chars=most).text
+        text = replied(memory, bag_dir, tool, given, max_chars=most).text
         assert len(text) <= most
         assert json.loads(text)["quoted"]
 

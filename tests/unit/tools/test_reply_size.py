@@ -29,11 +29,11 @@ def strict(text: str) -> Any:
     return json.loads(text, parse_constant=refuse)
 
 
-def samples(count: int, value: Any = None) -> dict[str, Any]:
+def samples(count: int) -> dict[str, Any]:
     return {
         "topic": "/odom",
         "total": count,
-        "samples": [{"timestamp": 1.5 + n, "value": value or {"x": n}} for n in range(count)],
+        "samples": [{"timestamp": 1.5 + n, "value": {"x": n}} for n in range(count)],
     }
 
 
@@ -55,23 +55,17 @@ def test_a_reply_never_passes_the_cap_and_is_always_valid(
 
 
 @given(st.integers(2, 3000), st.integers(1000, 30_000))
-def test_a_thinned_range_keeps_its_ends_and_stays_in_order(count: int, cap: int) -> None:
-    kept = strict(fit_reply(samples(count), cap))["samples"]
-    times = [row["timestamp"] for row in kept]
-    assert times[0] == 1.5
-    assert times[-1] == 0.5 + count
-    assert times == sorted(set(times))
-
-
-@given(st.integers(40, 3000), st.integers(1500, 30_000))
-def test_a_thinned_range_is_evenly_spaced_and_uses_the_room(count: int, cap: int) -> None:
-    reply = samples(count)
-    shown = strict(fit_reply(reply, cap))
+def test_a_thinned_range_keeps_its_ends_is_evenly_spaced_and_uses_the_room(
+    count: int, cap: int
+) -> None:
+    shown = strict(fit_reply(samples(count), cap))
     kept = [row["timestamp"] for row in shown["samples"]]
-    gaps = [after - before for before, after in pairwise(kept)]
-    assert max(gaps) - min(gaps) <= 1
-    if len(kept) < count:
-        assert len(to_json_text(shown)) > cap - 800
+    assert (kept[0], kept[-1]) == (1.5, 0.5 + count)
+    gaps = {after - before for before, after in pairwise(kept)}
+    assert min(gaps) > 0
+    if count >= 40 and cap >= 1500:
+        assert max(gaps) - min(gaps) <= 1
+        assert len(kept) == count or len(to_json_text(shown)) > cap - 800
 
 
 @given(st.integers(2, 300), st.integers(1, 60), st.integers(600, 6000))
