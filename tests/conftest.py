@@ -14,7 +14,7 @@ from unittest.mock import patch
 
 import pytest
 import structlog
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
 
 from tests.support.composed import shipped_once
@@ -33,7 +33,12 @@ if TYPE_CHECKING:
     from ros2_memory.typestore import MessageType
 
 # A loaded machine is slow, not wrong.
-settings.register_profile("steady", deadline=None, max_examples=examples(100))
+settings.register_profile(
+    "steady",
+    deadline=None,
+    max_examples=examples(100),
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("steady")
 
 # Also for the programs that tests start: nothing is to be left in the user's own.

@@ -1,7 +1,6 @@
 """Positions come from whatever carries one, and refusals name what does."""
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
@@ -72,8 +71,7 @@ def remembered(bag_dir: Path, recalls: bool) -> Memory:
 
 
 def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
-    limits = QuerySettings(**given.pop("limits", {}))
-    return asked(replace(remembered(bag_dir, recalls), limits=limits), bag_dir, tool, **given)
+    return asked(remembered(bag_dir, recalls), bag_dir, tool, **given)
 
 
 GLOBAL = "px4_msgs/msg/VehicleGlobalPosition"

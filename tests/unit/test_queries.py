@@ -2,17 +2,10 @@
 
 from pathlib import Path
 
-import pytest
-
 from ros2_memory import queries
-from ros2_memory.core.errors import (
-    NoDataError,
-    NoDataReason,
-)
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from tests.support.bags import (
-    Msg,
     command,
     detections,
     odom,
@@ -41,14 +34,6 @@ def test_nothing_seen_in_the_newest_message_does_not_make_a_field_unknown(tmp_pa
     assert (answer.found, answer.notes) == (None, ())
 
 
-def test_a_path_of_which_nothing_can_be_decoded_has_no_answer(tmp_path: Path) -> None:
-    broken = Msg("/odom", odom(T0, 0, 0).type, T0, b"\x00\x01\x00\x00")
-    write_mcap(tmp_path / "a" / "a_0.mcap", [broken])
-    with pytest.raises(NoDataError) as caught:
-        queries.trajectory_summary(memory_of(tmp_path), Call(), span(0, 10))
-    assert caught.value.reason is NoDataReason.UNDECODABLE
-
-
 def test_a_field_that_one_type_of_a_topic_has_is_shown_of_its_messages(tmp_path: Path) -> None:
     poses = [odom(T0 + n * S, n, 0.0) for n in range(3)]
     write_mcap(tmp_path / "a" / "a_0.mcap", poses)
@@ -73,12 +58,3 @@ def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: P
         "the memory begins",
         "the memory ends",
     ]
-
-
-def test_without_a_bag_directory_it_is_not_reported_that_nothing_was_recorded(
-    tmp_path: Path,
-) -> None:
-    memory = memory_of(tmp_path / "away")
-    with pytest.raises(NoDataError, match=r"the bag directory does not exist.*check \.\.\./away"):
-        queries.list_recorded_topics(memory, Call())
-    assert queries.list_recorded_topics(memory_of(tmp_path), Call()) == ()

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import NS_PER_S
@@ -55,7 +55,7 @@ def shown(row: dict[str, Any]) -> dict[str, Any]:
     return {key: row[key] for key in row if key not in {"first", "last"}}
 
 
-@settings(max_examples=examples(10), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(10))
 @given(
     seed=st.integers(0, 10_000),
     stored=st.booleans(),

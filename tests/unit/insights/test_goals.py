@@ -118,7 +118,7 @@ def test_a_search_of_a_window_finds_what_ended_in_it_by_a_status_that_there_is(
 ENDS = st.sampled_from([4, 5, 6])
 
 
-@settings(max_examples=examples(15), deadline=None)
+@settings(max_examples=examples(15))
 @given(
     st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), ENDS), min_size=1, max_size=4),
     st.integers(1, 5),

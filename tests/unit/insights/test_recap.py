@@ -1,11 +1,7 @@
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import FLAG, MOST
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -23,9 +19,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
-from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
-from tests.unit.analysis.motion.test_standstills import world
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -34,36 +28,6 @@ BEGIN = 1_784_000_000 * S
 def over(memory: Memory, begin: float, end: float) -> Recap:
     """Of so many seconds after BEGIN."""
     return recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
-
-
-@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    legs=st.lists(
-        st.tuples(st.floats(2.9, 4.1) | st.floats(4.1, 12.0), st.floats(1.0, 4.0)),
-        min_size=1,
-        max_size=4,
-    ),
-    parts=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=6),
-    recalls=st.booleans(),
-)
-def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
-    legs: list[tuple[float, float]], parts: list[float], recalls: bool
-) -> None:
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        driven = [(2.0, 0.5)]
-        for stands, drives in legs:
-            driven += [(stands, 0.0), (drives, 0.5)]
-        poses = world(driven, begin=0.0).poses
-        write_splits(bag_dir, [odom(BEGIN + at, x, 0.0, 0.0) for at, (x, *_) in poses], 7.3)
-        memory = memory_of(bag_dir, recalls=recalls)
-        end = sum(length for length, _ in driven)
-        # No part is so short that no pose is in it.
-        inner = {round(0.1 + part * (end - 0.2), 1) for part in parts}
-        edges = [0.0, *sorted(inner), end]
-        whole = over(memory, 0.0, end)
-        stood = [over(memory, *span).stood or 0 for span in pairwise(edges)]
-        assert sum(stood) == pytest.approx(whole.stood or 0, abs=0.02 * S)
 
 
 def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any, Final, Literal
 
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -59,9 +59,7 @@ QUESTIONS: Final[list[tuple[str, dict[str, Any]]]] = [
 ]
 
 
-@settings(
-    max_examples=60 if LONG else 2, deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
+@settings(max_examples=60 if LONG else 2)
 @given(
     kind=st.sampled_from(["moving map", "things"]),
     seed=st.integers(0, 2**32),

@@ -9,10 +9,7 @@ import pytest
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.state_files import (
-    SCREENED,
-    Excluded,
     Loss,
-    ScreenState,
     append_losses,
 )
 from ros2_memory.history.context import Call, Memory, QuerySettings
@@ -111,21 +108,6 @@ def test_what_was_lost_is_a_doubt(
     assert (told["doubts"], told["lost_last_hour"]) == (doubts, {"/odom": 7})
 
 
-def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Path) -> None:
-    for name, seconds in (("a", range(20)), ("b", range(37, 50)), ("c", range(60, 70))):
-        (tmp_path / name).mkdir()
-        messages = [odom(BEGIN + t * S // 2, 0.0, 0.0, 0.0) for t in seconds]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
-    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 36 * S))
-    beat(tmp_path, BEGIN + 35 * S)
-    assert shown(memory, tmp_path)["doubts"] == SOUND
-    append_losses(tmp_path, [lost("hung", 9, 24, topic="*")])
-    assert shown(memory, tmp_path)["doubts"] == (
-        f"nothing was recorded from {BEGIN // S + 9}.500000 to {BEGIN // S + 18}.500000 (9 s), "
-        "because ros2 bag record hung"
-    )
-
-
 def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     tmp_path: Path,
 ) -> None:
@@ -168,17 +150,6 @@ def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_p
     assert (
         "from with_start to with_end: 6 messages lost before they were recorded: /odom (6)" in notes
     )
-
-
-def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
-    beat(tmp_path, BEGIN + 59 * S, held_back="1 split is not served")
-    SCREENED.write(tmp_path, ScreenState(excluded=[Excluded(0, 10**9)]))
-    told = shown(memory, tmp_path)
-    assert told["doubts"] == "1 split is not served"
-    [note] = told["notes"]
-    assert note.startswith("excluded by the rules of recording.exclude_when")
-    assert note.endswith(": 0.000000 to 1.000000")
 
 
 @pytest.mark.parametrize(("now", "told"), [("wall", ("died", False)), ("latest", (None, None))])

@@ -79,29 +79,6 @@ def test_a_server_starts_though_the_folder_of_a_robot_hangs_and_names_it(
     assert [row["robot_name"] for row in found["matches"]] == ["attic"]
 
 
-@pytest.mark.parametrize("left", [0, 1], ids=["none", "the newest"])
-def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
-    tmp_path: Path, left: int
-) -> None:
-    bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
-    ship_from(tmp_path)
-    for bag in bags[: 2 - left]:
-        bag.unlink()
-    fleet = served(tmp_path)
-    asked = {"robot": "hall", "topic": "/chatter"}
-    old = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 1})
-    assert old["value"] == {"value": "n1"}
-    assert ("from the lake" in str(old.get("notes"))) is not left
-    new = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 11})
-    assert new["value"] == {"value": "n101"}
-    assert ("notes" in new) is not left
-    found = reply(fleet, "data_time_range", {"robot": "hall"})
-    assert found["earliest"] == START_S
-    nothing = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 500})
-    assert nothing["error"] == "no_data"
-    assert ("lake" in json.dumps(nothing)) is not left
-
-
 def test_what_retention_deleted_and_what_is_not_shipped_yet_are_in_one_answer(
     tmp_path: Path,
 ) -> None:
@@ -115,6 +92,11 @@ def test_what_retention_deleted_and_what_is_not_shipped_yet_are_in_one_answer(
     def answer(tool: str, **given: object) -> Any:
         return reply(fleet, tool, {"robot": "hall", **given})
 
+    old = answer("get_topic_at_time", topic="/chatter", timestamp=START_S + 1)
+    assert (old["value"], "from the lake" in str(old["notes"])) == ({"value": "n1"}, True)
+    assert answer("data_time_range")["earliest"] == START_S
+    nothing = answer("get_topic_at_time", topic="/chatter", timestamp=START_S + 500)
+    assert (nothing["error"], "lake" in json.dumps(nothing)) == ("no_data", False)
     newest = answer("find_last_match", **CUP)
     assert (newest["timestamp"], "notes" in newest) == (START_S + 20, False)
     assert answer("find_matches", **CUP)["sightings"][0]["count"] == 3

@@ -29,9 +29,12 @@ def test_the_first_hub_keeps_the_lake_and_another_is_refused_until_it_is_given_u
         ):
             hub(tmp_path, "other").claim()
         hub(tmp_path, "one").claim()  # also after it was killed
-        # That of an older version keeps others out, too.
-        own = json.loads(owner_file(tmp_path).read_text())
-        owner_file(tmp_path).write_text(json.dumps({"id": own["id"], "pid": 1, "until": 0}))
+    # The file of an older version keeps others out, too.
+    own = json.loads(owner_file(tmp_path).read_text())
+    owner_file(tmp_path).write_text(json.dumps({"id": own["id"], "pid": 1, "until": 0}))
+    hub(tmp_path, "one").claim()
+    with pytest.raises(LakeError, match="another writer"):
+        hub(tmp_path, "other").claim()
     owner_file(tmp_path).unlink()
     hub(tmp_path, "other").claim()
     # What the first would commit now is refused.

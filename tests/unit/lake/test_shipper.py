@@ -64,29 +64,6 @@ def values(folder: Path) -> list[str]:
 EXPECTED = sorted(f"n{bag * 100 + nth}" for _ in ROBOTS for bag in range(BAGS) for nth in range(3))
 
 
-def test_every_message_is_in_the_lake_once_and_again_after_a_second_pass(
-    fleet: Path, tmp_path: Path
-) -> None:
-    done = ship(tmp_path, [robot_bags(name, fleet / name) for name in ROBOTS])
-    assert (done.bags, done.waiting, done.problems) == (2 * BAGS, 0, [])
-    assert values(tmp_path) == EXPECTED
-    assert lake_column(tmp_path, "sightings", "label") == ["cup"] * 2 * BAGS
-    snapshots = _snapshots(tmp_path)
-    again = ship(tmp_path, [robot_bags(name, fleet / name) for name in ROBOTS])
-    assert (again.bags, again.waiting, again.problems) == (0, 0, [])
-    assert _snapshots(tmp_path) == snapshots
-    for name in ROBOTS:
-        receipts = read_receipts(fleet / name)
-        assert receipts.keys() == {f"rec/rec_{number}.mcap" for number in range(BAGS)}
-        ids = {each.bag_id for each in receipts.values()}
-        assert ids <= {str(each) for each in lake_column(tmp_path, "bags", "bag_id")}
-
-
-def _snapshots(folder: Path) -> dict[str, int]:
-    with location(folder).writable() as lake:
-        return {name: len(lake.current(name).snapshots()) for name in TABLES}
-
-
 def test_a_bag_directory_that_hangs_is_named_and_the_others_are_shipped(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

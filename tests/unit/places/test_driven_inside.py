@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -95,7 +95,7 @@ def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of
 SECONDS = 200
 
 
-@settings(max_examples=examples(8), suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(8))
 @given(
     seed=st.integers(0, 10_000),
     stored=st.booleans(),

@@ -60,6 +60,8 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
         alone = visits(moving, Call(), where=name, limit=100)
         assert (by_name[name].entries, by_name[name].exits) == (alone.entries, alone.exits)
         assert by_name[name].duration == alone.duration
+        few = visits(moving, Call(), where=name, limit=1)
+        assert (few.total, few.visits, few.more) == (alone.total, alone.visits[:1], alone.total > 1)
         arrivals = [each.arrived for each in alone.visits]
         # Nobody saw the robot enter where it was from the beginning on.
         if name == "start":
@@ -109,32 +111,3 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         [found] = asked(memory, tmp_path, "find_matches", where=name, **hello)["sightings"]
         assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
         assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
-
-
-@pytest.mark.parametrize("laps", [6, 50])
-def test_counts_of_visits_depend_on_no_limit_and_are_those_of_the_table(
-    tmp_path: Path, laps: int
-) -> None:
-    """In every second lap no pose is in the spot, but the line between two."""
-    write_mcap(
-        tmp_path / "rec/rec_0.mcap",
-        [
-            odom(BEGIN + (lap * 60 + n) * S, x, y)
-            for lap in range(laps)
-            for n in range(60)
-            for x, y in [(n - 10.0 + lap % 2 / 2, 0.0) if n < 20 else (15.0 - n / 2, 3.0)]
-        ],
-    )
-    memory = spots(memory_of(tmp_path), spot=Circle(0.5, 0.0, 0.2))
-    [row] = asked(memory, tmp_path, "visits")["places"]
-    for limit in (1, 2, 20):
-        reply = asked(memory, tmp_path, "visits", where="spot", limit=limit)
-        assert (reply["total"], reply["entries"], reply["exits"], reply["minutes"]) == (
-            (row["entries"], row["entries"], row["exits"], row["minutes"])
-        )
-        assert len(reply["visits"]) == min(limit, reply["total"])
-        assert reply.get("more", False) is (limit < reply["total"])
-        arrivals = [visit["arrived"] for visit in reply["visits"]]
-        assert arrivals == sorted(arrivals, reverse=True)
-    if laps == 6:
-        assert reply["total"] == 3

@@ -10,12 +10,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.insights.sightings import find_matches
+from ros2_memory.history.context import Memory
 from tests.support.bags import (
     boolean,
     octets,
@@ -26,7 +24,7 @@ from tests.support.bags import (
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
-from tests.support.moving_map import S, write_moving_map
+from tests.support.moving_map import S
 from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, write
 from tests.support.tables import table
 
@@ -52,7 +50,7 @@ def memory(folder: Path) -> Memory:
     return asked_of(folder, stored=True)
 
 
-@settings(max_examples=examples(8), suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(8))
 @example(seed=23, stored=False, rooms=["hall", "kitchen"])  # comes in with the newest pose
 @given(
     seed=st.integers(0, 10_000),
@@ -212,18 +210,3 @@ def test_what_no_message_of_another_topic_can_meet_is_refused(
     for by in ({}, {"by": "hour"}):
         refused = asked(memory, tmp_path, "find_matches", **cup, **by)
         assert said in refused["detail"]
-
-
-def test_the_frame_of_the_robot_is_the_map_or_the_one_asked_for(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 1, seconds=20)
-    memory = memory_of(tmp_path)
-
-    def robot(**given: Any) -> str:
-        [found] = find_matches(memory, Call(), SEEN, "contains", "cup", limit=1, **given).sightings
-        assert found.robot is not None
-        return found.robot.frame_id
-
-    assert robot() == "map"
-    assert robot(frame_id="odom") == "odom"
-    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
-        robot(frame_id="moon")

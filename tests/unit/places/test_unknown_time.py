@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -62,7 +62,7 @@ def brute(times: Sequence[int], first: int, last: int, start: int, end: int) -> 
     return sum(max(0, min(b, end) - max(a, start)) for a, b in apart)
 
 
-@settings(max_examples=examples(25), suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25))
 @given(seed=st.integers(0, 2**32), split_s=st.sampled_from([5, 10, 60]), stored=st.booleans())
 def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: bool) -> None:
     draw = random.Random(seed)

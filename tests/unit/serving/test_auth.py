@@ -232,15 +232,6 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     assert "none" in reply
 
 
-def test_a_server_that_others_can_reach_needs_one() -> None:
-    with pytest.raises(ConfigError, match=r"^MEMORY_API_TOKEN: missing") as caught:
-        take_token({}, host="robot.lan", loopback=False)
-    for reply in ("'robot.lan'", "MEMORY_API_TOKEN_FILE", "LoadCredential", "127.0.0.1"):
-        assert reply in str(caught.value)
-    token = take_token({"MEMORY_API_TOKEN": GOOD}, host="robot.lan", loopback=False)
-    assert token is not None
-
-
 def test_a_server_on_the_loopback_address_may_have_one_which_what_it_starts_has_not() -> None:
     for none in ({}, {"MEMORY_API_TOKEN": "", "MEMORY_API_TOKEN_FILE": ""}):
         assert take_token(none, host="127.0.0.1", loopback=True) is None

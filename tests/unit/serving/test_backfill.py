@@ -3,7 +3,6 @@
 import os
 import sqlite3
 import sys
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -12,18 +11,15 @@ import anyio
 import anyio.lowlevel
 import pytest
 
-from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.cli.maintenance.index import fill_store
-from ros2_memory.columns import fill
-from ros2_memory.columns.fill import Batch, Filling, Progress, StoreLimits
+from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.writing import Level
-from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.context import Memory
 from ros2_memory.serving.backfill import BACKLOG, Backfill, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
@@ -34,11 +30,11 @@ from tests.support.memories import memory_of
 T0 = 1_700_000_000 * NS_PER_S
 
 
-def bag(bag_dir: Path, number: int, *, finish: bool = True) -> Path:
+def bag(bag_dir: Path, number: int) -> Path:
     start = T0 + number * 10 * NS_PER_S
     messages = [odom(start + n * NS_PER_S, number + n / 10, 0.0) for n in range(10)]
     path = bag_dir / "rec" / f"rec_{number}.mcap"
-    return write_mcap(path, messages, McapLayout(finish=finish, chunk_size=300))
+    return write_mcap(path, messages, McapLayout(chunk_size=300))
 
 
 def storing(
@@ -62,21 +58,6 @@ def outlines_in(bag_dir: Path) -> list[tuple[int, str]]:
 def stored(memory: Memory) -> list[str]:
     assert memory.scanner.store is not None
     return sorted(memory.scanner.store.paths())
-
-
-def test_a_bag_that_cannot_be_stored_is_told_of_and_not_tried_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bag(tmp_path, 0)
-    memory, backfill = storing(tmp_path)
-
-    def damaged(*_: object, **__: object) -> Iterator[None]:
-        raise BagError("rec_0.mcap", "damaged in the middle")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(fill, "undecoded", damaged)
-        assert fill_store(backfill) == Progress(1, 0, 0, 1)
-    assert len(queries.list_recorded_topics(memory, Call())) == 1
 
 
 def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
@@ -123,17 +104,6 @@ def test_bags_that_a_crash_left_open_keep_nothing_from_being_joined(
             query = "SELECT kind, start_ns FROM fragment WHERE kind LIKE 'path-joined%'"
             joined.append(base.execute(query).fetchall())
     assert joined[0] == joined[1] != []
-
-
-def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path: Path) -> None:
-    bag_dir, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
-    bag(bag_dir, 0)
-    memory, backfill = storing(bag_dir)
-    fill_store(backfill)
-    bag_dir.rename(elsewhere)
-    backfill.prune()
-    elsewhere.rename(bag_dir)
-    assert stored(memory) == ["rec/rec_0.mcap"]
 
 
 async def test_what_is_stored_of_many_deleted_bags_goes_with_the_next_round(tmp_path: Path) -> None:

@@ -98,10 +98,6 @@ def shown(memory: Memory, query: str = "", **more: Any) -> Any:
     return received(span_shown(memory, Call(), span_request(QueryParams(query)), **more))
 
 
-def moment(memory: Memory, query: str) -> Any:
-    return received(moment_asked(QueryParams(query), memory, Call()))
-
-
 def test_a_first_look_has_all_that_the_page_draws(memory: Memory) -> None:
     found = shown(memory, "last=1000")
     assert found["range"]["gaps"] == [[BEGIN_S + 39.9, BEGIN_S + 140]]
@@ -265,26 +261,6 @@ def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
     assert kept[0]["arguments"] == '{"n": 4}'
     assert len(str(kept[0]["answer"])) <= 2_000
     assert log.count == 5
-
-
-def test_one_recording_answers_alone_and_all_are_listed(memory: Memory) -> None:
-    recordings = Recordings(memory)
-    one = recordings.alone("rec_1")
-    found = shown(one, "last=1000")
-    assert found["range"]["earliest"] == BEGIN_S + 20
-    assert found["range"]["latest"] == BEGIN_S + 39.9
-    assert (found["path"]["x"][0], found["robot"]["x"]) == (10.0, 20.0)
-    assert found["status"]["recorder"] is None
-    assert moment(one, f"t={BEGIN_S + 5}")["robot"] is None
-    listed = recordings.shown(one, Call())
-    assert listed["recordings"] == [
-        {"name": "rec_2", "start": BEGIN_S + 140, "end": BEGIN_S + 159.9},
-        {"name": "rec_1", "start": BEGIN_S + 20, "end": BEGIN_S + 39.9},
-        {"name": "rec_0", "start": BEGIN_S, "end": BEGIN_S + 19.9},
-    ]
-    assert listed["mixed"] == []
-    # What belongs to the same recording later is asked of the same memory.
-    assert recordings.alone("rec_1") is one
 
 
 @pytest.mark.parametrize("name", ["rec_9", "rec", "", ".", "../page0", "rec_1/..", "rec_1/x"])
@@ -466,44 +442,15 @@ def off_line(path: dict[str, Any], points: NDArray[np.float64]) -> NDArray[np.fl
     return nearest
 
 
-def circles(folder: Path, laps: int) -> tuple[Memory, NDArray[np.float64]]:
-    """It drives circles of 1 m, 20 poses a second, 5 cm from one to the next."""
-    angles = np.arange(126 * laps) * 0.05
-    poses = np.stack([np.sin(angles), 1 - np.cos(angles)], axis=1)
-    messages = [odom(BEGIN + n * S // 20, x, y) for n, (x, y) in enumerate(poses.tolist())]
-    write_mcap(folder / "bag.mcap", messages)
-    return memory_of(folder), poses
-
-
-@pytest.mark.parametrize(
-    "box",
-    [
-        Box(-2, -2, 2, 3, 0.01),
-        Box(-0.2, -0.1, 0.2, 0.2, 0.001),
-        Box(0.99, 0.9, 1.01, 1.1, 0.0002),
-        Box(-9, -9, 9, 9, 0.1),
-        Box(5, 5, 6, 6, 0.001),
-    ],
-)
-def test_no_pose_in_a_box_is_a_pixel_off_the_path_that_is_drawn(tmp_path: Path, box: Box) -> None:
-    memory, poses = circles(tmp_path, laps=3)
-    window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
-    found: Any = path_in_box(memory, Call(), window, box)
-    assert found["exact"]
-    assert found["t"] == sorted(found["t"])
-    is_in = (poses >= [box.x0, box.y0]) & (poses <= [box.x1, box.y1])
-    inside = poses[is_in.all(axis=1)]
-    if len(inside):
-        assert off_line(found, inside).max() <= box.pixel_m + 1e-4
-    else:
-        assert found["t"] == []
-
-
 def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drawn_path, "MOST_POINTS", 400)
-    memory, poses = circles(tmp_path, laps=8)
+    angles = np.arange(126 * 8) * 0.05  # eight laps of a circle of 1 m
+    poses = np.stack([np.sin(angles), 1 - np.cos(angles)], axis=1)
+    messages = [odom(BEGIN + n * S // 20, x, y) for n, (x, y) in enumerate(poses.tolist())]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    memory = memory_of(tmp_path)
     window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
     found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.002))
     assert 100 < len(found["x"]) <= 400

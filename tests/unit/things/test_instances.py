@@ -28,8 +28,8 @@ def bag_of(
     )
 
 
-def seen_at(x: float, y: float, label: str = "mug") -> list[PlacedDetection]:
-    return [PlacedDetection(label, (x, y, 0.7))]
+def seen_at(x: float, y: float) -> list[PlacedDetection]:
+    return [PlacedDetection("mug", (x, y, 0.7))]
 
 
 def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None:

@@ -90,7 +90,7 @@ CALLS: Final[dict[str, tuple[str, dict[str, object], list[str]]]] = {
 """By what is asked: the tool, its arguments, and where the attack stands in its reply."""
 
 
-def spoken_to(bag_dir: Path, said: str = ATTACK) -> Path:
+def spoken_to(bag_dir: Path) -> Path:
     """A drive of 30 s with a stop, on which everything that can hold a text says the same."""
     messages = [odom(T0 + n * S // 10, min(n, 100) / 20, 0.0) for n in range(300)]
     messages += [
@@ -102,13 +102,13 @@ def spoken_to(bag_dir: Path, said: str = ATTACK) -> Path:
     ]
     for n in range(30):
         at = T0 + n * S
-        messages.append(text(at, said, "/speech"))
-        messages.append(detections(at, [said] if n >= 10 else [], topic="/vision/objects"))
+        messages.append(text(at, ATTACK, "/speech"))
+        messages.append(detections(at, [ATTACK] if n >= 10 else [], topic="/vision/objects"))
         messages.append(boolean(at, n >= 14))
     for n in (9, 11, 13):
-        messages.append(log_entry(T0 + n * S, 40, "driver", said))
-    messages.append(diagnostics(T0 + S, **{said: (0, "")}))
-    messages.append(diagnostics(T0 + 8 * S, **{said: (2, said)}))
+        messages.append(log_entry(T0 + n * S, 40, "driver", ATTACK))
+    messages.append(diagnostics(T0 + S, **{ATTACK: (0, "")}))
+    messages.append(diagnostics(T0 + 8 * S, **{ATTACK: (2, ATTACK)}))
     messages.sort(key=lambda each: each.log_time)
     return write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
 

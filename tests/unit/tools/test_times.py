@@ -48,18 +48,6 @@ def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does
     assert found["timestamp"] == hours[1] / NS_PER_S
 
 
-def test_a_date_without_dashes_is_refused_where_seconds_are_meant(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [text(BEGIN * NS_PER_S, "here", "/chatter")])
-    memory = memory_of(tmp_path)
-    for given in ({"start": 20261121}, {"end": 20261121.0}, {"around": 20261121}):
-        reply = asked(memory, tmp_path, "recap", **given)
-        assert reply["error"] == "invalid_arguments"
-        assert "as Unix seconds is in 1970; the date is 2026-11-21" in reply["detail"]
-    reply = asked(memory, tmp_path, "get_topic_at_time", topic="/chatter", timestamps=[20261121])
-    assert "the date is 2026-11-21" in reply["detail"]
-    assert "error" not in asked(memory, tmp_path, "recap", start=20269999, end=BEGIN)
-
-
 S = 10**9
 T0 = 1_795_144_010
 """Of messages at 10 Hz, each 45,892,003 ns after a tenth of a second, along x at 1 m/s."""
