@@ -12,6 +12,7 @@ from ros2_memory.history.context import Memory
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
 from tests.support.bags import (
+    battery,
     boolean,
     octets,
     odom,
@@ -83,6 +84,20 @@ def test_changes_are_one_row_for_each_value_with_what_held_at_the_start(memory: 
     assert few["notes"][0].startswith("the first 2 of 3 changes: to continue")
     docked = ask(memory, "get_topic_in_range", topic="/docked", changes=True, **window)
     assert [row["value"] for row in docked["changes"]] == [False, True]
+
+
+def test_numbers_are_written_as_everywhere_else(tmp_path: Path) -> None:
+    """A float32 holds 0.10000000149011612 where 0.1 was meant."""
+    write_mcap(
+        tmp_path / "a" / "a_0.mcap", [battery((BEGIN + n) * S, n // 5 / 10) for n in range(15)]
+    )
+    given = {"topic": "/battery_state", "start": BEGIN, "end": BEGIN + 14, "fields": ["percentage"]}
+    for stored in (False, True):
+        memory = memory_of(tmp_path, recalls=stored)
+        reply = ask(memory, "get_topic_in_range", changes=True, **given)
+        assert [row["value"] for row in reply["changes"]] == [0, 0.1, 0.2]
+        reply = ask(memory, "get_topic_in_range", by="value", **given)
+        assert {row[0] for row in reply["rows"]} == {"0", "0.1", "0.2"}
 
 
 @each_way

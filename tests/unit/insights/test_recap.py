@@ -16,6 +16,8 @@ from tests.support.bags import (
     log_entry,
     make,
     odom,
+    tf,
+    transform,
     write_mcap,
     write_splits,
 )
@@ -62,6 +64,18 @@ PLACES = (
 def in_places(memory: Memory, frame_id: str = "map") -> Memory:
     places = tuple(replace(each, frame_id=frame_id) for each in PLACES)
     return replace(memory, limits=replace(memory.limits, places=places))
+
+
+def test_a_stop_in_which_the_map_jumps_is_where_it_began(tmp_path: Path) -> None:
+    messages = [odom(BEGIN + n * S // 20, 0.0, 2.0, 0.0) for n in range(1200)]
+    for n in range(600):
+        x = 60.5 if n >= 300 else 0.0
+        at = BEGIN + n * S // 10 + S // 50
+        messages.append(tf(at, transform(at, "map", "odom", (x, 0.0, 0.0))))
+    write_splits(tmp_path, messages)
+    events = over(in_places(memory_of(tmp_path)), 0, 60).events
+    [stop] = [each for each in events if each.kind == "stop"]
+    assert (stop.text, stop.places) == ("stood at x 0.00, y 2.00", ("room",))
 
 
 def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
