@@ -210,8 +210,8 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
 
 
 class TestWhatIsMissingIsNamedAndCounted:
-    def doubts(self, folder: Path, storage: str = "mcap") -> str:
-        doubts = shown(memory_of(folder, storage=storage), folder)["doubts"]
+    def doubts(self, folder: Path) -> str:
+        doubts = shown(memory_of(folder), folder)["doubts"]
         assert isinstance(doubts, str)
         return doubts
 

@@ -18,7 +18,6 @@ from mcp.types import CallToolResult, TextContent
 from structlog.testing import LogCapture
 
 from ros2_memory import results
-from ros2_memory.columns.fill import Progress
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -58,13 +57,12 @@ def value(shown: Any) -> results.TopicValue:
 def served(
     *tools: Tool,
     timeout_s: float = 25.0,
-    progress: Callable[[], Progress] | None = None,
     **options: Any,
 ) -> EpisodicServer:
     replies = Replies(Path("bags"), 24_000)
     dispatcher = Dispatcher(NOBODY, tools, replies, call_timeout_s=timeout_s, **options)
     about = {"name": "episodic", "version": "1.2.3", "instructions": "Ask away."}
-    return EpisodicServer(dispatcher, **about, progress=progress)
+    return EpisodicServer(dispatcher, **about)
 
 
 def sent(result: CallToolResult) -> Any:

@@ -22,7 +22,6 @@ MCP_HEADERS = {"accept": "application/json, text/event-stream"}
 
 def app(
     host: str = "127.0.0.1",
-    background: Any = anyio.sleep_forever,
     api_token: str | None = None,
     recorder: dict[str, Any] | None = None,
 ) -> ASGIApp:
@@ -36,7 +35,7 @@ def app(
         server,
         host=host,
         health=health,
-        background=background,
+        background=anyio.sleep_forever,
         api_token=api_token,
         page=page_routes(server.dispatcher),
     )
