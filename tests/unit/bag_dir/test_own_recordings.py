@@ -237,7 +237,9 @@ class TestWhatAKillLeaves:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(own_recordings, "_SPARE_LINES", 0)
-        own = begun(tmp_path)
+        own = claimed(tmp_path)
+        own.begin(A)
+        (tmp_path / A).mkdir()
         own.complete(A)
         own.begin(B)
         named_in_heartbeat(tmp_path, A, B)
