@@ -173,6 +173,7 @@ class JsonLog(Generic[_T]):
         target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         append_durably(target, self.text(rows))
+        give_to_owner(target, bag_dir)
         return target.stat().st_size
 
     def replace(self, bag_dir: Path, rows: Iterable[_T]) -> None:
@@ -184,6 +185,7 @@ class JsonLog(Generic[_T]):
         target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         write_durably(target, self.text(rows))
+        give_to_owner(target, bag_dir)
 
 
 @dataclass(eq=False, repr=False)
@@ -191,7 +193,6 @@ class JsonDocument(Generic[_T]):
     """A document in the bag directory, which holds one value of a dataclass.
 
     Args:
-        is_ascii: whether other characters are escaped, as paths need that are not UTF-8.
         most_bytes: a longer file is not read.
 
     Attributes:
@@ -202,7 +203,6 @@ class JsonDocument(Generic[_T]):
     name: str
     content: type[_T]
     _: KW_ONLY
-    is_ascii: bool = True
     most_bytes: int = MAX_SMALL_FILE
 
     def __post_init__(self) -> None:
@@ -235,7 +235,8 @@ class JsonDocument(Generic[_T]):
         target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         content = {"format": _FORMAT, **self._adapter.dump_python(value)}
-        text = json.dumps(content, ensure_ascii=self.is_ascii, separators=(",", ":"))
+        # Escaped, as paths need that are not UTF-8.
+        text = json.dumps(content, separators=(",", ":"))
         write_durably(target, text, mode=READABLE)
 
     def remove(self, bag_dir: Path) -> None:
@@ -323,6 +324,14 @@ def state_path(bag_dir: Path, name: str) -> Path:
     if path.parent != bag_dir and path.parent.is_symlink():
         raise OSError(errno.ELOOP, "it is a symbolic link, which is not followed", str(path.parent))
     return path
+
+
+def give_to_owner(path: Path, bag_dir: Path) -> None:
+    """Gives a file that root made to the owner of the bag directory, as whom the recorder runs."""
+    with suppress(OSError):
+        owner = bag_dir.stat()
+        if path.lstat().st_uid != owner.st_uid:
+            os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
 def _with_check(begun: bytes) -> bytes:

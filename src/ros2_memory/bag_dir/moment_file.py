@@ -42,6 +42,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.core import directories
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -211,7 +212,7 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
     }
     if moment.rule is not None:
         content |= {"rule": moment.rule, "matches": moment.matches}
-    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    text = encodable(json.dumps(content, indent=1, ensure_ascii=False)) + "\n"
     write_durably(folder / MOMENT_FILE, text)
 
 

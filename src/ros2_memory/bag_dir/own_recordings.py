@@ -39,7 +39,7 @@ from ros2_memory.bag_dir.durable_write import (
     write_durably,
 )
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, state_path
+from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, give_to_owner, state_path
 from ros2_memory.bag_dir.layout import (
     LIST_FILE,
     LOST_AND_FOUND,
@@ -499,10 +499,10 @@ class OwnRecordings:
                 folder = self._path.parent
                 if not folder.is_dir():
                     folder.mkdir(exist_ok=True)
-                    _give_to_owner(folder, self._bag_dir)
+                    give_to_owner(folder, self._bag_dir)
                     flush(folder.parent)
                 write_durably(self._path, LIST.text(merged.values()))
-                _give_to_owner(self._path, self._bag_dir)
+                give_to_owner(self._path, self._bag_dir)
         except OSError:
             # What others appended is read again.
             self._rows, self._stamp = before, None
@@ -582,11 +582,3 @@ def is_regular(path: Path) -> bool:
         OSError: it cannot be looked up.
     """
     return stat.S_ISREG(mode_of(path))
-
-
-def _give_to_owner(path: Path, bag_dir: Path) -> None:
-    """Gives a file that root made to the owner of the bag directory, as whom the recorder runs."""
-    with suppress(OSError):
-        owner = bag_dir.stat()
-        if path.lstat().st_uid != owner.st_uid:
-            os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)

@@ -85,7 +85,7 @@ RECORDED: Final = JsonLog(RECORDED_FILE, Recorded)
 # lost.jsonl
 
 MOST_LOST_BYTES: Final = 1 << 20
-"""A longer file loses its older half."""
+"""A longer file loses its older half, unless it is half as long once stretches are joined."""
 EVERY_TOPIC: Final = "*"
 """Stands for the topics of a recording that ended unexpectedly."""
 INTERRUPTIONS: Final = MappingProxyType(
@@ -125,7 +125,7 @@ LOST: Final = JsonLog(LOST_FILE, Loss, most_bytes=2 * MOST_LOST_BYTES)
 
 
 def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
-    """Appends losses, and drops the oldest where the file is too long.
+    """Appends losses. Where the file is too long, joins stretches, then drops the oldest.
 
     Raises:
         OSError: they cannot be written, and none is appended.
@@ -133,7 +133,26 @@ def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
     if LOST.append(bag_dir, losses) > MOST_LOST_BYTES:
         with suppress(OSError):  # or with the next ones
             rows = LOST.rows(bag_dir)
-            LOST.replace(bag_dir, rows[len(rows) // 2 :])
+            # A publisher that is refused has a row for each split.
+            refused = _joined(row for row in rows if row.by == "refused")
+            rows = [*refused, *(row for row in rows if row.by != "refused")]
+            if len(LOST.text(rows)) > MOST_LOST_BYTES // 2:
+                rows = rows[len(rows) // 2 :]
+            LOST.replace(bag_dir, rows)
+
+
+def _joined(losses: Iterable[Loss]) -> list[Loss]:
+    """Returns losses in order of time; stretches of a topic that lie close together are one."""
+    topics: dict[str, list[Loss]] = {}
+    for loss in sorted(losses, key=attrgetter("start")):
+        of_topic = topics.setdefault(loss.topic, [])
+        if of_topic and loss.start - of_topic[-1].stop <= _APART_NS:
+            last = of_topic.pop()
+            stop, lost = max(last.stop, loss.stop), last.lost + loss.lost
+            of_topic.append(replace(last, stop=stop, lost=lost))
+        else:
+            of_topic.append(loss)
+    return sorted(chain.from_iterable(topics.values()), key=attrgetter("start", "topic"))
 
 
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
@@ -167,16 +186,7 @@ class Expired:
         # What a kill left in the bag goes again.
         again = {loss.topic for loss in going} if bag == self.bag else set()
         before = [loss for loss in self.going if loss.topic not in again]
-        topics: dict[str, list[Loss]] = {}
-        for loss in sorted([*self.gone, *before], key=attrgetter("start")):
-            of_topic = topics.setdefault(loss.topic, [])
-            if of_topic and loss.start - of_topic[-1].stop <= _APART_NS:
-                last = of_topic.pop()
-                stop, lost = max(last.stop, loss.stop), last.lost + loss.lost
-                of_topic.append(replace(last, stop=stop, lost=lost))
-            else:
-                of_topic.append(loss)
-        gone = sorted(chain.from_iterable(topics.values()), key=attrgetter("start", "topic"))
+        gone = _joined([*self.gone, *before])
         return Expired((*gone[-_MOST_EXPIRED:],), bag, going)
 
 
@@ -753,4 +763,4 @@ class TriggerState:
     latched: dict[str, LatchedMark] = field(default_factory=dict)
 
 
-TRIGGERS: Final = JsonDocument(TRIGGERS_FILE, TriggerState, is_ascii=False)
+TRIGGERS: Final = JsonDocument(TRIGGERS_FILE, TriggerState)

@@ -11,6 +11,7 @@ import re
 import stat
 from pathlib import Path
 from typing import Any, TypeAlias
+from unittest.mock import Mock, call
 
 import pytest
 from hypothesis import given, settings
@@ -45,6 +46,7 @@ from ros2_memory.bag_dir.state_files import (
     read_withheld,
     unshipped,
 )
+from ros2_memory.core.spans import united
 from tests.support.examples import examples
 from tests.support.log_lines import with_checks
 
@@ -85,10 +87,10 @@ ERASURE = r"""{"format":1,"topics":["/a"],"windows":[[1,2]],"latched":["/\u00e4"
 SCREEN = """{"format":1,"recordings":{"rec_A":{"done":false,"start":1,"end":null,
 "files":{"a.mcap":"read"},"heard":{"home":[{"first":1,"last":2,"holds":null,"lasts":false}]},
 "unclear":[[1,2]]}},"excluded":[{"start":1,"stop":2,"held":true}]}"""
-RULES = """{"format":1,"rules":{"tür":{"fired":1,"moments":2,"refused":3,"last_fired":null,
-"problem":"ß","always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
+RULES = r"""{"format":1,"rules":{"t\u00fcr":{"fired":1,"moments":2,"refused":3,"last_fired":null,
+"problem":"\u00df","always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
 "start":1,"end":2,"matches":1,"known":false,"stored":false}],
-"runs":{"/a":{"first":1,"last":2,"fired":false,"lasts":false}}}},"searched":{"a":1},"before":"x",
+"runs":{"/a":{"first":1,"last":2,"fired":false,"lasts":false}}}},"searched":{"\udcff":1},"before":"x",
 "latched":{"/m":{"published":{"a":1},"begun":{"a":2},"payload":"ff"}}}"""
 DOCUMENTS: list[tuple[Document, str]] = [
     (ERASING, ERASURE.replace("\n", "")),
@@ -180,6 +182,22 @@ class TestEveryFile:
 
 @pytest.mark.parametrize(("log", "text"), LOGS, ids=name_of)
 class TestLogs:
+    def test_what_root_writes_belongs_to_the_owner_of_the_bag_directory(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log, text: str
+    ) -> None:
+        path = laid(tmp_path, log, text)
+        rows, status_of, given = log.rows(tmp_path), Path.stat, Mock()
+
+        def owned(at: Path, **how: bool) -> os.stat_result:
+            status = status_of(at, **how)
+            return status if at != tmp_path else os.stat_result((*status[:4], 71, 72, *status[6:]))
+
+        monkeypatch.setattr(Path, "stat", owned)
+        monkeypatch.setattr(os, "chown", given)
+        log.append(tmp_path, rows)
+        log.replace(tmp_path, rows)
+        assert given.mock_calls == [call(path, 71, 72, follow_symlinks=False)] * 2
+
     def test_rows_are_appended_and_newer_ones_read_as_far_as_they_are_known_and_checked(
         self, tmp_path: Path, log: Log, text: str
     ) -> None:
@@ -311,6 +329,21 @@ def test_losses_are_those_of_a_window_and_the_oldest_are_dropped(
     append_losses(tmp_path, losses[:1])
     assert read_losses(tmp_path, 900, 2000) == losses[90:]
     assert len(read_losses(tmp_path, 0, 2000)) < 60
+
+
+def test_a_publisher_that_is_refused_all_day_hides_nothing_older(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_files, "MOST_LOST_BYTES", 6000)
+    forgotten = Loss("/speech", 0, 1, 5, "forgotten")
+    append_losses(tmp_path, [forgotten])
+    for hour in range(24):
+        spans = [(T0 + n * 10**10, T0 + (n + 1) * 10**10) for n in range(hour * 40, hour * 40 + 40)]
+        append_losses(tmp_path, [Loss("/camera", *span, 0, "refused") for span in spans])
+    losses = read_losses(tmp_path, 0, 2 * T0)
+    assert [loss for loss in losses if loss.by != "refused"] == [forgotten]
+    refused = ((loss.start, loss.stop) for loss in losses if loss.by == "refused")
+    assert united(refused) == [(T0, spans[-1][1])]
 
 
 def test_receipts_of_bags_that_are_gone_are_dropped_where_they_are_most(

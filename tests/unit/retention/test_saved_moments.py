@@ -69,11 +69,12 @@ class TestKeeping:
         assert (reported["start_ns"], reported["end_ns"]) == (T0 + 19 * S, T0 + 20 * S)
         assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
 
+    @pytest.mark.parametrize("name", [A, os.fsdecode(b"caf\xe9")])
     def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
-        self, tmp_path: Path
+        self, tmp_path: Path, name: str
     ) -> None:
         # As `forget`, in another process, deletes beside the recorder.
-        made = recording(tmp_path, A, 0)
+        made = recording(tmp_path, name, 0)
         house = house_of(tmp_path)
         pending = asked(tmp_path, 15, 25)
         with house._index.undisturbed() as snapshot:
@@ -84,7 +85,9 @@ class TestKeeping:
         assert outcome.bags == 1
         reported = told_of(tmp_path)
         assert reported["complete"] is False
-        assert reported["missing"] == [f"{A}/{A}_1.mcap is missing, or another file has its name"]
+        assert reported["missing"] == [
+            f"{name}/{name}_1.mcap is missing, or another file has its name"
+        ]
 
     def test_a_sidecar_that_goes_meanwhile_refuses_no_moment(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING
 from unittest.mock import Mock
@@ -216,6 +217,16 @@ def test_the_budget_deletes_it_and_that_is_said(tmp_path: Path) -> None:
     robot.look()
     assert robot.logged("needed_bags_deleted")
     assert "were deleted to make room" in (robot.record().problem or "")
+
+
+def test_a_name_that_is_no_utf8_stops_neither_rules_nor_deletion(tmp_path: Path) -> None:
+    robot = watched(tmp_path, max_bytes=1)
+    for begin in range(0, 100, 10):
+        robot.split(seconds(begin, begin + 10, {92}), os.fsdecode(b"caf\xe9"))
+    robot.clock.at = T0 + 110 * S
+    robot.close_all()
+    assert robot.spans() == [(87, 95)]
+    assert len([*robot.bag_dir.glob("caf*/*")]) == 2  # those of the moment
 
 
 def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
