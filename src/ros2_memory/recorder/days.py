@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.clock_steps import STAMPS_BESIDE_NS
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
@@ -103,6 +104,7 @@ adam çocuk cocuk insan kadın kadin kişi kisi yüz
 _PEOPLE: Final = frozenset(_WORDS_FOR_PEOPLE.split())
 _WORD: Final = re.compile(r"[A-Z]*[^\W\d_A-Z]+|[A-Z]+")
 """Words also begin at capitals: `TrackedPersons`."""
+_WORD_OR_NUMBER: Final = re.compile(r"[^\W\d_]+|\d+")
 _OF_DETECTIONS: Final = LISTS_OF_LABELS.union(LABELS)
 _NAMES: Final = _OF_DETECTIONS.union(
     NAMED_IN_TYPES.values(), ("child_frame_id", "frame_id", "name", "names")
@@ -166,7 +168,8 @@ class MemoryDays:
         self._folder = self.bag_dir / MEMORY_FOLDER
         self.keeps = self.limits is not None
         self._limits = self.limits or MemoryLimits()
-        self._people = _PEOPLE.union(map(caseless, self._limits.people))
+        named = map(_words_in, self._limits.people)
+        self._people = [words for words in named if words.strip()]
         self._static_topics = frozenset(self.static_topics)
         self._minutes: set[Path] = set()
         self._failing = FailingFiles(self.monotonic)
@@ -337,6 +340,9 @@ class MemoryDays:
         chosen = _Staying()
         thinned: dict[tuple[str, str], TopicThinning] = {}
         detections = DetectionColumns(self.extractor)
+        times = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
+        near = times.widened(STAMPS_BESIDE_NS)
+        pauses = [pause for pause in shown.pauses if near.overlaps(*pause)]  # not those of a year
         for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
             topic, kind = table.channel.topic, table.channel.type
             if why := self._why_left_out(table):
@@ -346,9 +352,7 @@ class MemoryDays:
                 chosen.times[topic, kind].update(table.log_times.tolist())
             else:
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
-                chosen.times[topic, kind].update(
-                    beside_pauses(shown.pauses, table.log_times).tolist()
-                )
+                chosen.times[topic, kind].update(beside_pauses(pauses, table.log_times).tolist())
         for key, thinning in thinned.items():
             chosen.times[key].update(thinning.times().tolist())
         return chosen
@@ -452,7 +456,9 @@ class MemoryDays:
 
     def _is_of_people(self, name: str) -> bool:
         """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
-        return not self._people.isdisjoint(map(caseless, _WORD.findall(name)))
+        # Whole, too: in `MÄDCHEN` and `McDonald` no word begins at a capital.
+        words = f"{_words_in(' '.join(_WORD.findall(name)))}{_words_in(name)}"
+        return not _PEOPLE.isdisjoint(words.split()) or any(one in words for one in self._people)
 
     def _write_day(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
         """Writes a day anew, with more messages, which are those of some bags that stay.
@@ -545,6 +551,11 @@ class _Staying:
     times: dict[tuple[str, str], set[Ns]] = field(default_factory=lambda: defaultdict(set))
     latched: set[str] = field(default_factory=set)
     left_out: dict[str, str] = field(default_factory=dict)
+
+
+def _words_in(name: str) -> str:
+    """Returns the words and numbers in a name, each between blanks: ` user 1 ` of `user_1`."""
+    return f" {' '.join(_WORD_OR_NUMBER.findall(caseless(name)))} "
 
 
 def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:

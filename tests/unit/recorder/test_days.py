@@ -14,6 +14,8 @@ from functools import cache
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
+from unicodedata import normalize
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,13 +28,15 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.durable_write import read_small_file
 from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FILE, THINNED_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bag_dir.state_files import read_superseded, read_thinned
+from ros2_memory.bag_dir.state_files import THINNED, Thinned, read_superseded, read_thinned
 from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.recorder import days as recorder_days
 from ros2_memory.recorder.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.recorder.thinning import beside_pauses
 from ros2_memory.retention import collect
 from ros2_memory.retention.delete import remove_bag
 from ros2_memory.storage.base import BagWriter, Record
@@ -571,6 +575,20 @@ def test_forgetting_takes_it_out_of_days_to_the_byte(
     assert "/vision/scene/scene_objects" not in topics
 
 
+def test_pauses_of_other_days_are_not_compared_with_messages(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near = [(T0 - 6 * S, T0 - 5 * S), (T0 + 64 * S, T0 + 70 * S)]
+    far = [(T0 - nth * 2700 * S, T0 - nth * 2700 * S + S) for nth in range(200, 0, -1)]
+    split(bag_dir, 0)
+    (bag_dir / "memory").mkdir()
+    THINNED.write(bag_dir, Thinned(far[0][0], pauses=(*far, *near)))
+    compared = Mock(wraps=beside_pauses)
+    monkeypatch.setattr(recorder_days, "beside_pauses", compared)
+    keep_all(bag_dir)
+    assert [call.args[0] for call in compared.call_args_list] == [near] * compared.call_count
+
+
 GOLDEN = Path(__file__).resolve().parents[2] / "data" / "memory_day_1.mcap"
 """A day as the first version with this folder wrote it, of one minute."""
 
@@ -643,8 +661,13 @@ def labels_in(bag_dir: Path) -> set[str]:
     }
 
 
-PEOPLE = ("Person", "alte Frau", "niño", "行人", "TrackedPerson", "PERSON_2", "Anna", "0")
-THINGS = {"mug", "drill", "surface", "Manometer"}
+NAMES = ("anna", "McDonald", "O'Brien", "Anna Maria", "Tante_Inge", "user1", "Jürgen", "!")
+PEOPLE = (
+    *("Person", "alte Frau", "niño", "行人", "TrackedPerson", "PERSON_2", "0", "MÄDCHEN", "NIÑO"),
+    *(normalize("NFD", "mädchen"), "Anna", "McDonald", "O'Brien", "AnnaMaria", "tante_inge"),
+    *("user1", "JÜRGEN"),
+)
+THINGS = {"mug", "drill", "surface", "Manometer", "user 12", "Maria", "?"}
 STATES = (
     {"state": "held", "object": "mug"},
     {"state": "held", "object": "person"},
@@ -704,7 +727,7 @@ def test_people_are_taken_out_whatever_names_them_unless_their_label_is_named(
             ),
         ],
     )
-    keep_all(bag_dir, limits=MemoryLimits(people=("anna",), texts=("/arm",)))
+    keep_all(bag_dir, limits=MemoryLimits(people=NAMES, texts=("/arm",)))
     stays = decoded(bag_dir)
     assert "/face/is_seen" not in stays
     assert labels_in(bag_dir) == THINGS
@@ -724,7 +747,7 @@ def test_people_are_taken_out_whatever_names_them_unless_their_label_is_named(
     assert [each.id for each in stays["/detections"][0].detections] == ["cup_3"]
     assert b"Person" not in (bag_dir / DAY_FILE).read_bytes()
     (bag_dir / DAY_FILE).unlink()
-    keep_all(bag_dir, limits=MemoryLimits(labels=("Person",), people=("anna",)))
+    keep_all(bag_dir, limits=MemoryLimits(labels=("Person",), people=NAMES))
     assert labels_in(bag_dir) == {*THINGS, "Person"}
 
 
