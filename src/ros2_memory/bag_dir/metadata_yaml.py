@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from contextlib import suppress
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -129,7 +129,7 @@ def correct(recording: Path, reader: BagReader) -> bool:
     files = bags_in(recording)
     text = ""
     with suppress(FileNotFoundError):
-        text = read_small_file(path)
+        text = read_small_file(path, _MAX_BYTES)
     if not files or not (text or is_named_by_rosbag2(recording)):
         return False
     contents: dict[str, Contents] = {}
@@ -220,14 +220,17 @@ def _set_topics(
 ) -> None:
     """Sets the count of each topic, by name and type, and its QoS where no channel has that."""
     topics = [_mapping(item, "topics") for item in _list(info, "topics_with_message_count")]
+    # A day of splits has a million channels, and few QoS.
+    offered_qos: defaultdict[tuple[str, str], dict[str, None]] = defaultdict(dict)
+    for channel in channels:
+        offered_qos[channel.topic, channel.type][_qos(channel)] = None
     listed = set()
     for topic in topics:
         topic_metadata = _mapping(topic.get("topic_metadata"), "topic_metadata")
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
         listed.add(key)
         topic["message_count"] = counts[key]
-        of_topic = (channel for channel in channels if (channel.topic, channel.type) == key)
-        offered = [_offered(channel, version) for channel in of_topic]
+        offered = [_offered(text, version) for text in offered_qos[key]]
         # rosbags returns no message of a channel whose profiles differ from these.
         if offered and topic_metadata.get("offered_qos_profiles") not in offered:
             topic_metadata["offered_qos_profiles"] = offered[0]
@@ -239,7 +242,7 @@ def _set_topics(
                 "name": channel.topic,
                 "type": channel.type,
                 "serialization_format": channel.encoding,
-                "offered_qos_profiles": _offered(channel, version),
+                "offered_qos_profiles": _offered(_qos(channel), version),
             }
             if version >= _FIRST_OF_TYPE_HASHES:
                 type_hash = dict(channel.metadata).get("topic_type_hash", "")
@@ -270,9 +273,8 @@ def _new_information(channels: Sequence[Channel]) -> dict[str, object]:
     }
 
 
-def _offered(channel: Channel, version: int) -> object:
+def _offered(text: str, version: int) -> object:
     """Returns the QoS profiles as this version has them: as a list, before version 9 as text."""
-    text = _qos(channel)
     return text if version < _FIRST_OF_NAMED_QOS else _parse(text) or []
 
 
