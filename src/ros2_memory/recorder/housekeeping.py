@@ -146,6 +146,7 @@ class Housekeeping:
         self._screening = screening
         self._repairer = Repairer(reader, writer, bag_dir)
         self._links = HardLinks(bag_dir)
+        self._measure_free = measure_free
         self._clock = clock
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
@@ -262,7 +263,8 @@ class Housekeeping:
         self._note_interruption(min(first, now), now, how)
 
     def _note_interruption(self, first: Ns, now: Ns, how: Interruption) -> None:
-        self._unwritten.append(Loss(EVERY_TOPIC, first, now + 1, 0, how))
+        with self._lock:  # what another thread has written is cleared
+            self._unwritten.append(Loss(EVERY_TOPIC, first, now + 1, 0, how))
         self._write_losses()
 
     def _write_losses(self) -> None:
@@ -446,11 +448,14 @@ class Housekeeping:
                 continue
             if self._links.is_saved(str(path)) or not self._may_repair(path, status):
                 continue
+            is_small = status.st_size <= MOST_REPAIRED_BYTES
+            if is_small and self._measure_free(self._bag_dir) < status.st_size:
+                continue  # until there is room for the new file beside it
             opened = open_files() if opened is None else opened
             if (status.st_dev, status.st_ino) in opened:
                 continue
             self._tried.add(state)
-            if status.st_size > MOST_REPAIRED_BYTES:
+            if not is_small:
                 size = f"{status.st_size} bytes are too many to repair while recording"
                 reason = f"{size}: run ros2-memory recover {path}"
                 _log.error("bag_not_repaired", path=str(path), reason=reason)

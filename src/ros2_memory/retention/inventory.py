@@ -294,13 +294,19 @@ class Inventory:
 def state_bytes_in(bag_dir: Path) -> int:
     """Returns the size of what is stored beside the bags, columns and logs, in bytes."""
     paths = [bag_dir / name for name in (*OWN_FILES, LOCK_FILE)]
-    with suppress(OSError):
-        paths += (bag_dir / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
+    moments = _entries(bag_dir / MOMENTS_FOLDER)
+    paths += (moment / MOMENT_FILE for moment in moments if not moment.is_symlink())
     for folder in OWN_FOLDERS:
-        with suppress(OSError):
-            paths += (bag_dir / folder).iterdir()
+        paths += _entries(bag_dir / folder)
     # Deleting bags makes that list longer.
     return sum(size_of(path) for path in paths if path != bag_dir / DELETED_FILE)
+
+
+def _entries(folder: Path) -> list[Path]:
+    """Returns what lies in a folder; nothing behind a link, or where it cannot be listed."""
+    with suppress(OSError):
+        return [] if folder.is_symlink() else [*folder.iterdir()]
+    return []
 
 
 def _may_be_deleted(state: FileState, path: str, *, is_named: bool) -> bool:

@@ -12,12 +12,20 @@ import zstandard
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses
+from ros2_memory.bag_dir.state_files import (
+    Loss,
+    Receipt,
+    append_losses,
+    append_receipts,
+    read_losses,
+)
 from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.recorder import housekeeping
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.delete import remove_bag
+from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
@@ -34,7 +42,7 @@ from tests.support.memories import asked, memory_of
 from tests.support.simulated_recorders import events
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, MutableMapping
+    from collections.abc import Iterable, Iterator, MutableMapping
     from pathlib import Path
 from unittest.mock import Mock
 
@@ -89,6 +97,18 @@ class TestRetention:
         assert first.exists()
         keeper_of(tmp_path, max_bytes=total - 1).apply()
         assert not first.exists()
+
+    @pytest.mark.parametrize("link", [".ros_log", "moments/x"])
+    def test_the_budget_counts_nothing_behind_a_link(self, tmp_path: Path, link: str) -> None:
+        bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
+        first, *_ = recording(bags, "a", 0)
+        total = size_of(bags)
+        elsewhere.mkdir()
+        (elsewhere / "moment.json").write_bytes(bytes(5000))
+        (bags / link).parent.mkdir(exist_ok=True)
+        (bags / link).symlink_to(elsewhere)
+        keeper_of(bags, max_bytes=total).apply()
+        assert first.exists()
 
     def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
         self, tmp_path: Path
@@ -365,6 +385,24 @@ def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
     assert [(loss.by, loss.start) for loss in read_losses(tmp_path, 0, MAX_NS)] == found
 
 
+def test_an_interruption_that_comes_while_another_is_written_is_written_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper = keeper_of(tmp_path, clock=later(0))
+    paused = threading.Thread(target=keeper.note_restart, args=(T0, "paused"))
+
+    def slow(bag_dir: Path, losses: Iterable[Loss]) -> None:
+        append_losses(bag_dir, losses)
+        if not paused.ident:
+            paused.start()
+            paused.join(0.1)  # until it waits
+
+    monkeypatch.setattr(housekeeping, "append_losses", slow)
+    keeper.note_restart(T0, "died")
+    paused.join()
+    assert [loss.by for loss in read_losses(tmp_path, 0, MAX_NS)] == ["died", "paused"]
+
+
 def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
     empty = tmp_path / OWN / f"{OWN}_1.mcap"
@@ -383,6 +421,20 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     newest = max(topic.last for topic in after.topics) / 1e9
     assert f"the newest message is of {newest:.3f}; later ones that had not" in reported["reason"]
     assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]
+
+
+def test_what_a_full_disk_leaves_unrepaired_is_repaired_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
+    free = Mock(return_value=1000)
+    keeper = keeper_of(tmp_path, measure_free=free)
+    with monkeypatch.context() as full:
+        full.setattr(McapWriter, "rewrite", failing())
+        keeper.apply()
+    free.return_value = PLENTY
+    keeper.apply()
+    assert McapReader().summarize(open_one).complete
 
 
 def test_a_recording_of_another_is_left_alone_until_it_lay_still_and_nobody_holds_it(
