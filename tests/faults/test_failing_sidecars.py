@@ -74,6 +74,20 @@ def test_a_handover_is_not_settled_from_what_a_failing_disk_hides(
     assert read_handover(new).handover.state is Counting.COUNTS
 
 
+def test_a_handover_that_did_not_begin_is_settled_once_the_disk_gives_its_sidecar(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, new = tmp_path / "rec", tmp_path / "rec_2"
+    old.mkdir()
+    write_handover(old, Handover(next="rec_2"))
+    with monkeypatch.context() as patched:
+        patched.setattr(handovers, "read_small_file", fails)
+        with pytest.raises(RecorderError, match="cannot be read"):
+            settle_handover(old, new, McapReader(), ("rec",))
+    assert settle_handover(old, new, McapReader(), ("rec",))
+    assert read_handover(old).handover.next is None
+
+
 real_open = os.open
 
 

@@ -309,7 +309,7 @@ def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection
             if is_folder(new) and handover_to_change(new).hides_all:
                 write_handover(new, Handover())
             return True
-        begun = read_handover(old).handover
+        begun = handover_to_change(old)
         if begun.next == new.name and begun.counts_until is None:
             if old.name not in running:
                 _write_cut(old, new, reader)

@@ -278,8 +278,8 @@ class GarbageCollector:
             # Bags without latched messages can still be deleted, and may free enough space.
             for bag in latched:
                 self._keep_failed(bag, f"its latched messages cannot be carried on: {error}", run)
-        else:
-            run.result.carried = run.result.carried if carried is None else carried
+            return
+        run.result.carried = run.result.carried if carried is None else carried
         now = self.monotonic()
         for bag in latched:
             # Queries may still look for latched messages there, though they are carried.

@@ -374,6 +374,8 @@ class Carrier:
         try:
             with beside(self.path) as new:
                 self.writer.write(new, records)
+                # Listed first: after a kill it would be foreign.
+                self.own.hold(folder, [CARRY_FILE])
                 new.replace(self.path)
         except BaseException:
             with suppress(OSError):
@@ -381,7 +383,6 @@ class Carrier:
             raise
         flush(folder)
         flush(folder.parent)
-        self.own.hold(folder, [CARRY_FILE])
 
 
 def _is_tf(type_name: str) -> bool:

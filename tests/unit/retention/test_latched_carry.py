@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -191,6 +192,35 @@ class TestTheBagOfCarriedMessages:
         ]
         keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
+
+    def test_its_grace_does_not_begin_with_a_carry_that_failed(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        at_home(tmp_path, splits=4)
+        size, now = (tmp_path / "rec/rec_0.mcap").stat().st_size, SettableClock(0)
+        keeper = keeper_of(
+            tmp_path, max_bytes=3 * size + 1, grace_s=60.0, monotonic=lambda: now.now() / S
+        )
+        with monkeypatch.context() as full:
+            full.setattr(McapWriter, "write", failing())
+            keeper.apply()
+        for number in (4, 5, 6):
+            write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", drive_in(number), LAYOUT)
+        now.at = 100 * S
+        keeper.apply()
+        assert carried_at(tmp_path) == [T0]
+        assert "rec/rec_0.mcap" in files_in(tmp_path)
+
+    def test_after_a_kill_it_is_the_recorder_s_own(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        at_home(tmp_path)
+        with monkeypatch.context() as killed:
+            killed.setattr(OwnRecordings, "hold", Mock(side_effect=KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                keeper_of(tmp_path, max_bytes=1).apply()
+        keeper_of(tmp_path, max_bytes=1).apply()
+        assert OwnRecordings(tmp_path).owns_bag(tmp_path / "latched/carried.mcap")
 
     @pytest.mark.parametrize("is_full", [False, True])
     def test_where_no_other_bag_can_go_in_its_place_it_goes_at_once(
