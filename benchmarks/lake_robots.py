@@ -29,7 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from mcp import Client
 from pyiceberg.expressions import AlwaysTrue
-from tests.soak.server import serving
+from tests.support.served import PROGRAM, serving
 
 from benchmarks import report, timing, worlds
 from benchmarks.timing import resident_mb
@@ -194,7 +194,7 @@ async def _measured(
         f"lake.warehouse='{folder / 'lake'}'",
         *given.set,
     ]
-    with serving(nowhere, folder / "log", *overrides) as served:
+    with serving(nowhere, folder / "log", *overrides, program=PROGRAM) as served:
         pid, url = str(served.process.pid), f"http://127.0.0.1:{served.port}/mcp"
         await _until_stored(folder / "cache", size[1])
         resident = resident_mb("VmRSS", pid)

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from tests.integration.test_server_process import PROGRAM, Served, serving
 from tests.support.robot_run import write_run
+from tests.support.served import PROGRAM, Served, serving
 
 HERE: Final = Path(__file__).parent
 HOME: Final = HERE.parents[1] / "build" / "conformance"

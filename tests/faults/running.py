@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
-import signal
-import subprocess
 import threading
-import time
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import httpx2
+
 from tests.faults.world import T0_S
-from tests.support.forked_commands import Forked
+from tests.support import served
 from tests.support.processes import PATIENCE_S, until
+from tests.support.served import Served
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
 
 def questions(count: int) -> list[tuple[str, dict[str, Any]]]:
@@ -44,16 +43,11 @@ def questions(count: int) -> list[tuple[str, dict[str, Any]]]:
 
 
 @dataclass
-class Running:
-    """One run of the server: from its start until it is killed or stopped."""
-
-    process: subprocess.Popen[bytes]
-    port: int
-    log: Path
-    begun_s: float = field(default_factory=time.monotonic)
+class Running(Served):
+    """One run of the server: from its start until it is killed."""
 
     def health(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self._request("GET", "/health", None))
+        found: dict[str, Any] = json.loads(self.get("/health")[1])
         return found
 
     def ask(self, tool: str, given: dict[str, Any]) -> str:
@@ -67,7 +61,9 @@ class Running:
     def _whole_answer(self, tool: str, given: dict[str, Any]) -> str | None:
         call = {"name": tool, "arguments": given}
         body = {"jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": call}
-        reply = json.loads(self._request("POST", "/mcp", json.dumps(body)))
+        headers = {"accept": "application/json", "mcp-protocol-version": "2025-06-18"}
+        asked = httpx2.post(self.url("/mcp"), json=body, headers=headers, timeout=PATIENCE_S)
+        reply = asked.raise_for_status().json()
         [block] = reply["result"]["content"]
         text = str(block["text"])
         late = "out of time" in text or "query_timeout" in text
@@ -80,64 +76,15 @@ class Running:
         self.process.kill()
         self.process.wait()
 
-    def events(self, name: str) -> list[dict[str, Any]]:
-        whole, _, _ = self.log.read_text(encoding="utf-8").rpartition("\n")
-        said = [json.loads(line) for line in whole.splitlines() if line.startswith("{")]
-        return [each for each in said if each["event"] == name]
-
-    def _request(self, method: str, path: str, body: str | None) -> bytes:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
-        headers = {
-            "Content-Type": "application/json",
-            "Accept": "application/json, text/event-stream",
-            "MCP-Protocol-Version": "2025-06-18",
-        }
-        try:
-            connection.request(method, path, body, headers if body else {})
-            response = connection.getresponse()
-            answer = response.read()
-            assert response.status == 200, answer
-            return answer
-        finally:
-            connection.close()
-
-
-def start(
-    bag_dir: Path, log: Path, *overrides: str, environment: dict[str, str] | None = None
-) -> Running:
-    """Starts the server on a free port, and returns once it listens."""
-    ours = ("MEMORY_", "MCP_", "ROS_")
-    kept = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
-    env = kept | {"MEMORY_BAG_DIR": str(bag_dir), "MCP_TRANSPORT": "sse", "MCP_PORT": "0"}
-    given = ("data.now=latest", "reader.index_refresh_s=0.1", *overrides)
-    with log.open("wb") as stderr:
-        process = Forked("ros2-memory-server", *given, env=env | (environment or {}), stderr=stderr)
-    running = Running(process, 0, log)
-
-    def listening() -> bool:
-        assert process.poll() is None, log.read_text(encoding="utf-8")
-        said = running.events("listening")
-        running.port = said[0]["port"] if said else 0
-        return bool(said)
-
-    try:
-        until(listening)
-    except BaseException:
-        running.kill()
-        raise
-    return running
+    def logged(self, name: str) -> list[dict[str, Any]]:
+        return [each for each in self.events() if each["event"] == name]
 
 
 @contextmanager
-def serving(
-    bag_dir: Path, log: Path, *overrides: str, environment: dict[str, str] | None = None
-) -> Iterator[Running]:
-    """The server for the time of the block."""
-    running = start(bag_dir, log, *overrides, environment=environment)
-    try:
-        yield running
-    finally:
-        running.kill()
+def serving(bag_dir: Path, log: Path, *overrides: str, **more: str) -> Iterator[Running]:
+    """The server for the time of the block; `more` joins its environment."""
+    with served.serving(bag_dir, log, "reader.index_refresh_s=0.1", *overrides, **more) as found:
+        yield Running(found.process, found.port, found.log)
 
 
 @contextmanager
@@ -151,7 +98,7 @@ def load(running: Running, count: int, clients: int = 3) -> Iterator[list[str]]:
         while not over.is_set():
             first += 1
             # The server is killed under them.
-            with suppress(OSError, http.client.HTTPException, AssertionError, ValueError):
+            with suppress(OSError, httpx2.HTTPError, AssertionError, ValueError):
                 answered.append(running.ask(*asked[first % len(asked)]))
                 continue
             return
@@ -186,9 +133,3 @@ def is_alive(number: int) -> bool:
     except ProcessLookupError:
         return False
     return "\nState:\tZ" not in Path(f"/proc/{number}/status").read_text(encoding="utf-8")
-
-
-def stop(numbers: Sequence[int]) -> None:
-    for number in numbers:
-        with suppress(ProcessLookupError):
-            os.kill(number, signal.SIGKILL)

@@ -188,6 +188,12 @@ def test_too_many_open_files_are_a_fault_that_passes(tmp_path: Path, kind: str, 
     assert told(fresh, count=COUNT) == right
 
 
+def of_sqlite(code: int) -> sqlite3.OperationalError:
+    error = sqlite3.OperationalError(f"as sqlite puts {code}")
+    error.sqlite_errorcode = code
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "kind"),
     [
@@ -196,28 +202,15 @@ def test_too_many_open_files_are_a_fault_that_passes(tmp_path: Path, kind: str, 
         (OSError(errno.ENOENT, "No such file or directory"), BagVanishedError),
         (MemoryError(), BagUnreachableError),
         (ValueError("no such record"), BagError),
+        (of_sqlite(sqlite3.SQLITE_IOERR_READ), BagUnreachableError),
+        (of_sqlite(sqlite3.SQLITE_CANTOPEN), BagUnreachableError),
+        (of_sqlite(sqlite3.SQLITE_NOMEM), BagUnreachableError),
+        (of_sqlite(sqlite3.SQLITE_CORRUPT), BagError),
+        (of_sqlite(sqlite3.SQLITE_NOTADB), BagError),
     ],
     ids=repr,
 )
 def test_what_may_pass_is_told_from_damage(error: Exception, kind: type[BagError]) -> None:
     with pytest.raises(BagError) as raised, reading(Path("a.mcap")):
-        raise error
-    assert type(raised.value) is kind
-
-
-@pytest.mark.parametrize(
-    ("code", "kind"),
-    [
-        (sqlite3.SQLITE_IOERR_READ, BagUnreachableError),
-        (sqlite3.SQLITE_CANTOPEN, BagUnreachableError),
-        (sqlite3.SQLITE_NOMEM, BagUnreachableError),
-        (sqlite3.SQLITE_CORRUPT, BagError),
-        (sqlite3.SQLITE_NOTADB, BagError),
-    ],
-)
-def test_what_sqlite_says_of_the_disk_is_told_from_damage(code: int, kind: type[BagError]) -> None:
-    error = sqlite3.OperationalError("as sqlite puts it")
-    error.sqlite_errorcode = code
-    with pytest.raises(BagError) as raised, reading(Path("a.db3")):
         raise error
     assert type(raised.value) is kind

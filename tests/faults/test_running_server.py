@@ -106,7 +106,7 @@ def test_a_store_that_another_program_holds_is_said_and_waited_for(tmp_path: Pat
         recovers(running, COUNT)
         with closing(sqlite3.connect(path, isolation_level=None)) as other:
             other.execute("BEGIN EXCLUSIVE")
-            before = len(running.events("database_failed"))
+            before = len(running.logged("database_failed"))
             write_bag(bag_dir, COUNT)
             says(running, "the store of columns cannot be used: database is locked")
             answers = running.ask_all(COUNT + 1)
@@ -114,7 +114,7 @@ def test_a_store_that_another_program_holds_is_said_and_waited_for(tmp_path: Pat
         assert running.ask_all(COUNT + 1) == answers
         assert "thing12" in answers[3]
         # Once by the server, and by its child that stored the first bags, if that still ran.
-        assert len(running.events("database_failed")) - before in {1, 2}
+        assert len(running.logged("database_failed")) - before in {1, 2}
 
 
 def test_a_bag_directory_that_is_renamed_away_and_back_is_the_same_again(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_a_disk_that_is_unmounted_and_mounted_again_loses_nothing(tmp_path: Path
             write_bags(bag_dir, COUNT)
             # The store in the cache folder is the one that could be pruned meanwhile.
             told = ("recorder=none", "logging.level=debug")
-            with serving(bag_dir, tmp_path / "log", *told, environment=cache) as running:
+            with serving(bag_dir, tmp_path / "log", *told, **cache) as running:
                 recovers(running, COUNT)
                 right = running.ask_all(COUNT)
                 unmount(bag_dir)
@@ -152,11 +152,11 @@ def test_a_disk_that_is_unmounted_and_mounted_again_loses_nothing(tmp_path: Path
                 for answer in running.ask_all(COUNT):
                     assert is_honest(answer), answer
                 assert not list(bag_dir.iterdir())
-                assert sum(event["bags"] for event in running.events("bags_stored")) == COUNT
+                assert sum(event["bags"] for event in running.logged("bags_stored")) == COUNT
                 mount(bag_dir, "--bind", str(kept))
                 recovers(running, COUNT)
                 assert running.ask_all(COUNT) == right
-                assert sum(event["bags"] for event in running.events("bags_stored")) == COUNT
+                assert sum(event["bags"] for event in running.logged("bags_stored")) == COUNT
         finally:
             unmount(kept)
 
@@ -169,9 +169,7 @@ def test_a_full_disk_under_the_store_is_said_and_got_over(tmp_path: Path) -> Non
         place = {"XDG_CACHE_HOME": str(cache)}
         full = stack.enter_context(ExitStack())
         full.enter_context(filled(cache))
-        running = stack.enter_context(
-            serving(bag_dir, tmp_path / "log", "recorder=none", environment=place)
-        )
+        running = stack.enter_context(serving(bag_dir, tmp_path / "log", "recorder=none", **place))
         says(running, "the store of columns is kept in memory: no file can be written for it")
         right = running.ask_all(COUNT)
         full.close()

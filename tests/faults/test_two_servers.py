@@ -52,9 +52,9 @@ def test_two_servers_share_a_directory_and_one_goes_on_without_the_other(tmp_pat
             until(partial(is_ready, first, COUNT + 2))
         right = first.ask_all(COUNT + 2)
         for each in (first, second):
-            assert each.events("database_set_aside") == []
-            assert each.events("database_lost") == []
-            assert each.events("tool_failed") == []
+            assert each.logged("database_set_aside") == []
+            assert each.logged("database_lost") == []
+            assert each.logged("tool_failed") == []
     path = store_file(bag_dir)
     assert stored(path) == sorted({f"rec/rec_{n}.mcap" for n in range(COUNT + 2)})
     assert_sound(path, COUNT + 2)

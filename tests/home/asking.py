@@ -236,11 +236,16 @@ def text_of(server: EpisodicServer, tool: str, arguments: Mapping[str, Any]) -> 
     return reply.text
 
 
-def missed(server: EpisodicServer, questions: Sequence[Question]) -> Row:
+def replies_to(server: EpisodicServer, questions: Sequence[Question]) -> list[str]:
+    """Returns the texts of the replies."""
+    return [text_of(server, each.tool, each.arguments) for each in questions]
+
+
+def missed(questions: Sequence[Question], replies: Sequence[str]) -> Row:
     """Returns the questions whose answer is not right, and what is wrong of it."""
     found: Row = {}
-    for question in questions:
-        reply = json.loads(text_of(server, question.tool, question.arguments))
+    for question, text in zip(questions, replies, strict=True):
+        reply = json.loads(text)
         try:
             wrong: object = question.wrong(reply)
         except (LookupError, TypeError, ValueError) as error:

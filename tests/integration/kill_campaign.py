@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import RecorderState
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tests.integration.test_server_process import Served
     from tests.support.real_recorder import RealRecorder
+    from tests.support.served import Served
 
 KINDS: Final = ("child", "daemon", "both")
 RECORD_OVERHEAD_BYTES: Final = 31  # of one MCAP message besides its payload
@@ -70,7 +70,6 @@ class Fault:
     `at` and `gone` (ns): when it was killed, and when nothing of it was left.
     """
 
-    kind: str
     at: int
     gone: int
     victims: tuple[str, ...]  # recordings whose recorder was killed, or ended with the daemon
@@ -80,15 +79,12 @@ class Fault:
     place_t: float  # that message's time since T0
 
 
-@dataclass(frozen=True)
-class Loss:
+class Loss(NamedTuple):
     """What a recording lost at the end: messages published in its last `seconds`, so many ticks.
 
     `holds_any`: whether any message reached the disk, so that it certainly received some.
     """
 
-    kind: str
-    recording: str
     seconds: float
     ticks: int
     holds_any: bool
@@ -131,14 +127,8 @@ class Campaign:
                 last = max([since, *(t.publish_time for t in self.held.get(name, []))])
                 lost_s = max(0, fault.at - last) / NS_PER_S
                 lost_ticks = math.floor(lost_s * self.terms.hz)
-                holds_any = bool(self.held.get(name))
-                found.append(Loss(fault.kind, name, lost_s, lost_ticks, holds_any))
+                found.append(Loss(lost_s, lost_ticks, bool(self.held.get(name))))
         return found
-
-    def delivered_late(self) -> list[float]:
-        """How long DDS held the first message of each recording that holds any, in s."""
-        delays = (held[0].log_time - held[0].publish_time for held in self.held.values())
-        return [delay / NS_PER_S for delay in delays]
 
     def _received_since(self, name: str) -> int | None:
         """When a recording had subscribed to everything, and the robot reached it; None: never."""
@@ -234,7 +224,6 @@ def _kill(
         questions.append(("get_position_at", {"timestamp": chosen.log_time / NS_PER_S}))
     topics, *place = answers(served, *questions)
     return Fault(
-        kind,
         killed.at,
         killed.gone,
         killed.recordings,

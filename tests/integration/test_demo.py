@@ -8,8 +8,11 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcp import Client
@@ -31,6 +34,35 @@ def environment(scratch: Path) -> dict[str, str]:
     return {**os.environ, **folders, **dict.fromkeys(wrong, "no-such-thing")}
 
 
+@contextmanager
+def demonstrating(scratch: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A demo that goes on, and the address that it invites to; none is left running."""
+    with subprocess.Popen(
+        [*PROGRAM, "--port", "0", "--duration", "95", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(scratch),
+    ) as demo:
+        try:
+            yield demo, _invited(demo)
+        finally:
+            demo.kill()
+
+
+def ended(scratch: Path, *options: str, **how: Any) -> subprocess.CompletedProcess[str]:
+    """A demo that ends by itself."""
+    return subprocess.run(
+        [*PROGRAM, "--once", *options],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+        env=environment(scratch),
+        **how,
+    )
+
+
 @pytest.fixture
 def scratch(tmp_path: Path) -> Path:
     folder = tmp_path / "tmp"
@@ -43,15 +75,7 @@ def test_once_it_answers_every_question_rightly_and_leaves_nothing_behind(
 ) -> None:
     # What lies in the folder where somebody tries it is no part of it.
     (tmp_path / "mcp.py").write_text("raise SystemExit('another mcp')\n")
-    done = subprocess.run(
-        [*PROGRAM, "--once", "--port", "0"],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-        env=environment(scratch),
-        cwd=tmp_path,
-    )
+    done = ended(scratch, "--port", "0", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
     for question in QUESTIONS:
         assert f". {question.words}\n" in done.stdout
@@ -76,21 +100,12 @@ async def test_it_stays_for_other_clients_and_leaves_a_closed_recording(
     tmp_path: Path, scratch: Path
 ) -> None:
     bag_dir = tmp_path / "bags"
-    with subprocess.Popen(
-        [*PROGRAM, "--port", "0", "--bag-dir", str(bag_dir), "--duration", "95"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=environment(scratch),
-    ) as demo:
-        try:
-            url = _invited(demo)
-            async with Client(sse_client(url, timeout=PATIENCE_S)) as client:
-                tools = (await client.list_tools()).tools
-                result = await client.call_tool("get_position_seconds_ago", {"seconds_ago": 10})
-            demo.send_signal(signal.SIGTERM)
-            assert demo.wait(timeout=PATIENCE_S) == 0
-        finally:
-            demo.kill()
+    with demonstrating(scratch, "--bag-dir", str(bag_dir)) as (demo, url):
+        async with Client(sse_client(url, timeout=PATIENCE_S)) as client:
+            tools = (await client.list_tools()).tools
+            result = await client.call_tool("get_position_seconds_ago", {"seconds_ago": 10})
+        demo.send_signal(signal.SIGTERM)
+        assert demo.wait(timeout=PATIENCE_S) == 0
     assert len(tools) >= 17
     (content,) = result.content
     assert isinstance(content, TextContent)
@@ -98,54 +113,29 @@ async def test_it_stays_for_other_clients_and_leaves_a_closed_recording(
     (recording,) = bag_dir.glob("*/")
     with Reader(recording) as reader:
         assert {connection.topic for connection in reader.connections} >= {"/odom", "/tf_static"}
-    _assert_nobody_listens(url)
+    assert not _listens(url)
 
 
 def test_its_server_ends_with_it_where_it_is_killed(scratch: Path) -> None:
-    with subprocess.Popen(
-        [*PROGRAM, "--port", "0", "--duration", "95"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=environment(scratch),
-    ) as demo:
-        try:
-            url = _invited(demo)
-        finally:
-            demo.kill()
+    with demonstrating(scratch) as (_, url):
+        pass
     until(lambda: not _listens(url) or None)
 
 
 def test_a_port_in_use_is_named_and_nothing_stays(scratch: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        refused = subprocess.run(
-            [*PROGRAM, "--once", "--port", str(port)],
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-            env=environment(scratch),
-        )
+        refused = ended(scratch, "--port", str(port))
     assert refused.returncode == 2
     assert f"port {port} on 127.0.0.1 is in use" in refused.stderr
     assert list(scratch.iterdir()) == []
 
 
 def test_it_says_so_when_its_server_is_ended_by_someone_else(scratch: Path) -> None:
-    with subprocess.Popen(
-        [*PROGRAM, "--port", "0", "--duration", "95"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment(scratch),
-    ) as demo:
-        try:
-            _invited(demo)
-            children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
-            os.kill(int(children[0]), signal.SIGKILL)
-            _, output = demo.communicate(timeout=PATIENCE_S)
-        finally:
-            demo.kill()
+    with demonstrating(scratch) as (demo, _):
+        children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
+        os.kill(int(children[0]), signal.SIGKILL)
+        _, output = demo.communicate(timeout=PATIENCE_S)
     assert demo.returncode == 2
     assert "the server ended by itself" in output
     assert list(scratch.iterdir()) == []
@@ -159,11 +149,6 @@ def _invited(demo: subprocess.Popen[str]) -> str:
         if found:
             return found[1]
     raise AssertionError("the demo ended without an invitation")
-
-
-def _assert_nobody_listens(url: str) -> None:
-    with socket.create_server(("127.0.0.1", _port_of(url))):
-        pass
 
 
 def _listens(url: str) -> bool:

@@ -11,9 +11,9 @@ from mcp import Client
 from mcp.client.sse import sse_client
 from mcp.client.streamable_http import streamable_http_client
 
-from tests.integration.test_server_process import serving
 from tests.support.fleets import START_S, seeded, write_robot
 from tests.support.robot_run import ask
+from tests.support.served import serving
 
 if TYPE_CHECKING:
     from pathlib import Path

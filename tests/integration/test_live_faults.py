@@ -1,21 +1,18 @@
 """SIGKILL at random moments, over real DDS: what is closed answers, and little is lost.
 
-Ten kills at each rate; EPISODIC_LONG=1 makes it 50. EPISODIC_SEED chooses other moments. What was
-lost is logged: `--log-cli-level=INFO` shows it.
+Ten kills at each rate; EPISODIC_LONG=1 makes it 50. EPISODIC_SEED chooses other moments.
 """
 
 from __future__ import annotations
 
-import logging
 import os
-import statistics
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.integration.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
+from tests.integration.kill_campaign import Campaign, Terms, place_is_right, run_campaign
 from tests.support.examples import LONG
 from tests.timing import Watch, driven
 
@@ -33,8 +30,6 @@ TERMS: Final = {
     "slow": Terms("slow", 1.0, 2, 9, KILLS, 3.5, SEED + 1),
 }
 
-_log = logging.getLogger(__name__)
-
 
 @dataclass
 class Campaigns:
@@ -46,12 +41,8 @@ class Campaigns:
 
 @pytest.fixture(scope="module")
 def campaigns(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory) -> Campaigns:
-    found = driven(
-        lambda watch: _run(tmp_path_factory.mktemp("faults"), watch, real_recorder), _judge
-    )
-    for campaign in found.found.values():
-        _log_losses(campaign)
-    return found
+    folder = tmp_path_factory.mktemp("faults")
+    return driven(lambda watch: _run(folder, watch, real_recorder), _judge)
 
 
 def _run(folder: Path, watch: Watch, real: RealRecorder) -> Campaigns:
@@ -72,26 +63,6 @@ def _judge(campaigns: Campaigns) -> None:
         _lost_at_kills_alone(campaign)
     _lost_at_most_2_s(campaigns.found["reference"])
     _lost_at_most_a_split(campaigns.found["slow"])
-
-
-def _log_losses(campaign: Campaign) -> None:
-    for kind in KINDS:
-        lost = [loss.seconds for loss in campaign.losses() if loss.kind == kind]
-        kills = sum(fault.kind == kind for fault in campaign.faults)
-        figures = (statistics.median(lost), max(lost)) if lost else (0.0, 0.0)
-        _log.info(
-            "%s, %s: %d kills, %d of a recording under way; "
-            "lost in s: median %.2f, most %.2f; all: %s",
-            *(campaign.terms.name, kind, kills, len(lost), *figures),
-            " ".join(f"{each:.2f}" for each in sorted(lost)),
-        )
-    late = campaign.delivered_late()
-    _log.info(
-        "%s: first messages of %d recordings delivered after s: median %.2f, most %.2f; "
-        "lost by those that hold nothing: %s",
-        *(campaign.terms.name, len(late), statistics.median(late), max(late)),
-        " ".join(f"{loss.seconds:.2f}" for loss in campaign.losses() if not loss.holds_any),
-    )
 
 
 @pytest.fixture(params=list(TERMS))

@@ -1,17 +1,14 @@
 """The real recorder under load, and by a simulated clock: what it keeps, and what that costs.
 
 Seconds of each; EPISODIC_LONG=1 makes it an hour of 10 topics at 200 Hz, and two simulated days.
-The figures are printed.
 """
 
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections import Counter
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -23,7 +20,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import LONG
 from tests.support.live_recorder import (
     NS_PER_S,
-    LiveRecorder,
     Machine,
     bag_files,
     machine,
@@ -45,34 +41,7 @@ SIMULATED: Final = ["/odom", "/rare"]
 SPEED: Final = 100.0
 SIMULATED_S: Final = 2 * 86_400 if LONG else 1200
 SIMULATED_SPLIT_S: Final = 600 if LONG else 300
-TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 MOST_DAEMON_MB: Final = 150
-
-
-@dataclass
-class Cost:
-    """Processor seconds of the daemon and of its recorders so far, and the most memory of each."""
-
-    daemon_s: float = 0.0
-    daemon_mb: float = 0.0
-    children_mb: float = 0.0
-    children_s: dict[int, float] = field(default_factory=dict)
-
-    def look(self, recorder: LiveRecorder) -> None:
-        self.daemon_s = processor_s(recorder.process.pid)
-        self.daemon_mb = max(self.daemon_mb, resident_mb(recorder.process.pid))
-        running = [child.pid for child in recorder.children()]
-        self.children_mb = max(self.children_mb, sum(map(resident_mb, running)))
-        self.children_s.update({pid: processor_s(pid) for pid in running})
-
-
-def processor_s(pid: int) -> float:
-    """Processor seconds of a process; 0 where it is gone."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
 
 
 def resident_mb(pid: int) -> float:
@@ -117,10 +86,11 @@ def test_what_is_lost_under_load_is_counted(real_recorder: RealRecorder, tmp_pat
             "load", *(() if LONG else ("recording.split_duration_s=2",)), topics=LOAD
         )
         recorder.wait_for("subscribed", len(LOAD))
-        cost, began = Cost(), time.monotonic()
+        daemon_mb, began = 0.0, time.monotonic()
 
         def over() -> bool:
-            cost.look(recorder)
+            nonlocal daemon_mb
+            daemon_mb = max(daemon_mb, resident_mb(recorder.process.pid))
             return time.monotonic() - began >= LOAD_S
 
         wait_for(over, "the end", timeout_s=LOAD_S + 60, alive=recorder.process)
@@ -129,19 +99,11 @@ def test_what_is_lost_under_load_is_counted(real_recorder: RealRecorder, tmp_pat
     counted = Counter[str]()
     for loss in read_losses(recorder.bag_dir, 0, time.time_ns()):
         counted[loss.topic] += loss.lost
-    sys.stdout.write(
-        f"{LOAD_S} s, {len(LOAD)} topics at {HZ} Hz: {sum(map(len, found.values()))} messages, "
-        f"{sum(map(missing, found.values()))} missing, {counted.total()} counted as lost, "
-        f"{sum(each.total() - len(each) for each in found.values())} double, "
-        f"{len(recorder.events('rotated'))} rotations; daemon {cost.daemon_s / LOAD_S:.2%} of a "
-        f"core, {cost.daemon_mb:.0f} MB; recorders {sum(cost.children_s.values()) / LOAD_S:.2%}, "
-        f"{cost.children_mb:.0f} MB\n"
-    )
     assert {topic: missing(each) for topic, each in found.items()} == {
         topic: counted[topic] for topic in LOAD
     }
     assert all(set(each.values()) == {1} for each in found.values())
-    assert cost.daemon_mb < MOST_DAEMON_MB
+    assert daemon_mb < MOST_DAEMON_MB
 
 
 @each_in_time
@@ -169,11 +131,6 @@ def test_simulated_time_is_recorded_by_its_clock(
         )
         recorder.stop()
     found = numbers(recorder.bag_dir, SIMULATED)
-    sys.stdout.write(
-        f"{SIMULATED_S} simulated s: {len(bag_files(recorder.bag_dir))} splits, "
-        f"{len(recorder.events('rotated'))} rotations, "
-        f"{ {topic: (len(each), missing(each), each.total()) for topic, each in found.items()} }\n"
-    )
     times = [
         record.log_time / NS_PER_S
         for path in bag_files(recorder.bag_dir)

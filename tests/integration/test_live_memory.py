@@ -7,8 +7,10 @@ recorder process killed and is restarted later, and one, with splits of 10 s, is
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
@@ -42,11 +44,12 @@ from tests.timing import Watch, driven
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.integration.test_server_process import Served
     from tests.support.real_recorder import RealRecorder
+    from tests.support.served import Served
 
 HZ: Final = 50.0
 AGO_S: Final = 10
+NAMES: Final = ("rotating", "killed", "ten")
 VISION: Final = "/vision/scene/scene_objects"
 TEN_S_AGO: Final = ("get_position_seconds_ago", {"seconds_ago": AGO_S})
 TRAVELLED: Final = 0.05  # m: how far from the closed form an answer may be
@@ -82,13 +85,8 @@ def drive(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory)
 
 def judge(drive: Drive) -> None:
     """All that holds where programs run in time: the robot's, the recorders' in a handover."""
-    for what in AFTER:
-        is_right(drive, what)
-    is_the_last_cup(drive)
-    counts_once(drive)
-    is_not_moved(drive)
-    for name in drive.after:
-        all_answers(drive, name)
+    for check in CHECKS.values():
+        check(drive)
 
 
 def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
@@ -103,7 +101,7 @@ def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
         # Once the robot drives nothing else should be busy starting.
         served = {
             name: stack.enter_context(answering(site.bag_dir(name), folder / f"{name}.log"))
-            for name in ("rotating", "killed", "ten")
+            for name in NAMES
         }
         short = "recording.split_duration_s=2"
         drive = Drive(
@@ -197,41 +195,13 @@ def _stamp(told: Any) -> int:
     return round(milliseconds) * 10**6
 
 
-AFTER: Final = (
-    "12 s, in splits of 10 s",
-    "12 s, in splits of 2 s",
-    "rotations",
-    "a killed recorder",
-    "a restart",
-    "a killed daemon",
-)
-
-
-@pytest.mark.parametrize("what", AFTER)
-def test_where_the_robot_was_10_s_ago_is_right_after(drive: Drive, what: str) -> None:
-    with drive.watch.excusing():
-        is_right(drive, what)
-
-
-def is_right(drive: Drive, what: str) -> None:
+def is_right(what: str, drive: Drive) -> None:
     told, asked, answered = drive.positions[what]
     assert "age_s" in told, told
     now = told["timestamp"] + told["age_s"]  # in whole milliseconds
     assert asked - 0.002 <= now <= answered + 0.002
     x, y = position(now - AGO_S - drive.t0 / NS_PER_S)
     assert math.hypot(told["x"] - x, told["y"] - y) <= TRAVELLED
-
-
-@pytest.mark.parametrize("name", ["rotating", "killed"])
-def test_scissors_were_last_seen_when_the_robot_last_published_them(
-    drive: Drive, name: str
-) -> None:
-    assert _stamp(drive.scissors[name]) == drive.t0 + 17 * NS_PER_S
-
-
-def test_the_last_cup_is_that_of_the_newest_closed_split(drive: Drive) -> None:
-    with drive.watch.excusing():
-        is_the_last_cup(drive)
 
 
 def is_the_last_cup(drive: Drive) -> None:
@@ -241,20 +211,10 @@ def is_the_last_cup(drive: Drive) -> None:
     assert _stamp(told) in {before, after}
 
 
-def test_over_three_rotations_every_message_that_was_sent_counts_once(drive: Drive) -> None:
-    assert len(drive.rotating.events("rotated")) >= 3
-    with drive.watch.excusing():
-        counts_once(drive)
-
-
 def counts_once(drive: Drive) -> None:
+    assert len(drive.rotating.events("rotated")) >= 3
     assert {row["topic"]: row["count"] for row in drive.topics} == drive.published
     assert drive.totals == drive.published
-
-
-def test_over_three_rotations_no_message_is_moved(drive: Drive) -> None:
-    with drive.watch.excusing():
-        is_not_moved(drive)
 
 
 def is_not_moved(drive: Drive) -> None:
@@ -264,13 +224,39 @@ def is_not_moved(drive: Drive) -> None:
     assert len(ticks(files, drive.t0, HZ, counting=False)) > len(found)
 
 
-@pytest.mark.parametrize("name", ["rotating", "killed", "ten"])
-def test_in_the_end_no_file_is_left_that_does_not_answer(drive: Drive, name: str) -> None:
-    # A recorder that does not get to close its files is killed in the end.
-    with drive.watch.excusing():
-        all_answers(drive, name)
-
-
-def all_answers(drive: Drive, name: str) -> None:
+def all_answers(name: str, drive: Drive) -> None:
+    """A recorder that does not get to close its files is killed in the end."""
     aside = ("active", "damaged", "incomplete", "unread")
     assert {kind: drive.after[name][kind] for kind in aside} == {key: [] for key in aside}
+
+
+AFTER: Final = (
+    "12 s, in splits of 10 s",
+    "12 s, in splits of 2 s",
+    "rotations",
+    "a killed recorder",
+    "a restart",
+    "a killed daemon",
+)
+CHECKS: Final[Mapping[str, Callable[[Drive], None]]] = {
+    **{f"where it was 10 s ago is right after {what}": partial(is_right, what) for what in AFTER},
+    "the last cup is that of the newest closed split": is_the_last_cup,
+    "over three rotations every message that was sent counts once": counts_once,
+    "over three rotations no message is moved": is_not_moved,
+    **{
+        f"no file of {name} is left without an answer": partial(all_answers, name) for name in NAMES
+    },
+}
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_while_and_after_it_drives(drive: Drive, check: str) -> None:
+    with drive.watch.excusing():
+        CHECKS[check](drive)
+
+
+@pytest.mark.parametrize("name", ["rotating", "killed"])
+def test_scissors_were_last_seen_when_the_robot_last_published_them(
+    drive: Drive, name: str
+) -> None:
+    assert _stamp(drive.scissors[name]) == drive.t0 + 17 * NS_PER_S

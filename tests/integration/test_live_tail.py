@@ -33,6 +33,7 @@ from tests.support.ros_processes import publishing_robot, ros_environment
 from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from tests.support.real_recorder import RealRecorder
@@ -73,10 +74,8 @@ def drive(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory)
 def judge(drive: Drive) -> None:
     """All that is promised by the clock."""
     for name in NAMES:
-        is_asked_often(drive, name)
-        is_fresh(drive, name)
-        is_right(drive, name)
-        is_recorded(drive, name)
+        for check in CHECKS:
+            check(drive, name)
 
 
 def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
@@ -120,34 +119,18 @@ def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
         return drive
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_questions_went_over_the_end_of_a_split(drive: Drive, name: str) -> None:
-    with drive.watch.excusing():
-        is_asked_often(drive, name)
-
-
 def is_asked_often(drive: Drive, name: str) -> None:
+    """The questions went over the end of a split."""
     assert drive.files[name] >= DRIVE_S // SPLIT_S
     assert len(drive.newest[name]) >= 5
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_what_was_recorded_3_s_before_a_question_is_found_by_it(drive: Drive, name: str) -> None:
-    with drive.watch.excusing():
-        is_fresh(drive, name)
-
-
 def is_fresh(drive: Drive, name: str) -> None:
+    """What was recorded 3 s before a question is found by it."""
     for told, asked, _ in drive.newest[name]:
         assert "timestamp" in told, told
         recorded = _newest_recorded(drive, name, asked - FRESH_S)
         assert told["timestamp"] >= unix_rounded_up(recorded)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_where_the_robot_was_a_moment_ago_is_right(drive: Drive, name: str) -> None:
-    with drive.watch.excusing():
-        is_right(drive, name)
 
 
 def is_right(drive: Drive, name: str) -> None:
@@ -190,12 +173,17 @@ def test_an_answer_from_what_is_being_written_says_so(drive: Drive, name: str) -
     assert any(told.get("from_active") is True for told, *_ in drive.newest[name])
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_recording_goes_on_as_if_nobody_had_asked(drive: Drive, name: str) -> None:
-    with drive.watch.excusing():
-        is_recorded(drive, name)
-
-
 def is_recorded(drive: Drive, name: str) -> None:
+    """Recording goes on as if nobody had asked."""
     numbers = [tick.number for tick in drive.recorded[name]]
     assert numbers == list(range(drive.published))
+
+
+CHECKS: Final = (is_asked_often, is_fresh, is_right, is_recorded)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_while_it_drives(drive: Drive, name: str, check: Callable[[Drive, str], None]) -> None:
+    with drive.watch.excusing():
+        check(drive, name)

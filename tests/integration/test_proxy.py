@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.integration.test_server_process import serving
 from tests.support.memories import ROOT
 from tests.support.processes import until
 from tests.support.robot_run import write_run
+from tests.support.served import serving
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -78,42 +78,23 @@ def children() -> set[str]:
     return set(Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split())
 
 
-def test_before_it_is_started_it_does_not_run(recorder: Recorder) -> None:
-    assert not recorder.is_running()
-
-
-def test_stopping_what_does_not_run_does_nothing(recorder: Recorder) -> None:
-    recorder.stop()
-    recorder.stop()
-    assert not recorder.is_running()
-
-
-def test_started_twice_it_goes_on_as_it_is(recorder: Recorder) -> None:
-    recorder.start()
-    before = children()
-    recorder.start()
-    assert children() == before
-
-
-def test_when_stop_returns_nothing_of_it_runs(recorder: Recorder) -> None:
-    before = children()
-    recorder.start()
-    drive(recorder)
-    recorder.stop()
-    assert not recorder.is_running()
-    assert children() == before
-
-
-def test_after_a_stop_it_may_be_started_again_into_a_new_recording(
+def test_it_runs_from_its_start_to_its_stop_each_time_into_a_new_recording(
     recorder: Recorder, tmp_path: Path
 ) -> None:
-    recorder.start()
-    records = drive(recorder)
+    before = children()
+    assert not recorder.is_running()
     recorder.stop()
-    recorder.start()
-    assert drive(recorder) is records
-    recorder.stop()
-    assert len(list(tmp_path.glob("bags/rec_*"))) == 2 * records
+    for nth in (1, 2):
+        recorder.start()
+        started = children()
+        recorder.start()
+        assert children() == started
+        records = drive(recorder)
+        recorder.stop()
+        recorder.stop()
+        assert not recorder.is_running()
+        assert children() == before
+        assert len(list(tmp_path.glob("bags/rec_*"))) == nth * records
 
 
 def test_one_that_cannot_begin_leaves_nothing_running(

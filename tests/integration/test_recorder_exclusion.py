@@ -16,28 +16,21 @@ from ros2_memory.bag_dir.state_files import read_withheld
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.live_recorder import LiveRecorder, Machine, machine
+from tests.support.live_recorder import LiveRecorder, Machine
 from tests.support.processes import PATIENCE_S
-from tests.support.ros_processes import end, ros_environment, wait_for
+from tests.support.ros_processes import end, wait_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from collections.abc import Set as AbstractSet
     from pathlib import Path
 
-    from tests.support.real_recorder import RealRecorder
 
 RULES = """
 rules:
   privacy: {topic: /privacy_mode, condition_type: equals, value: true, field: value}
 """
 TOPICS = ("/odom", "/privacy_mode")
-
-
-@pytest.fixture
-def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
-        yield found
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import pytest
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from tests.integration.test_recorder_daemon import Site, sited
-from tests.integration.test_server_process import Served, serving
 from tests.support.live_recorder import answer
 from tests.support.processes import until
+from tests.support.served import Served, serving
 from tests.timing import each_in_time
 
 if TYPE_CHECKING:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
 import yaml
 from mcap.reader import make_reader
 
@@ -18,14 +17,12 @@ from ros2_memory.bag_dir.state_files import read_losses
 from tests.support.live_recorder import (
     LiveRecorder,
     Machine,
-    machine,
     number_of,
     publishing,
     stall,
 )
 from tests.support.processes import PATIENCE_S
-from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import end, ros_environment, wait_for
+from tests.support.ros_processes import end, wait_for
 from tests.timing import Watch, driven
 
 TOPICS = ("/odom", "/scan", "/watched")
@@ -33,12 +30,6 @@ STALLS_S = (0.2, 0.3, 0.5, 1.0)
 LOSING_S = 3.0
 """A stall of 1 s may lose nothing: DDS keeps it. One of 5 s is taken for a silent publisher."""
 MOST_STALLS = 5
-
-
-@pytest.fixture
-def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
-        yield found
 
 
 def numbers(bag_dir: Path, recordings: str = "rec_*") -> dict[str, list[int]]:

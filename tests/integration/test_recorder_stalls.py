@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections import Counter
 from itertools import chain, groupby, pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -16,8 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import pytest
 from mcap.reader import make_reader
 
-from ros2_memory.bag_dir.state_files import read_losses
-from tests.support.examples import LONG
 from tests.support.live_recorder import (
     NS_PER_S,
     LiveRecorder,
@@ -25,20 +22,16 @@ from tests.support.live_recorder import (
     answer,
     answering,
     bag_files,
-    machine,
     number_of,
     publishing,
     stall,
 )
-from tests.support.ros_processes import ros_environment, wait_for
 from tests.timing import in_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Mapping, Sequence
 
-    from tests.integration.test_server_process import Served
-    from tests.support.real_recorder import RealRecorder
+    from tests.support.served import Served
 
 STALLS: Final = 3
 STALL_S: Final = 3.0
@@ -52,14 +45,12 @@ ROUNDED_S: Final = 2e-6
 """Replies give microseconds."""
 EDGE_S: Final = 2 * PERIOD_S + 0.06
 NEVER: Final = {"condition_type": "above", "field": "position.x", "value": 1e12}
-BUSY_S: Final = 3600.0
 TOPICS: Final = ("/odom", "/scan", "/slow")
 ROBOTS: Final = {
     "best effort": ("/odom:200:best_effort", "/scan:50:best_effort", "/slow:2:best_effort"),
     "reliable": ("/odom:50:reliable", "/scan:50:reliable", "/slow:2:reliable"),
 }
 BOTH: Final = ("/odom:50:reliable", "/scan:50:best_effort", "/slow:2:reliable")
-FOREVER: Final = (0, 2**62)
 
 Span = tuple[float, float]
 """Unix seconds."""
@@ -131,12 +122,6 @@ class Drive(NamedTuple):
 
     def is_there(self, sent: Sent) -> bool:
         return (sent.topic, sent.number) in self.logged
-
-
-@pytest.fixture
-def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
-        yield found
 
 
 def drive(
@@ -270,24 +255,3 @@ def test_a_stall_at_a_rotation_is_a_gap_where_both_recorders_stall(site: Machine
             assert_gaps_are_what_did_not_arrive(found, gaps_of(served))
 
     in_time(stalling)
-
-
-@pytest.mark.skipif(not LONG, reason=f"takes {BUSY_S:.0f} s: EPISODIC_LONG=1")
-def test_a_busy_publisher_has_no_gap_and_no_loss_that_is_none(site: Machine) -> None:
-    robot = ("/odom:200:best_effort", "/scan:200:reliable", "/slow:10:reliable")
-
-    def none(recorder: LiveRecorder) -> Sequence[Span]:
-        over = time.monotonic() + BUSY_S
-        wait_for(lambda: time.monotonic() > over, "the end", timeout_s=2 * BUSY_S)
-        assert recorder.process.poll() is None
-        return ()
-
-    found = drive(site, robot, 60, none)
-    lost = Counter(each.topic for each in found.recorded() if not found.is_there(each))
-    told = Counter[str]()
-    for loss in read_losses(found.recorder.bag_dir, *FOREVER):
-        told[loss.topic] += loss.lost
-    sys.stdout.write(f"{len(found.sent)} sent, {lost} lost, {told} told\n")
-    assert told <= lost
-    with answering(found.recorder.bag_dir, site.folder / "server.log") as served:
-        assert_gaps_are_what_did_not_arrive(found, gaps_of(served))

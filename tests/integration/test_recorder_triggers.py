@@ -7,19 +7,15 @@ import time
 from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
-import pytest
-
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.live_recorder import Machine, bag_files, machine
+from tests.support.live_recorder import Machine, bag_files
 from tests.support.processes import until
-from tests.support.ros_processes import publishing_robot, ros_environment
+from tests.support.ros_processes import publishing_robot
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
-    from tests.support.real_recorder import RealRecorder
 
 SPLIT_S: Final = 2
 ISO_TIME: Final = r"\d{4}-\d\d-\d\dT\S+?[+-]\d\d:\d\d"
@@ -29,12 +25,6 @@ rules:
   turned: {topic: /odom, condition_type: above, value: 0.5, field: position.y, for_s: 1}
   restarted: {kind: recorder_restart, before_s: 1, after_s: 1}
 """
-
-
-@pytest.fixture
-def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
-        yield found
 
 
 def test_rules_fire_once_through_rotations_and_a_kill(site: Machine, tmp_path: Path) -> None:

@@ -29,7 +29,6 @@ from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.split_writer import DOCK, SplitWriter
 from tests.integration.test_recorder_daemon import Site, sited
-from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.examples import LONG
 from tests.support.housekeepers import keeper_of, own_all, size_of
@@ -37,6 +36,7 @@ from tests.support.live_recorder import answer, answering
 from tests.support.memories import memory_of
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ask_everything, write_run
+from tests.support.served import serving
 from tests.unit.core.test_deep_directories import DEEP, within
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from mcap.writer import CompressionType
 from mcp import Client
 from mcp.client.sse import sse_client
 
-from tests.soak.server import Served, serving
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.examples import LONG
 from tests.support.processes import PATIENCE_S, until
+from tests.support.served import PROGRAM, Served, serving
 
 MB: Final = 1 << 20
 PROMISED_MB: Final = 512
@@ -60,7 +60,7 @@ async def asked(client: Client, tool: str, given: dict[str, Any]) -> str:
 async def ask_alone_and_at_once(served: Served, count: int) -> None:
     """Asks each question alone, then eight at once: each is answered with what is there."""
     asks = questions(count)
-    transport = sse_client(f"http://127.0.0.1:{served.port}/sse", timeout=PATIENCE_S)
+    transport = sse_client(served.url("/sse"), timeout=PATIENCE_S)
     async with Client(transport, read_timeout_seconds=PATIENCE_S) as client:
         tool, given, expected = asks[0]
         assert expected in await asked(client, tool, given)
@@ -85,7 +85,9 @@ def test_a_small_bag_of_large_messages_takes_no_more_memory_than_promised(
     write_mcap(bag, said, McapLayout(chunk_size=chunk_size, compression=compression))
     assert bag.stat().st_size < count * size // 100
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    with serving(bag.parent.parent, tmp_path / "log", "server.call_timeout_s=170") as served:
+    with serving(
+        bag.parent.parent, tmp_path / "log", "server.call_timeout_s=170", program=PROGRAM
+    ) as served:
         before = memory_mb(served, "VmRSS")
         asyncio.run(ask_alone_and_at_once(served, count))
         until(lambda: memory_mb(served, "VmRSS") < before + CACHED_MB)
@@ -102,12 +104,12 @@ def test_only_the_message_above_the_bound_is_refused_and_named(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     async def ask(served: Served) -> Any:
-        transport = sse_client(f"http://127.0.0.1:{served.port}/sse", timeout=PATIENCE_S)
+        transport = sse_client(served.url("/sse"), timeout=PATIENCE_S)
         async with Client(transport, read_timeout_seconds=PATIENCE_S) as client:
             given = {"topic": "/chatter", "start": 0, "end": 9}
             return json.loads(await asked(client, "get_topic_in_range", given))
 
-    with serving(bag.parent.parent, tmp_path / "log") as served:
+    with serving(bag.parent.parent, tmp_path / "log", program=PROGRAM) as served:
         reply = asyncio.run(ask(served))
         assert memory_mb(served, "VmHWM") < PROMISED_MB
     assert [sample["value"]["value"][:4] for sample in reply["samples"]] == ["0001", "0003"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import http.server
 import subprocess
 import sys
@@ -15,15 +14,15 @@ import pytest
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
 
-from tests.integration.test_server_process import (
-    ENDS_WITHIN_S,
+from tests.support.processes import PATIENCE_S
+from tests.support.robot_run import ask, write_run
+from tests.support.served import (
     Served,
     command,
     environment,
+    refusal,
     serving,
 )
-from tests.support.processes import PATIENCE_S
-from tests.support.robot_run import ask, write_run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,16 +37,6 @@ SWITCHES = {"server.metrics": "prometheus_client", "server.traces": "opentelemet
 def bag_dir(tmp_path: Path) -> Path:
     write_run(tmp_path / "bags")
     return tmp_path / "bags"
-
-
-def get(served: Served, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=PATIENCE_S)
-    try:
-        connection.request("GET", path, headers=headers)
-        response = connection.getresponse()
-        return response.status, response.read()
-    finally:
-        connection.close()
 
 
 @contextmanager
@@ -92,10 +81,10 @@ async def test_what_was_asked_and_what_is_known_is_scraped_by_whoever_shows_the_
     parser = pytest.importorskip("prometheus_client.parser", reason="needs the extra observability")
     with serving(bag_dir, tmp_path / "log", "server.metrics=true", MEMORY_API_TOKEN=GOOD) as served:
         await asked(served)
-        assert get(served, "/metrics", {})[0] == 401
-        assert get(served, "/metrics", {"Authorization": "Bearer x"})[0] == 401
-        assert get(served, "/metrics", SHOWN | {"Host": "evil.example"})[0] == 421
-        status, body = get(served, "/metrics", SHOWN)
+        assert served.get("/metrics", {})[0] == 401
+        assert served.get("/metrics", {"Authorization": "Bearer x"})[0] == 401
+        assert served.get("/metrics", SHOWN | {"Host": "evil.example"})[0] == 421
+        status, body = served.get("/metrics", SHOWN)
     assert status == 200
     found = {
         (sample.name, *sorted(sample.labels.items())): sample.value
@@ -127,10 +116,10 @@ async def test_each_call_is_one_span_at_the_collector(bag_dir: Path, tmp_path: P
         more = {"OTEL_EXPORTER_OTLP_ENDPOINT": endpoint, "MEMORY_API_TOKEN": GOOD}
         with serving(bag_dir, tmp_path / "log", "server.traces=true", **more) as served:
             await asked(served)
-            assert get(served, "/metrics", SHOWN)[0] == 404
+            assert served.get("/metrics", SHOWN)[0] == 404
             # The last spans leave when it ends.
             served.process.terminate()
-            assert served.process.wait(ENDS_WITHIN_S) == 0
+            assert served.process.wait(PATIENCE_S) == 0
     outcomes = []
     for body in bodies:
         for resource in trace_service_pb2.ExportTraceServiceRequest.FromString(body).resource_spans:
@@ -149,21 +138,6 @@ async def test_each_call_is_one_span_at_the_collector(bag_dir: Path, tmp_path: P
     ]
 
 
-def refused(bag_dir: Path, program: list[str]) -> str:
-    """What a server says that does not start."""
-    ended = subprocess.run(
-        program,
-        env=environment(bag_dir),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
-    assert ended.returncode == 2
-    assert ended.stdout == ""
-    return ended.stderr
-
-
 @pytest.mark.parametrize("key", SWITCHES)
 def test_without_the_extra_it_does_not_start_and_says_what_to_install(
     bag_dir: Path, key: str
@@ -173,14 +147,14 @@ def test_without_the_extra_it_does_not_start_and_says_what_to_install(
         f"import sys; sys.modules[{absent!r}] = None; from ros2_memory.server import main; "
         f"sys.exit(main(['server.transport=sse', 'server.port=0', '{key}=true']))"
     )
-    output = refused(bag_dir, [sys.executable, "-c", hidden])
+    output = refusal([sys.executable, "-c", hidden], bag_dir)
     assert len(output.splitlines()) == 2
     assert f"{key}: true needs the optional part of this package" in output
     assert "pip install '.[observability]'" in output
 
 
 def test_there_are_no_metrics_over_stdio(bag_dir: Path) -> None:
-    output = refused(bag_dir, command("server.metrics=true"))
+    output = refusal(command("server.metrics=true"), bag_dir)
     assert len(output.splitlines()) == 2
     assert "server.transport=sse" in output
 

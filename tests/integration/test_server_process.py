@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import http.client
 import json
-import os
 import signal
 import socket
 import subprocess
 import sys
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import anyio
 import pytest
@@ -21,13 +17,13 @@ from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from ros2_memory.server import _show_page, main
 from tests.support.examples import LONG
-from tests.support.forked_commands import Forked, write_command
-from tests.support.processes import PATIENCE_S, until
+from tests.support.forked_commands import write_command
+from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import CALLS, T0_S, ask, ask_everything, write_run
+from tests.support.served import PROGRAM, Served, command, environment, refusal, serving
 from tests.timing import in_time
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 BETWEEN_ATTEMPTS_S = 0.05
@@ -39,75 +35,6 @@ ENDS_WITHIN_S = 5.0
 def bag_dir(tmp_path: Path) -> Path:
     write_run(tmp_path / "bags")
     return tmp_path / "bags"
-
-
-PROGRAM = (sys.executable, "-m", "ros2_memory.server", "data.now=latest")
-
-
-def command(*overrides: str) -> list[str]:
-    return [*PROGRAM, *overrides]
-
-
-def environment(bag_dir: Path, **more: str) -> dict[str, str]:
-    """This test's environment, without the user's own settings."""
-    ours = ("MEMORY_", "MCP_", "ROS_")
-    kept = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
-    return kept | {"MEMORY_BAG_DIR": str(bag_dir)} | more
-
-
-@dataclass
-class Served:
-    process: subprocess.Popen[Any]
-    port: int
-    log: Path
-
-    def url(self, path: str) -> str:
-        return f"http://127.0.0.1:{self.port}{path}"
-
-    def get(self, path: str) -> tuple[int, bytes]:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
-        try:
-            connection.request("GET", path)
-            response = connection.getresponse()
-            return response.status, response.read()
-        finally:
-            connection.close()
-
-    def events(self) -> list[dict[str, Any]]:
-        """What was logged so far; the last line may be on its way."""
-        whole, _, _ = self.log.read_text(encoding="utf-8").rpartition("\n")
-        return [json.loads(line) for line in whole.splitlines()]
-
-
-@contextmanager
-def serving(
-    bag_dir: Path, log: Path, *overrides: str, program: Sequence[str] = (), **more: str
-) -> Iterator[Served]:
-    """The server over HTTP on a free port, from when it answers `/health`.
-
-    `program`: what is started; none: it is forked. `more` joins its environment.
-    """
-    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT="0", **more)
-    with log.open("wb") as stderr:
-        process: subprocess.Popen[Any] = (
-            subprocess.Popen([*program, *overrides], env=env, stdout=subprocess.PIPE, stderr=stderr)
-            if program
-            else Forked("ros2-memory-server", "data.now=latest", *overrides, env=env, stderr=stderr)
-        )
-    try:
-        served = Served(process, 0, log)
-
-        def port() -> int | None:
-            assert process.poll() is None, log.read_text(encoding="utf-8")
-            heard = (each["port"] for each in served.events() if each["event"] == "listening")
-            return next(heard, None)
-
-        served.port = until(port)
-        assert served.get("/health")[0] == 200
-        yield served
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> None:
@@ -262,16 +189,7 @@ def test_a_port_in_use_is_told_in_one_line(bag_dir: Path) -> None:
 
 
 def test_a_refused_configuration_is_told_on_stderr(bag_dir: Path) -> None:
-    ended = subprocess.run(
-        command("server.prot=1"),
-        env=environment(bag_dir),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ended.returncode == 2
-    assert ended.stdout == ""
-    assert "server.prot" in ended.stderr
+    assert "server.prot" in refusal(command("server.prot=1"), bag_dir)
 
 
 @pytest.mark.parametrize(("option", "reply"), [("--version", "0.1"), ("--help", "key=value")])

@@ -13,9 +13,9 @@ from mcp import Client
 from mcp.client.sse import sse_client
 from mcp.types import TextContent
 
-from tests.integration.test_server_process import Served, serving
 from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import write_run
+from tests.support.served import Served, serving
 
 if TYPE_CHECKING:
     from pathlib import Path

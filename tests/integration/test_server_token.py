@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import http.client
 import json
-import subprocess
 from typing import TYPE_CHECKING
 
 import httpx2
@@ -13,9 +11,9 @@ from mcp import Client
 from mcp.client.sse import sse_client
 from mcp.client.streamable_http import streamable_http_client
 
-from tests.integration.test_server_process import Served, command, environment, serving
 from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import ask, write_run
+from tests.support.served import Served, command, refusal, serving
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,29 +29,11 @@ def bag_dir(tmp_path: Path) -> Path:
     return tmp_path / "bags"
 
 
-def status(served: Served, method: str, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=PATIENCE_S)
-    try:
-        connection.request(method, path, headers=headers)
-        response = connection.getresponse()
-        return response.status, response.read()
-    finally:
-        connection.close()
-
-
 def test_it_does_not_start_without_a_token_where_others_can_reach_it(bag_dir: Path) -> None:
-    ended = subprocess.run(
-        command("server.transport=sse", "server.port=0"),
-        env=environment(bag_dir, MCP_HOST=EVERYWHERE),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert "MEMORY_API_TOKEN: missing" in ended.stderr
-    assert repr(EVERYWHERE) in ended.stderr
-    assert len(ended.stderr.splitlines()) == 2
+    said = refusal(command("server.transport=sse", "server.port=0"), bag_dir, MCP_HOST=EVERYWHERE)
+    assert "MEMORY_API_TOKEN: missing" in said
+    assert repr(EVERYWHERE) in said
+    assert len(said.splitlines()) == 2
 
 
 async def test_whoever_shows_the_token_is_answered_and_nobody_else(
@@ -75,9 +55,9 @@ async def test_whoever_shows_the_token_is_answered_and_nobody_else(
             assert (await ask(client, "data_time_range", {}))[0]["bags"] == 1
         for path in ("/sse", "/mcp", "/messages/"):
             for headers in ({}, {"Authorization": "Bearer " + GOOD[:-1]}):
-                assert status(served, "POST", path, headers)[0] == 401
+                assert served.get(path, headers, "POST")[0] == 401
         assert json.loads(served.get("/health")[1]) == {"status": "ok"}
-        assert json.loads(status(served, "GET", "/health", SHOWN)[1])["bags"] == 1
+        assert json.loads(served.get("/health", SHOWN)[1])["bags"] == 1
         _leave_traces(served)
     output = (tmp_path / "log").read_text(encoding="utf-8")
     assert '"event": "tool_call"' in output
@@ -89,6 +69,6 @@ def _leave_traces(served: Served) -> None:
     """Shows the token, and another, in every place that somebody may put into a log."""
     for path in (f"/sse?token={GOOD}", f"/mcp?access_token={GOOD}", "/health?token=in-a-query"):
         for headers in ({}, SHOWN | {"Host": "evil.example"}, SHOWN | {"Content-Length": "x"}):
-            status(served, "POST", path, headers)
-    status(served, "POST", f"/messages/?session_id={GOOD}", SHOWN)
-    status(served, "POST", f"/messages/{GOOD}?session_id=in-a-query", SHOWN)
+            served.get(path, headers, "POST")
+    served.get(f"/messages/?session_id={GOOD}", SHOWN, "POST")
+    served.get(f"/messages/{GOOD}?session_id=in-a-query", SHOWN, "POST")

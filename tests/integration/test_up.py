@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, Final
 import pytest
 import yaml
 
-from tests.integration.test_server_process import Served
-from tests.support.live_recorder import Machine, answer, machine
+from tests.support.live_recorder import Machine, answer
 from tests.support.processes import PATIENCE_S, until
-from tests.support.ros_processes import end, publishing_robot, ros_environment
+from tests.support.ros_processes import end, publishing_robot
+from tests.support.served import Served
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from tests.support.real_recorder import RealRecorder
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 QUICK: Final = ("server.port=0", "recording.split_duration_s=1", "retention.min_free_gb=0")
@@ -38,12 +37,6 @@ PROPOSED: Final = [
     "/tf_static",
     "/vision/scene/scene_objects",
 ]
-
-
-@pytest.fixture
-def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as site:
-        yield site
 
 
 @dataclass

@@ -12,6 +12,7 @@ import re
 import textwrap
 from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import yaml
@@ -294,11 +295,16 @@ def _schema_of(key: str) -> Mapping[str, Any]:
         if above == f"{group}.{inner}".rstrip(".") and name in own:
             break
     else:
-        schema = TypeAdapter(Settings).json_schema()
+        schema = _schema_of_settings()
         of_section = schema["properties"][above]["$ref"].rpartition("/")[2]
         own = schema["$defs"][of_section]["properties"]
     found: Mapping[str, Any] = own[name]
     return found
+
+
+@cache
+def _schema_of_settings() -> dict[str, Any]:
+    return TypeAdapter(Settings).json_schema()
 
 
 def configured_keys() -> set[str]:

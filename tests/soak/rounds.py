@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from tests.soak import clients
-from tests.soak.server import Held, Served
+from tests.soak.server import Held, came_back_to, held
+from tests.support.examples import LONG
 from tests.support.processes import PATIENCE_S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from tests.soak.clients import Habit
+    from tests.support.served import Served
 
 SHORT: Final[tuple[Habit, ...]] = (
     clients.all_tools,
@@ -27,8 +27,8 @@ SHORT: Final[tuple[Habit, ...]] = (
 )
 SLOW: Final[tuple[Habit, ...]] = (
     clients.slow_loris,
-    clients.endless_bodies,
     clients.never_reading,
+    *LONG * (clients.endless_bodies,),
 )
 """What the server lets go on for seconds."""
 
@@ -41,7 +41,6 @@ class Soak:
     rounds: list[Held] = field(default_factory=list)
     end: Held | None = None
     seen: dict[str, Counter[str]] = field(default_factory=dict)
-    most: Held | None = None
 
     @property
     def growth_mb(self) -> float:
@@ -56,31 +55,23 @@ class Soak:
         self.seen.setdefault(name, Counter()).update(seen)
 
 
-async def soaked(
-    served: Served,
-    seconds: float,
-    tell: Callable[[float, Held], None] = lambda *_: None,
-    slow: tuple[Habit, ...] = SLOW,
-) -> Soak:
+async def soaked(served: Served, seconds: float) -> Soak:
     """Runs rounds for so long, at least two after the first, which only warms the server up."""
-    await _round(served, Soak(served.held()), (*SHORT, clients.never_reading))
+    await _round(served, Soak(held(served)), (*SHORT, clients.never_reading))
     await clients.crowd(served.port)
     soak = Soak(await asyncio.to_thread(_settled, served))
     begun = time.monotonic()
-    waited_for = asyncio.ensure_future(_round(served, soak, slow))
-    watch = asyncio.create_task(_watch(served, soak))
+    waited_for = asyncio.ensure_future(_round(served, soak, SLOW))
     while len(soak.rounds) < 2 or time.monotonic() - begun < seconds:
         await _round(served, soak, SHORT)
-        soak.rounds.append(served.held())
-        tell(time.monotonic() - begun, soak.rounds[-1])
+        soak.rounds.append(held(served))
         if waited_for.done():
             await waited_for
             await _one(served, soak, clients.crowd)
             if time.monotonic() - begun < seconds:
-                waited_for = asyncio.ensure_future(_round(served, soak, slow))
+                waited_for = asyncio.ensure_future(_round(served, soak, SLOW))
     await waited_for
-    watch.cancel()
-    soak.end = await asyncio.to_thread(served.came_back_to, soak.start)
+    soak.end = await asyncio.to_thread(came_back_to, served, soak.start)
     return soak
 
 
@@ -93,25 +84,12 @@ async def _one(served: Served, soak: Soak, habit: Habit) -> None:
     soak.saw(habit, await habit(served.port))
 
 
-async def _watch(served: Served, soak: Soak) -> None:
-    """The most of each that was ever seen held."""
-    while True:
-        held = served.held()
-        most = soak.most or held
-        soak.most = Held(
-            max(most.rss_mb, held.rss_mb),
-            max(most.threads, held.threads),
-            max(most.files, held.files),
-        )
-        await asyncio.sleep(0.05)
-
-
 def _settled(served: Served) -> Held:
     """What it holds when nothing has changed for a while: connections of the warm-up are over."""
-    alike, held = 0, served.held()
+    alike, now = 0, held(served)
     give_up = time.monotonic() + PATIENCE_S
     while alike < 20 and time.monotonic() < give_up:
         time.sleep(0.1)
-        before, held = held, served.held()
-        alike = alike + 1 if before.files == held.files and before.threads == held.threads else 0
-    return held
+        before, now = now, held(served)
+        alike = alike + 1 if before.files == now.files and before.threads == now.threads else 0
+    return now

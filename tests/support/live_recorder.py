@@ -35,12 +35,12 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.integration.test_server_process import Served, serving
 from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
 from tests.support.real_recorder import env_without_ros
 from tests.support.robot_run import ask
 from tests.support.ros_processes import end, wait_for
+from tests.support.served import Served, serving
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
