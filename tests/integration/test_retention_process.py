@@ -1,4 +1,4 @@
-"""Retention while a recorder records and questions are asked; and none where nothing is recorded.
+"""Retention while a recorder records and questions are asked.
 
 20 splits; EPISODIC_LONG=1 makes it 200.
 """
