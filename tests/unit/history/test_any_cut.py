@@ -432,7 +432,7 @@ def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(see
         limit.setattr(timeline, "SEGMENT_BAGS", how.choice([1, 2, timeline.SEGMENT_BAGS]))
         limit.setattr(decode, "_HELD_BYTES", how.choice([1, 300, 2000, decode._HELD_BYTES]))
         limit.setattr(decode, "GROUP_BYTES", how.choice([1, 1000, decode.GROUP_BYTES]))
-        limit.setattr(bulk, "BATCH_BYTES", how.choice([500, bulk.BATCH_BYTES]))
+        limit.setattr(bulk, "BATCH_BYTES", how.choice([500, 1 << 20]))
         limit.setattr(writing, "_MOST_ROWS", how.choice([3, writing._MOST_ROWS]))
         bag_dir, aside = Path(folder, "bags"), Path(folder, "aside")
         bag_dir.mkdir()

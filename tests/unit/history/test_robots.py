@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +134,9 @@ def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robot
 
 @pytest.mark.parametrize("asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}])
 def test_a_way_over_both_robots_is_not_known(both: Memory, asks: dict[str, object]) -> None:
-    ask = partial(asked, both, both.index.bag_dir, **WINDOW, **asks)
+    def ask(tool: str, **more: object) -> Any:
+        return asked(both, both.index.bag_dir, tool, **WINDOW, **asks, **more)
+
     told, unknown = ask("recap"), "the path is unknown: 2 recordings"
     assert [told.get(each) for each in ("distance_m", "max_speed", "stood_s")] == [None] * 3
     assert not [each for each in told["events"] if each["kind"] in {"stop", "drop"}]

@@ -40,7 +40,7 @@ def noisy(points: Points, sigma: float, seed: int = 1, axes: int = 3) -> Points:
     return points + off
 
 
-def driven(positions: Iterable[Vector3], hertz: float = 1.0) -> Poses:
+def driven(positions: Iterable[Vector3 | list[float]], hertz: float = 1.0) -> Poses:
     """Poses at even steps of log time."""
     return posed((BEGIN + round(nth * S / hertz), place) for nth, place in enumerate(positions))
 
