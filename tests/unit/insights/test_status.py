@@ -69,7 +69,7 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     assert shown(memory, tmp_path)["newest_age_s"] == 50.0
 
 
-def lost(kind: str, begin_s: float, stop_s: float, count: int = 0, topic: str = "/odom") -> Loss:
+def lost(kind: Any, begin_s: float, stop_s: float, count: int = 0, topic: str = "/odom") -> Loss:
     return Loss(topic, BEGIN + round(begin_s * S), BEGIN + round(stop_s * S), count, kind)
 
 
