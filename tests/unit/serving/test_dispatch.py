@@ -62,7 +62,7 @@ def served(
     replies = Replies(Path("bags"), 24_000)
     dispatcher = Dispatcher(NOBODY, tools, replies, call_timeout_s=timeout_s, **options)
     about = {"name": "episodic", "version": "1.2.3", "instructions": "Ask away."}
-    return EpisodicServer(dispatcher, **about)
+    return EpisodicServer(dispatcher, **about, progress=None)
 
 
 def sent(result: CallToolResult) -> Any:
