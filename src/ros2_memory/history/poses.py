@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
+from ros2_memory.analysis.poses import NO_POSES, FrameCodes, Poses, joined_poses
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
@@ -111,21 +111,13 @@ def poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> d
         tables: all rows of a topic, of these bags and of others.
         files: of the bags.
     """
-    failures: list[UndecodableError] = []
-    reader = PoseReader(view, failures)
+    reader = PoseReader(view, [])
     parts: dict[str, list[Poses]] = defaultdict(list)
     for rows in tables:
-        try:
-            poses = reader.poses(rows)
-        except InvalidArgumentsError:
-            return {}
+        poses = reader.poses_of_all(rows)
         for bag, positions in rows.bag_rows(files):
-            if failures:
-                failures.clear()
-                own = reader.poses(rows.some(positions))
-            else:
-                own = poses.rows(positions)
-            parts[bag.file].append(joined_poses([]) if failures else own)
+            of_bag = poses.rows(positions) if poses else reader.poses_of_all(rows.some(positions))
+            parts[bag.file].append(of_bag or NO_POSES)
     return {file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))}
 
 
@@ -193,6 +185,14 @@ class PoseReader:
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
         return self._by_messages(rows) if poses is None else joined_poses(poses)
+
+    def poses_of_all(self, rows: Rows) -> Poses | None:
+        """Returns the poses of rows, each at the place of its row; None where a row has none."""
+        try:
+            poses = self.poses(rows)
+        except InvalidArgumentsError:
+            return None
+        return poses if len(poses) == len(rows) else None
 
     def _by_columns(self, rows: Rows) -> Poses | None:
         read = partial(self._columns.of, rows.table, rows.times, rows.index)

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 from collections import Counter, defaultdict
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
@@ -35,7 +36,7 @@ from ros2_memory.analysis.sights import Spot
 from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEvents
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.errors import UndecodableError
+from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -203,10 +204,18 @@ class RowMaker:
         if places is None:
             return []
         tracks = [
-            (frame, cut(TrackReader(self._view, frame).over(around.aligned(PART_NS)).track, window))
+            (frame, cut(self._track(frame, around, window), window))
             for frame in dict.fromkeys((places.map_frame, places.pose_frame))
         ]
         return [(frame, track) for frame, track in tracks if len(track.times)]
+
+    def _track(self, frame: str, *windows: TimeWindow) -> RobotTrack:
+        """Returns the track in the first of some windows in which all messages carry positions."""
+        reader = TrackReader(self._view, frame)
+        for window in windows:
+            with suppress(InvalidArgumentsError):
+                return reader.over(window.aligned(PART_NS)).track
+        return empty_track()
 
     def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:
         same = {"topic": self._view.pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
