@@ -194,10 +194,16 @@ def _with_jumps(view: View, waypoints: Sequence[Waypoint], frame_id: str) -> tup
     """Returns waypoints of the robot's path with `jump` at the first after each jump of a frame."""
     window = TimeWindow(waypoints[0].time, waypoints[-1].time + 1)
     try:
-        track = TrackReader(view, frame_id).over(window).track
+        known = TrackReader(view, frame_id).over(window)
     except QueryTimeoutError:
         view.notes.add_lack(f"there was no time to look where {frame_id} jumped")
         return tuple(waypoints)
+    if known.since is not None:
+        view.notes.add_lack(
+            f"where {frame_id} jumped is known back to {unix_text(known.since)}: out of time "
+            "before older poses were placed"
+        )
+    track = known.track
     jumped = track.times[1:][jumps(track)[:-1]]
     reached = np.searchsorted(jumped, [waypoint.time for waypoint in waypoints], side="right")
     is_after = np.diff(reached, prepend=reached[0]) > 0

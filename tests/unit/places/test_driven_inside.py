@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import odom, tf, transform, write_mcap
+from tests.support.bags import odom, tf, transform, write_mcap, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
@@ -73,6 +74,23 @@ def test_no_drawn_way_leads_across_a_jump_of_the_map(tmp_path: Path, recalls: bo
     note = "map jumped before 1 waypoint: the line to there was not driven"
     assert note in moved["notes"]
     assert note not in own["notes"]
+
+
+def test_where_the_map_jumped_before_its_time_was_over_is_not_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = []
+    for step in range(60):
+        at, off_m = BEGIN + step * S, 0.0 if step < 15 else 10.0
+        pose = transform(at, "odom", "base_link", (step * 0.3, 0.0, 0.0))
+        there = transform(at, "map", "odom", (0.0, off_m, 0.0))
+        messages += [odom(at, step * 0.3, 0.0, vx=0.3), tf(at, there, pose)]
+    write_splits(tmp_path, messages)
+    monkeypatch.setattr("ros2_memory.places.robot_tracks._READING_S", 0.0)
+    call = Call(deadline=Deadline.after(100))
+    found = trajectory_summary(memory_of(tmp_path), call, ALL, frame_id="map")
+    assert not any(each.jump for each in found.trajectory.waypoints)
+    assert any(note.startswith("where map jumped is known back to") for note in found.notes)
 
 
 @each_way
