@@ -7,6 +7,7 @@ import time
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
@@ -375,8 +376,8 @@ class Latching:
         return None if snapshot.timeline.is_transient_state(topic) else False
 
 
-NoteKey: TypeAlias = "tuple[Reason, str]"
-"""The kind of a note, and the file that it is on."""
+NoteKey: TypeAlias = "tuple[Reason, str, Ns, Ns]"
+"""The kind of a note, the file that it is on, and the log times between which it is."""
 
 
 class Note(NamedTuple):
@@ -421,10 +422,7 @@ class Notes:
                 self._sentences.setdefault(note)
                 continue
             self.added += 1
-            before = self._notes.get((note.kind, note.file), note)
-            newest = note if before.until < note.until else before
-            since = min(before.since, note.since)
-            self._notes[note.kind, note.file] = newest._replace(since=since)
+            self._notes.setdefault((note.kind, note.file, note.since, note.until), note)
 
     def add_lack(self, note: str | Note) -> None:
         """Adds a note on data that the answer needs and that could not be read."""
@@ -450,7 +448,7 @@ class Notes:
         not: so the shared ones are sorted.
         """
         by_kind: dict[Reason, dict[str, str]] = {}
-        for note in self._notes.values():
+        for note in _farthest(self._notes.values()):
             # A sentence on the bag's summary may report the same already.
             if note.detail not in self._remarks.get(note.file, ()):
                 by_kind.setdefault(note.kind, {})[note.file] = note.detail
@@ -469,7 +467,8 @@ class Notes:
         name = short_name(bag.path)
         if name in self._remarks:
             return False
-        details = {note.detail for note in self._notes.values() if note.file == name}
+        own = [note for note in self._notes.values() if note.file == name]
+        details = {note.detail for note in _farthest(own)}
         return details.issuperset(bag.summary.remarks)
 
     def keys(self) -> frozenset[NoteKey]:
@@ -489,6 +488,12 @@ class Notes:
             for key, note in self._notes.items()
             if key in keep or any(window.overlaps(note.since, note.until) for window in windows)
         }
+
+
+def _farthest(notes: Iterable[Note]) -> Iterable[Note]:
+    """Returns, of the notes of each kind on each file, the one that reaches farthest."""
+    in_order = sorted(notes, key=attrgetter("until", "since"))
+    return {(note.kind, note.file): note for note in in_order}.values()
 
 
 def short_name(path: Path) -> str:

@@ -15,9 +15,9 @@ from ros2_memory.history.context import Memory
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, detections, odom, write_db3, write_mcap
 from tests.support.listed_bags import odom_bag
-from tests.support.mcap_surgery import spoil_chunk
+from tests.support.mcap_surgery import chunks_of, spoil_chunk
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN, write_moving_map
 
@@ -223,6 +223,25 @@ def damaged(tmp_path_factory: pytest.TempPathFactory) -> Memory:
             data[at] ^= 0xFF
         split.write_bytes(data)
     return memory_of(folder)
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("tool", "given"), [("visits", {"x": 0.0, "y": 0.0, "radius_m": 9.0}), ("recap", {})]
+)
+def test_a_file_with_damage_on_both_sides_of_the_window_is_whole_there(
+    tmp_path: Path, tool: str, given: dict[str, object], *, recalls: bool
+) -> None:
+    messages = [odom(T0 + n * S // 5, n * 0.01, 0.0) for n in range(300)]
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=8000))
+    for at in (T0 + 10 * S, T0 + 50 * S):
+        chunks = enumerate(chunks_of(path))
+        spoil_chunk(path, next(nth for nth, chunk in chunks if chunk.message_end_time >= at))
+    memory = memory_of(tmp_path, recalls=recalls)
+    for start, is_named in ((0, True), (28, False), (45, True)):
+        window = {"start": T0_S + start, "end": T0_S + start + 12}
+        notes = asked(memory, tmp_path, tool, **given, **window).get("notes", [])
+        assert any("could not be read whole" in note for note in notes) == is_named
 
 
 @pytest.mark.parametrize(
