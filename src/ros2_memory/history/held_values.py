@@ -28,7 +28,7 @@ from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
 from ros2_memory.messages.conversions import Summary
-from ros2_memory.messages.to_json import round_real
+from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -70,7 +70,11 @@ class Held(NamedTuple):
     @property
     def value(self) -> JsonValue:
         """The same as replies round it: NaN and infinity are None."""
-        return round_real(exact) if isinstance(exact := self.exact, float) else exact
+        exact = self.exact
+        if isinstance(exact, float):
+            return round_real(exact)
+        # In the word a whole float has all its digits.
+        return round_integer(exact) if isinstance(exact, int) else exact
 
     @property
     def is_blank(self) -> bool:

@@ -12,8 +12,10 @@ from ros2_memory.history.context import Memory
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
 from tests.support.bags import (
+    Msg,
     battery,
     boolean,
+    make,
     octets,
     odom,
     text,
@@ -98,6 +100,26 @@ def test_numbers_are_written_as_everywhere_else(tmp_path: Path) -> None:
         assert [row["value"] for row in reply["changes"]] == [0, 0.1, 0.2]
         reply = ask(memory, "get_topic_in_range", by="value", **given)
         assert {row[0] for row in reply["rows"]} == {"0", "0.1", "0.2"}
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("kind", "number"), [("Float32", float(2**128 - 2**104)), ("Float64", 1e300)]
+)
+def test_a_large_number_is_written_as_everywhere_else(
+    tmp_path: Path, kind: str, number: float, *, recalls: bool
+) -> None:
+    type_name = f"std_msgs/msg/{kind}"
+    said = [make(type_name, data=value) for value in (number, 2.5, number)]
+    messages = [Msg("/number", type_name, (BEGIN + n) * S, body) for n, body in enumerate(said)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    given = {"topic": "/number", "start": BEGIN, "end": BEGIN + 9}
+    samples = ask(memory, "get_topic_in_range", **given)["samples"]
+    changes = ask(memory, "get_topic_in_range", **given, changes=True)["changes"]
+    shown = [str(row["value"]) for row in changes]
+    assert shown == [str(number), "2.5", str(number)]
+    assert shown == [str(each["value"]["value"]) for each in samples]
 
 
 @each_way
