@@ -454,8 +454,7 @@ def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[Span]:
     On a straight way from one part of a region to another one there are poses of both.
     """
     for left, back in pairwise(inside):
-        between = (times > left) & (times < back)
-        if back - left >= FLICKER_NS and between.any():
+        if back - left >= FLICKER_NS and ((times > left) & (times < back)).any():
             yield left, back
 
 
