@@ -12,6 +12,8 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
     NS_PER_S,
     START_SLACK_NS,
     Ns,
@@ -37,14 +39,18 @@ _ALIKE_NS: Final[Ns] = 30 * NS_PER_S
 """Topics of one node fall silent and return within this of each other."""
 
 
-def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
-    """Yields all silences in order of time.
+def silences_of(
+    memory: Memory, snapshot: Snapshot, first: Ns = MIN_NS, last: Ns = MAX_NS
+) -> Iterator[Silence]:
+    """Yields all silences that reach into a time (inclusive), in order of time.
 
     A latched topic holds, and is never silent. Nor was one silent where its messages were deleted.
     """
     latching, bag_dir = memory.limits.latching, memory.index.bag_dir
     is_latched: dict[str, bool] = {}
     for silence in _all_silences(bag_dir, snapshot):
+        if silence.within(first, last) is None:
+            continue
         if silence.topic not in is_latched:
             is_latched[silence.topic] = latching.is_latched(snapshot, silence.topic)
         if not is_latched[silence.topic]:
@@ -94,7 +100,7 @@ def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
     """Yields the silences in a window, in order, as far as they are inside."""
     start = window.start + START_SLACK_NS
     end = max(start, window.stop - 1 - AT_OR_BEFORE_SLACK_NS)
-    for silence in silences_of(view.memory, view.snapshot):
+    for silence in silences_of(view.memory, view.snapshot, start, end):
         part = silence.within(start, end)
         if part is not None:
             yield part

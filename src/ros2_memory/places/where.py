@@ -340,11 +340,9 @@ class Scope:
     def parts_of(self, first: Ns, last: Ns) -> Spans:
         """Returns the parts of a time (inclusive, as they are) in which matches count, in order."""
         inside = [(first, last + 1)] if self._inside is None else self._inside
-        parts = [
-            (max(first, start), min(last, stop - 1))
-            for start, stop in inside
-            if start <= last and first < stop
-        ]
+        begin = bisect_right(inside, first, key=itemgetter(1))
+        end = bisect_right(inside, last, key=itemgetter(0))
+        parts = [(max(first, start), min(last, stop - 1)) for start, stop in inside[begin:end]]
         for state in self._states:
             parts = [part for span in parts for part in state.parts_of(*span)]
         return parts

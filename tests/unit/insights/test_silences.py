@@ -1,11 +1,14 @@
 """A detector that was blind for a while, as each tool reports it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
 from ros2_memory.bag_dir.state_files import LOST, Loss, append_losses
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import Span
+from ros2_memory.history import coverage
 from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, detections, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
@@ -61,6 +64,23 @@ def test_a_recap_has_it_as_an_event(memory: Memory, bag_dir: Path) -> None:
     ]
     before = asked(memory, bag_dir, "recap", start=BEGIN, end=BEGIN + 90)
     assert "silences" not in before["counts"]
+
+
+def test_a_silence_outside_of_the_window_is_not_cut(
+    memory: Memory, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a year there are thousands, and each is compared with all that was lost."""
+    cut: list[str] = []
+
+    def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
+        cut.append(topic)
+        return coverage.cut_spans(bag_dir, topic, window)
+
+    monkeypatch.setattr("ros2_memory.insights.silences.cut_spans", cut_spans)
+    asked(memory, bag_dir, "recap", start=BEGIN, end=BEGIN + 90)
+    assert cut == []
+    asked(memory, bag_dir, "recap", start=BEGIN + 120, end=BEGIN + 150)
+    assert SEEN in cut
 
 
 def test_compare_counts_how_long_a_topic_was_silent_while_the_robot_was_on(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ What is expected is counted from the drawn world itself, second by second.
 
 import json
 import math
+from itertools import combinations_with_replacement
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,7 +14,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.history.context import Memory
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.view import View
+from ros2_memory.places.where import Scope
 from tests.support.bags import (
     boolean,
     octets,
@@ -90,6 +94,20 @@ def test_what_happened_in_any_of_several_places_is_what_happened_in_one_of_them(
             ends = sum((run.first > 0) + (run.last < 149) for run in own)
             seconds = sum(run.last - run.first for run in own) + ends / 2
             assert by_place[room]["minutes"] == pytest.approx(seconds / 60, abs=0.02)
+
+
+def test_the_parts_of_a_time_are_all_of_it_that_lie_in_a_place(memory: Memory) -> None:
+    window = TimeWindow(BEGIN * S, (BEGIN + SECONDS) * S)
+    scope = Scope(View(memory, Call()), window, "hall, kitchen")
+    inside = [*scope.narrowed()][::-1]
+    assert len(inside) > 3
+    ends = {at + off for part in inside for at in (part.start, part.stop) for off in (-1, 0, 1)}
+    for first, last in combinations_with_replacement(sorted(ends), 2):
+        assert scope.parts_of(first, last) == [
+            (max(first, part.start), min(last, part.stop - 1))
+            for part in inside
+            if part.overlaps(first, last)
+        ]
 
 
 @pytest.mark.parametrize("tool", ["find_matches", "trajectory_summary", "visits"])
