@@ -1,4 +1,4 @@
-"""Where the simulated robot of live recordings was, in closed form.
+"""Where the simulated robot of recordings was, in closed form.
 
 A circle of radius 2 m at 0.5 m/s, t seconds after its start: from (0, 0) facing +x, turning left
 about (0, 2).
