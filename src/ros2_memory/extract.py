@@ -412,7 +412,8 @@ class SchemaExtractor:
         array = value.get(head) if isinstance(value, dict) and names else None
         if not isinstance(array, list):
             return ABSENT
-        return dict(zip(names[::-1], array[: len(names)][::-1], strict=False)).get(name)
+        at = names.index(name) if name in names else len(array)
+        return array[at] if at < len(array) else None
 
 
 def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:

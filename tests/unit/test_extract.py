@@ -98,6 +98,12 @@ def test_fields_over_a_list_take_an_element_or_map_over_all() -> None:
     assert shown(detections(), DETECTIONS, "detections.label") == {"detections.label": []}
 
 
+def test_an_element_of_an_array_is_found_by_the_name_beside_it() -> None:
+    message = {"names": ["a", "b", [1]], "positions": [1.0, 2.0]}
+    fields = ["positions.b", "positions.c"]
+    assert shown(message, "json", *fields) == {"positions.b": 2.0, "positions.c": None}
+
+
 def test_the_full_path_to_the_quaternions_of_a_list_gives_their_components() -> None:
     path = bags.make(
         "nav_msgs/msg/Path",
