@@ -10,11 +10,13 @@ from functools import partial
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore, relative
-from ros2_memory.columns.writing import Level, ReadBag
+from ros2_memory.columns.writing import PART_NS, Level, ReadBag
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
@@ -333,12 +335,18 @@ class Filling:
         refusals = self.store.refusals
         stored, taken = self.store.merged_bytes()
         left = round(self._limits.max_share * stored) - taken
-        self._merged.append((bag.start, bag.end + 1))
         budget = self._share([bag]) + max(left, 0)
-        is_stored = self.store.put_long(to_store, groups, budget=budget)
+        is_stored = self.store.put_long(to_store, self._noting_times(groups), budget=budget)
         if not is_stored and self.store.refusals > refusals:
             self._refuse(bag, self.store.refused_for or "")
         return is_stored
+
+    def _noting_times(self, groups: Iterable[list[Table]]) -> Iterator[list[Table]]:
+        """Yields groups, and notes when they have rows: decades may lie between two of a bag."""
+        for tables in groups:
+            slots = np.unique(np.concatenate([table.log_times for table in tables]) // PART_NS)
+            self._merged += [(slot * PART_NS, (slot + 1) * PART_NS) for slot in slots.tolist()]
+            yield tables
 
     def _released_groups(
         self, begin: list[Group], groups: Iterator[Group]
