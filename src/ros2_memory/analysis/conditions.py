@@ -40,7 +40,6 @@ POSITION_KEYS: Final = ("position", "point", "translation")
 _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
 _DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LISTED_PATHS: Final = 16
-"""Keys of a list that names the elements of the arrays beside it, as in joint states."""
 _AXES: Final = {"0": "x", "1": "y", "2": "z"}
 """An array of three numbers may be shown as a point."""
 _POINT: Final = {*_AXES.values()}

@@ -344,8 +344,9 @@ class Filling:
     def _noting_times(self, groups: Iterable[list[Table]]) -> Iterator[list[Table]]:
         """Yields groups, and notes when they have rows: decades may lie between two of a bag."""
         for tables in groups:
-            slots = np.unique(np.concatenate([table.log_times for table in tables]) // PART_NS)
-            self._merged += [(slot * PART_NS, (slot + 1) * PART_NS) for slot in slots.tolist()]
+            for table in tables:
+                slots = np.unique(table.log_times // PART_NS).tolist()
+                self._merged += [(slot * PART_NS, (slot + 1) * PART_NS) for slot in slots]
             yield tables
 
     def _released_groups(

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import re
 import unicodedata
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fnmatch import translate
@@ -56,8 +57,9 @@ NAMES_IN_MESSAGES: Final = LISTS_OF_LABELS.union(
 _NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")
 """One word, or two: `map`, `traffic light`."""
 _JSON: Final = frozenset("[{")
-_WITH_ESCAPES: Final = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)+"', re.DOTALL)
-"""Strings of JSON that have escapes; between strings it has no backslash."""
+_STRINGS: Final = re.compile(r'"(?:[^"\\]|\\.)*+"|\\.', re.DOTALL)
+"""Strings of JSON. An escape is passed over where the string around it does not end: else the
+search begins again at each quote that is escaped."""
 _MOST_KEYS: Final = 12
 _MOST_KEYS_CHARS: Final = 300
 """Of more places, or longer ones, a reply lists its own keys above them."""
@@ -74,17 +76,17 @@ def caseless(text: str) -> str:
     That is to accents, and in JSON to escapes, as of all letters that are not ASCII.
     """
     if "\\" in text and looks_like_json(text):
-        text = _WITH_ESCAPES.sub(_unescaped, text)
+        text = _STRINGS.sub(_unescaped, text)
     folded = text.casefold()
     return folded if folded.isascii() else unicodedata.normalize("NFC", folded)
 
 
 def _unescaped(match: re.Match[str]) -> str:
-    """Returns a string of JSON as it is meant, in quotes."""
-    try:
-        return f'"{json.loads(match[0], strict=False)}"'
-    except ValueError:
-        return match[0]
+    """Returns a string of JSON as it is meant, in quotes; anything else as it is."""
+    if match[0][0] == '"' and "\\" in match[0]:
+        with suppress(ValueError):
+            return f'"{json.loads(match[0], strict=False)}"'
+    return match[0]
 
 
 def similar(name: str, names: Iterable[str], at_most: int = 3) -> list[str]:

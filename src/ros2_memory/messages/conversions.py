@@ -31,7 +31,8 @@ V = TypeVar("V")
 
 ABSENT: Final = object()
 """The result of a step or a path where there is no such field."""
-ELEMENT_NAMES: Final = ("names", "name", "joint_names")
+_ELEMENT_NAMES: Final = ("names", "name", "joint_names")
+"""Keys of a list that names the elements of the arrays beside it, as in joint states."""
 INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 """The place of an element in a path; a negative one counts from the end."""
 
@@ -129,7 +130,7 @@ def names_beside(value: object, dot_path: str) -> list[object]:
     array = value.get(head)
     if not isinstance(array, list) or isinstance(next(iter(array), 0), dict):
         return []
-    lists = (value.get(key) for key in ELEMENT_NAMES if key != head)
+    lists = (value.get(key) for key in _ELEMENT_NAMES if key != head)
     return next((names for names in lists if isinstance(names, list)), [])
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.text import abbreviate, match_topics
+from ros2_memory.core.text import abbreviate, caseless, match_topics
 from tests.support.hostile_arguments import DEEP, nested, values
 
 globs = st.text(st.sampled_from("/ab*?[]!-AB\n"), max_size=12)
@@ -45,3 +45,9 @@ def test_a_glob_matches_what_it_matches_in_a_shell(names: list[str], glob: str) 
 def test_a_glob_of_many_stars_takes_no_long_search() -> None:
     assert match_topics(["/" + "a" * 200, "/b"], "*a" * 200 + "*") == ["/" + "a" * 200]
     assert match_topics(["a" * 250], "*a" * 249 + "*b") == []
+
+
+def test_escapes_of_a_string_that_does_not_end_take_no_long_search() -> None:
+    hostile = '{"' + '\\"' * 500_000
+    assert caseless(hostile) == hostile
+    assert caseless(f'["\\u00c4", {hostile}') == f'["ä", {hostile}'

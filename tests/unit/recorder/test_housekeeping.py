@@ -390,13 +390,24 @@ def test_an_interruption_that_comes_while_another_is_written_is_written_too(
 ) -> None:
     keeper = keeper_of(tmp_path, clock=later(0))
     paused = threading.Thread(target=keeper.note_restart, args=(T0, "paused"))
+    lock, waits = threading.Lock(), threading.Event()
+
+    class WatchedLock:
+        def __enter__(self) -> None:
+            if threading.current_thread() is paused:
+                waits.set()
+            lock.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            lock.release()
 
     def slow(bag_dir: Path, losses: Iterable[Loss]) -> None:
         append_losses(bag_dir, losses)
         if not paused.ident:
             paused.start()
-            paused.join(0.1)  # until it waits
+            assert waits.wait(60)
 
+    monkeypatch.setattr(keeper, "_lock", WatchedLock())
     monkeypatch.setattr(housekeeping, "append_losses", slow)
     keeper.note_restart(T0, "died")
     paused.join()
