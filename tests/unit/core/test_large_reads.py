@@ -84,14 +84,17 @@ def test_nobody_waits_outside_of_a_block_or_where_it_is_set_aside(is_set_aside: 
 
 def test_a_turn_that_is_passed_on_is_taken_again_behind_who_waited() -> None:
     large, had, waits = LargeReads(), list[str](), list[int]()
-    with large.during(waited=waits.append):
+
+    def check() -> None:
+        other.go_on.set()  # it goes on once it is waited for
+
+    with large.during(check, waits.append):
         large.acquire()
         other = Reader(large, had, "other")
         until(lambda: waiting(large) == 2)
         assert not had
         large.release()
         until(lambda: had)
-        other.go_on.set()
         large.acquire()
         other.join()
     assert [each > 0 for each in waits] == [True]
