@@ -267,9 +267,14 @@ class Snapshot:
             if bag.file not in self.dating.misdated
             for span in without([(bag.start, bag.end)], bag.summary.schema.pauses)
         )
-        for start, end in without([pause.span], others):
-            if end - start > SHORTEST_PAUSE_NS:
-                yield pause._replace(start=start, end=end)
+        parts = [
+            (start, end)
+            for start, end in without([pause.span], others)
+            if end - start > SHORTEST_PAUSE_NS
+        ]
+        for start, end in parts:
+            # With another recording in the middle of it, the clock was set more likely than not.
+            yield pause._replace(start=start, end=end, ran_on=pause.ran_on and len(parts) == 1)
 
     @cached_property
     def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:

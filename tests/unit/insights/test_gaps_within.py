@@ -86,6 +86,19 @@ def test_a_window_in_a_gap_within_a_bag_was_not_recorded(stalled: Memory) -> Non
     assert (reply["error"], reply["reason"]) == ("no_data", "gap")
 
 
+def test_a_recorder_did_not_stall_where_another_recording_lies_within_its_pause(
+    tmp_path: Path,
+) -> None:
+    bag, moved = at_rates(), 1000 * S
+    ahead = [replace(message, log_time=message.log_time + moved) for message in bag]
+    between = [replace(message, log_time=message.log_time + moved // 2) for message in bag]
+    write_mcap(tmp_path / "older" / "older_0.mcap", between)
+    memory = memory_with(tmp_path, [*bag, *ahead])
+    assert len(gaps(memory)) == 3 * len(STALLS) + 2
+    doubts = ask(memory, "memory_status")["doubts"]
+    assert doubts.endswith("while the recorder ran, nothing was recorded 6 times (11.13 s)")
+
+
 @pytest.mark.anyio
 async def test_health_counts_the_gaps_of_the_last_hour(tmp_path: Path) -> None:
     memory = memory_with(tmp_path, at_rates())
