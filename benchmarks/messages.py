@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from benchmarks.motion import Floats
     from benchmarks.worlds import Part, World
+    from ros2_memory.core.arrays import Floats
 
 LABELS: Final = (
     *("kettle", "umbrella", "guitar", "basket", "stool", "teapot", "vase", "printer", "scarf"),

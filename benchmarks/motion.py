@@ -8,14 +8,12 @@ there. One room it never enters.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats: TypeAlias = NDArray[np.float64]
+    from ros2_memory.core.arrays import Floats
 
 _CORRIDOR_M: Final = 0.8  # half of its width
 _WALL_M: Final = 0.7  # what the robot keeps from walls

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rosbags.typesys.store import Typestore
 
-    from benchmarks.motion import Floats, Motion
+    from benchmarks.motion import Motion
+    from ros2_memory.core.arrays import Floats
 
 DETECTIONS: Final = "ros2_vision_interfaces/msg/VisionDetectionArray"
 DETECTIONS_3D: Final = "vision_msgs/msg/Detection3DArray"

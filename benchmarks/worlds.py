@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from benchmarks.motion import Floats
+    from ros2_memory.core.arrays import Floats
     from ros2_memory.core.model import JsonValue
 
 HOME: Final = "home_week"

@@ -9,7 +9,6 @@ from collections.abc import Generator, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import pytest
@@ -17,6 +16,7 @@ import structlog
 from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
 
+from ros2_memory.typestore import MessageType
 from tests.support.composed import shipped_once
 from tests.support.examples import examples
 from tests.support.forked_commands import ADDRESS, forking
@@ -28,9 +28,6 @@ from tests.support.measured import (
 )
 from tests.support.real_recorder import real_recorder  # noqa: F401 (a fixture)
 from tests.support.workers import Groups, give_way, place, workers_for
-
-if TYPE_CHECKING:
-    from ros2_memory.typestore import MessageType
 
 # A loaded machine is slow, not wrong.
 settings.register_profile(

@@ -3,8 +3,6 @@
 Exit code 0: all that applies passed; 1: something did not; 3: not evaluated, and why.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

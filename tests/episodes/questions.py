@@ -3,13 +3,12 @@
 Nothing here looks at a message or asks the memory. Times of answers are Unix seconds.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from random import Random
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from tests.episodes.world import (
     DAY_S,
@@ -23,9 +22,6 @@ from tests.episodes.world import (
     day_start,
     month,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 LISTED = "listed on a day"
 AFTER = "just after"

@@ -1,14 +1,15 @@
 """A hundred questions about a month that no reply holds are answered rightly, in one call each."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 
+from ros2_memory.history.context import Memory
 from tests.episodes.questions import (
     AFTER,
     AGO,
@@ -29,12 +30,6 @@ from tests.episodes.world import ACTION, DAYS, NOW, TASK, US_PER_S, day_start, m
 from tests.support.bags import Msg, make, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 pytestmark = pytest.mark.xdist_group("episodes")
 

@@ -5,8 +5,6 @@ A text holds until the next one. An empty text ends it, or another text takes it
 said again while they hold. A night is not recorded, unless a task goes on past midnight.
 """
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from random import Random

@@ -1,16 +1,12 @@
 """A disk that fails on command, where the program touches files: the calls of `os` themselves."""
 
-from __future__ import annotations
-
 import errno
 import os
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
-
-    import pytest
+import pytest
 
 OPEN: Final = frozenset({"open", "fstat", "pread"})
 """What is called to read a bag file."""

@@ -1,15 +1,14 @@
 """A real server process, asked without a session: as much as a load and a fault need."""
 
-from __future__ import annotations
-
 import json
 import os
 import threading
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import httpx2
 
@@ -17,9 +16,6 @@ from tests.faults.world import T0_S
 from tests.support import served
 from tests.support.processes import PATIENCE_S, until
 from tests.support.served import Served
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 def questions(count: int) -> list[tuple[str, dict[str, Any]]]:

@@ -1,15 +1,15 @@
 """Kills, other processes and two servers while columns are stored: the same answers throughout."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import random
 import shutil
 import signal
 import sqlite3
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING
+from multiprocessing.process import BaseProcess
+from pathlib import Path
 
 import pytest
 
@@ -19,12 +19,6 @@ from tests.support.column_worlds import World, check_all, store_file
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts
 from tests.unit.columns.test_fill import T0, S, decode_in_groups, write_bag, write_long_bag
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from multiprocessing.process import BaseProcess
-    from pathlib import Path
-
 
 KILLS = 100 if LONG else 2
 SPANNED = {"get_topic_in_range", "find_matches"}

@@ -4,22 +4,21 @@
 given); with 0 every single one is: that takes an hour.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import random
 import resource
 import sqlite3
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 import zstandard
 
 from ros2_memory.columns.fill import RETRY_NS, Progress
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
+from ros2_memory.history.context import Memory
 from ros2_memory.index.file_state import RETRY_SOON_NS
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.base import BagReader
@@ -31,11 +30,6 @@ from tests.faults.world import NOW, T0, fill_up, served, told, write_bag, write_
 from tests.support.bags import odom, write_db3
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from ros2_memory.history.context import Memory
 
 READS = int(os.environ.get("FAULTS_READS", "4"))
 COUNT = 3

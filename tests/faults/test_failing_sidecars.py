@@ -1,10 +1,9 @@
 """A sidecar that cannot be read for a moment is not taken for one that is not there."""
 
-from __future__ import annotations
-
 import errno
 import os
-from typing import TYPE_CHECKING, NoReturn
+from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -22,9 +21,6 @@ from ros2_memory.recorder.handover import settle_handover
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.faults.world import write_bag
 from tests.support.handovers import recover_handovers
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 HIDDEN = Handover(state=Counting.VOID)
 

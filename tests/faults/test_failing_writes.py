@@ -1,12 +1,11 @@
 """A disk that fails on writes: what lies there stands, answers stay right, and it is got over."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 import structlog
@@ -16,10 +15,6 @@ from ros2_memory.columns.fill import Progress
 from tests.faults.test_store_faults import assert_sound
 from tests.faults.world import fill_up, plainly, served, store_of, told, write_bags
 from tests.support.column_worlds import store_file
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 
 @contextmanager

@@ -1,10 +1,9 @@
 """A full disk under the temporary files that compressed bags are unpacked into."""
 
-from __future__ import annotations
-
 import errno
 import tempfile
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import zstandard
@@ -18,10 +17,6 @@ from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.faults.world import NOW, told, write_bags
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 COUNT = 3
 

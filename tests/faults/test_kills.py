@@ -3,26 +3,21 @@
 `FAULTS_KILLS` is how many more than one (1 unless given).
 """
 
-from __future__ import annotations
-
 import os
 import random
 import shutil
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from tests.faults.running import children_of, is_alive, load, serving
 from tests.faults.world import write_bags
 from tests.support.column_worlds import store_file
 from tests.support.processes import until
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 KILLS = int(os.environ.get("FAULTS_KILLS", "1"))
 COUNT = 60

@@ -5,8 +5,6 @@ everything as it was when the fault is over, without a restart. With `FAULTS_ALL
 the store is tried on a server, which takes a minute, and otherwise a few.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

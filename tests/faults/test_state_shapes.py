@@ -1,11 +1,11 @@
 """State files in every wrong shape: nothing more is served or deleted than with the right ones."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -43,10 +43,6 @@ from tests.support.housekeepers import keeper_of, recording_now
 from tests.support.log_lines import with_checks
 from tests.support.memories import memory_of
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, words
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 NAMES: Final = [
     *(f.name for f in (LIST, RECORDED, LOST, DELETED, SHIPPED, FORGOTTEN)),

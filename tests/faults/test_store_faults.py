@@ -1,12 +1,12 @@
 """Whatever becomes of the store's file under a running server: answers stay right, it returns."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sqlite3
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING, NoReturn
+from pathlib import Path
+from typing import NoReturn
 
 import anyio
 import anyio.lowlevel
@@ -23,10 +23,6 @@ from tests.faults.world import NOW, fill_up, plainly, served, store_of, told, wr
 from tests.support.clocks import SettableClock
 from tests.support.column_worlds import store_file
 from tests.support.processes import PATIENCE_S
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
 
 
 def delete(path: Path) -> None:

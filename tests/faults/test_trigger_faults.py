@@ -1,10 +1,10 @@
 """Rules through kills at any step of what they store, and through a full disk."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Callable
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,10 +12,6 @@ from ros2_memory.bag_dir import durable_write, json_files, moment_file
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.watched_bags import T0, S, WatchedBags, flag, rule
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 class KilledError(BaseException):

@@ -1,21 +1,15 @@
 """Two servers on one bag directory: each answers as if it were alone, also when the other dies."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from tests.faults.running import Running, load, serving
 from tests.faults.test_store_faults import assert_sound
 from tests.faults.world import write_bag, write_bags
 from tests.support.column_worlds import store_file
 from tests.support.processes import until
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 COUNT = 12
 

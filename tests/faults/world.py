@@ -1,17 +1,16 @@
 """A memory with everything in it that a server has, and questions that every answer shows in."""
 
-from __future__ import annotations
-
 import os
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ros2_memory import queries
 from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.maintenance.index import fill_store
+from ros2_memory.columns.store import ColumnStore
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
@@ -20,16 +19,11 @@ from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.visits import visits
+from ros2_memory.serving.backfill import Backfill
 from tests.support.bags import McapLayout, detections, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ros2_memory.columns.store import ColumnStore
-    from ros2_memory.serving.backfill import Backfill
 
 T0_S = 1_700_000_000
 T0 = T0_S * NS_PER_S

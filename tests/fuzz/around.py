@@ -1,22 +1,17 @@
 """Mutations of what lies around a bag: metadata, links, rights, names, and files that change."""
 
-from __future__ import annotations
-
 import os
 import random
 import socket
 import stat
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from random import Random
+from typing import Final
 
 from tests.fuzz.good import Good, goods
 from tests.fuzz.mutant import Mutant, Trap, mutant_file
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from random import Random
-
 
 _METADATA: Final = """rosbag2_bagfile_information:
   version: 5

@@ -1,18 +1,13 @@
 """What is asked beside a mutant: of good bags, whose answers are known, and of the mutant."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any, Final
+from random import Random
+from typing import Any, Final
 
 from mcp.types import TextContent
 
+from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.fuzz.good import AFTER_S, BASE_S, BEFORE_S, LENGTH_S, TOPICS
-
-if TYPE_CHECKING:
-    from random import Random
-
-    from ros2_memory.serving.mcp_server import EpisodicServer
 
 Asked = tuple[str, dict[str, Any]]
 

@@ -1,14 +1,14 @@
 """Small files that unpack to enormous ones: zstd and lz4, in chunks, messages and whole files."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
+from collections.abc import Iterator
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
+from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -28,11 +28,6 @@ from tests.fuzz.records import (
     without_summary,
 )
 from tests.support.bags import Msg, definition, write_db3
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from random import Random
-
 
 _BASE: Final = BASE_S * NS_PER_S
 _MB: Final = 1 << 20

@@ -1,12 +1,12 @@
 """Mutations of the bytes of a file: flipped bits, cuts, wrong lengths, absurd numbers."""
 
-from __future__ import annotations
-
 import struct
-from typing import TYPE_CHECKING, Final
+from random import Random
+from typing import Final
 
 from mcap.opcode import Opcode
 
+from tests.fuzz.good import Good
 from tests.fuzz.mutant import Mutant, mutant_file, mutant_of
 from tests.fuzz.records import (
     MAGIC,
@@ -18,11 +18,6 @@ from tests.fuzz.records import (
     with_summary_sealed,
     without_summary,
 )
-
-if TYPE_CHECKING:
-    from random import Random
-
-    from tests.fuzz.good import Good
 
 _PAGE: Final = 4096
 _SUMMARIZING: Final = frozenset(

@@ -1,22 +1,18 @@
 """Runs mutants through child processes, and adds up what became of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import select
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from tests.fuzz.classes import Job
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
 
 HANG_S: Final = 60.0
 """After so long without a word a child hangs: it asks seven questions, of 10 s each at most."""

@@ -1,18 +1,13 @@
 """The classes of mutation: which functions make each, out of which good bags."""
 
-from __future__ import annotations
-
 import random
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from tests.fuzz import around, bombs, bytewise, content, definitions, indexes, tables
 from tests.fuzz.good import Good, goods, mcaps, sqlites
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from tests.fuzz.mutant import Mutant, Mutation
+from tests.fuzz.mutant import Mutant, Mutation
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,15 @@
 """Mutations of what a bag says: its chunks, schemas, definitions, payloads and times."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
@@ -31,11 +31,6 @@ from tests.fuzz.records import (
 )
 from tests.support.bags import Msg, definition, write_db3, write_mcap
 from tests.support.reader_cases import LAYOUTS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from random import Random
-
 
 _BASE: Final = BASE_S * NS_PER_S
 _PAGE: Final = 4096

@@ -1,8 +1,7 @@
 """Mutations of message definitions: those that lead back to themselves, and enormous ones."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from random import Random
+from typing import Final
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.fuzz.content import db3_with
@@ -10,10 +9,6 @@ from tests.fuzz.good import BASE_S, Good
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import channel, header, message, schema, without_summary
 from tests.support.bags import Msg
-
-if TYPE_CHECKING:
-    from random import Random
-
 
 _BASE: Final = BASE_S * NS_PER_S
 _BAR: Final = "=" * 80

@@ -1,14 +1,13 @@
 """The good bags that mutants are made of, one of every kind that is read, and two neighbours."""
 
-from __future__ import annotations
-
 import json
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import zstandard
@@ -31,9 +30,6 @@ from tests.support.bags import (
 )
 from tests.support.reader_cases import LAYOUTS
 from tests.support.shared_bags import REAL, RECORDED
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
 
 BASE_S: Final = 1_784_023_200
 LENGTH_S: Final = 3

@@ -1,25 +1,20 @@
 """Holds every answer about a mutant to what can be read of it (`oracle`)."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from random import Random
+from typing import Any, Final
 
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
+from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.fuzz.asking import ask
+from tests.fuzz.good import Good
+from tests.fuzz.mutant import Mutant
 from tests.fuzz.oracle import Readable, readable_db3, readable_mcap
 from tests.support.bags import typestore
-
-if TYPE_CHECKING:
-    from random import Random
-
-    from ros2_memory.serving.mcp_server import EpisodicServer
-    from tests.fuzz.good import Good
-    from tests.fuzz.mutant import Mutant
 
 _PACKED: Final = b"\x28\xb5\x2f\xfd"
 _ASKED: Final = 4

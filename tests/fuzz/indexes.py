@@ -1,26 +1,21 @@
 """Mutations of what points to messages: every index lies, and every message is as it was."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from mcap.opcode import Opcode
 
+from tests.fuzz.good import Good
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import Piece, as_it_was, pieces, with_summary_sealed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from random import Random
-
-    from tests.fuzz.good import Good
 
 _PAIR: Final = 16
 _INDEX_PAGES: Final = (2, 10)

@@ -1,17 +1,13 @@
 """What a mutation makes: files to lay beside good bags, and what then happens to them."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeAlias
+from random import Random
+from typing import Final, TypeAlias
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from random import Random
-
-    from tests.fuzz.good import Good
+from tests.fuzz.good import Good
 
 FOLDER: Final = "mutant"
 LONG_AGO_S: Final = 1_784_030_000

@@ -6,21 +6,17 @@ gives must be a message that can be read, and what it leaves out must not be one
 that the file is damaged.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 import zlib
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _LATEST: Final = (1 << 63) - 1

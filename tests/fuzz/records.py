@@ -1,19 +1,15 @@
 """Taking MCAP files apart, and putting them together with faults that no writer makes."""
 
-from __future__ import annotations
-
 import struct
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 MAGIC: Final = MCAP0_MAGIC
 RECORD: Final = struct.Struct("<BQ")

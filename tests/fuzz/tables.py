@@ -1,22 +1,17 @@
 """Mutations of sqlite bags: missing tables, wrong types, and schemas that are made to do harm."""
 
-from __future__ import annotations
-
 import random
 import sqlite3
 import struct
+from collections.abc import Iterable
 from contextlib import closing, suppress
 from pathlib import Path
+from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from tests.fuzz.good import Good
 from tests.fuzz.mutant import Mutant, mutant_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from random import Random
-
-    from tests.fuzz.good import Good
 
 _TABLES: Final = ("topics", "messages", "message_definitions", "metadata", "schema")
 _COLUMNS: Final = (

@@ -3,10 +3,9 @@
 EPISODIC_LONG=1 tries over a hundred times as many, and EPISODIC_SEED others.
 """
 
-from __future__ import annotations
-
 import os
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -17,9 +16,6 @@ from tests.fuzz.indexes import agreed
 from tests.fuzz.mutant import mutant_of
 from tests.fuzz.trial import World
 from tests.support.examples import LONG
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "1"))
 OF_EACH: Final = 300 if LONG else 2

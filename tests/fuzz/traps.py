@@ -1,17 +1,12 @@
 """Files that change while they are read: what happens at the n-th opening or reading of one."""
 
-from __future__ import annotations
-
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from tests.fuzz.mutant import Trap
+from tests.fuzz.mutant import Trap
 
 _REAL_PREAD = os.pread
 

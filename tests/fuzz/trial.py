@@ -1,17 +1,16 @@
 """One mutant beside two good bags: asked, stored, sometimes recovered, and judged."""
 
-from __future__ import annotations
-
 import asyncio
 import io
 import os
 import shutil
 import time
 import traceback
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import structlog
 
@@ -22,19 +21,15 @@ from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.history.context import Memory
+from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.fuzz.asking import OF_GOOD, ask, comparable, of_mutant
+from tests.fuzz.classes import Job
 from tests.fuzz.good import Good, neighbours
 from tests.fuzz.holding import hold, truth_of
 from tests.fuzz.mutant import LONG_AGO_S, Mutant
+from tests.fuzz.oracle import Readable
 from tests.fuzz.traps import sprung
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, MutableMapping
-
-    from ros2_memory.history.context import Memory
-    from ros2_memory.serving.mcp_server import EpisodicServer
-    from tests.fuzz.classes import Job
-    from tests.fuzz.oracle import Readable
 
 MOST_S: Final = 10.0
 MOST_MB: Final = 512

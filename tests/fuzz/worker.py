@@ -3,8 +3,6 @@
 A child of its own, so that a crash, a hang or a growth of memory is seen as what it is.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import json
@@ -12,15 +10,13 @@ import os
 import resource
 import sys
 import traceback
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from tests.fuzz.classes import Job
 from tests.fuzz.trial import Verdict, World, resident_mb, tried
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 _MUCH_MB: Final = 220
 _MOST_ADDRESSES: Final = 8 << 30

@@ -1,25 +1,19 @@
 """Questions about where the robot was, when, how long and how often, and what it usually does."""
 
-from __future__ import annotations
-
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
-from tests.home.asking import Asked, Is, Number, Question, Series, Words, bins, in_words
+from tests.home.asking import Asked, Is, Number, Question, Row, Series, Words, bins, in_words
 from tests.home.flat import HALL, ROOMS, room_at
 from tests.home.messages import BATTERY, BUMPER, DOCKED
 from tests.home.things import DAY
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from tests.home.asking import Row
-    from tests.home.truth import Span
+from tests.home.truth import Span
 
 _OFF_DOCK: Final = {"topic": DOCKED.topic, "condition_type": "equals", "value": False}
 _BUMPED: Final = {"topic": BUMPER.topic, "condition_type": "equals", "value": True}

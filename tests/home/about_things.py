@@ -1,21 +1,15 @@
 """Questions about things: how many there are, where they are, where they were before."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Iterator
 from itertools import chain, groupby
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from tests.home.asking import Asked, Is, Names, Number, Question, between, since, stays
+from tests.home.asking import Asked, Is, Names, Number, Question, Row, between, since, stays
 from tests.home.camera import PERSON
 from tests.home.flat import FRONT_DOOR
 from tests.home.things import NEVER_SEEN
+from tests.home.truth import PlaceOfThing, ThingTruth
 from tests.home.world import VISION
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from tests.home.asking import Row
-    from tests.home.truth import PlaceOfThing, ThingTruth
 
 _WITHIN_M: Final = 0.4
 _PEOPLE: Final = frozenset({PERSON})

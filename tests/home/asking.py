@@ -4,14 +4,13 @@ A question is asked at the end of the data. Nothing is reckoned: values are comp
 in the reply. What a call may be given is in the question, never in another reply.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
 
@@ -19,15 +18,11 @@ from ros2_memory.bootstrap import build_backfill, build_memory, build_server
 from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.home.days import CLOCK_STEP_S
 from tests.home.things import DAY
+from tests.home.truth import PlaceOfThing, ThingTruth, Truth
 from tests.home.world import START_S, World
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.serving.mcp_server import EpisodicServer
-    from tests.home.truth import PlaceOfThing, ThingTruth, Truth
 
 Row: TypeAlias = "dict[str, Any]"
 SINCE: Final = ("since", "from", "first_seen")

@@ -5,25 +5,19 @@ dropped; places have a noise that grows with the range; two labels in a hundred 
 that are near each other are confused, and one label has several spellings.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ros2_memory.core.arrays import Floats
 from tests.home.flat import clear_lines
+from tests.home.paths import Pose
+from tests.home.people import Person
 from tests.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS, Thing
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from benchmarks.motion import Floats
-    from numpy.typing import NDArray
-
-    from tests.home.paths import Pose
-    from tests.home.people import Person
 
 CAMERA: Final = (0.15, 0.0, 0.40)
 """The camera's position (m) in `base_link`; it looks straight ahead."""

@@ -1,20 +1,15 @@
 """What tests of the home robot's world share. Files that use it are of the group "home"."""
 
-from __future__ import annotations
-
 import shutil
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.home.days import Scale
 from tests.home.recording import write_world
 from tests.home.year import Year
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 
 @pytest.fixture(scope="session")

@@ -5,20 +5,16 @@ for 24 hours, and an outing takes some 20 minutes. Above it the robot is on only
 and each is short: a day of some 20 minutes, at the same hours of the clock.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from tests.home.flat import DOCK, HALL_X, SPOTS, Spot, way
 from tests.home.paths import Knots, Path, finished
 from tests.home.things import DAY, HOUR
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 EXECUTING: Final = 2
 SUCCEEDED: Final = 4
@@ -124,7 +120,7 @@ class Incidents:
     clock_step: int
 
     @classmethod
-    def of(cls, days: int) -> Incidents:
+    def of(cls, days: int) -> "Incidents":
         """Returns them, spread over so many days; the detector is blind on the last."""
         last = days - 1
         return cls(

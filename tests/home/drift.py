@@ -5,23 +5,17 @@ wheels slip. `believed` is what the localiser publishes: the truth at its last c
 small error of its own. After a slip it takes the localiser some seconds to notice.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ros2_memory.core.arrays import Floats
 from tests.home.days import SLIP_M, Life, Scale
 from tests.home.paths import Pose
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from benchmarks.motion import Floats
-    from numpy.typing import NDArray
-
 
 _STEP_S: Final = 1.0
 _DRIFT_M: Final = 0.006
@@ -43,13 +37,13 @@ class Frame(NamedTuple):
     y: float
     yaw: float
 
-    def turned(self, by: float, x: float, y: float) -> Frame:
+    def turned(self, by: float, x: float, y: float) -> "Frame":
         """Returns the frame turned about a point of the map."""
         cos, sin = math.cos(by), math.sin(by)
         east, north = self.x - x, self.y - y
         return Frame(x + cos * east - sin * north, y + sin * east + cos * north, self.yaw + by)
 
-    def shifted(self, x: float, y: float) -> Frame:
+    def shifted(self, x: float, y: float) -> "Frame":
         """Returns the frame moved by so many metres."""
         return Frame(self.x + x, self.y + y, self.yaw)
 

@@ -4,17 +4,13 @@ All coordinates are metres in the frame `map`: x points east, y north, z up. The
 dock in the south to the front door in the north; all other rooms open into it.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Mapping
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from benchmarks.motion import Floats
-    from numpy.typing import NDArray
+from ros2_memory.core.arrays import Floats
 
 
 class Room(NamedTuple):

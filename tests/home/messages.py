@@ -1,25 +1,19 @@
 """The messages of a recording, as serialized bytes with their times."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from benchmarks import payloads
 from benchmarks.motion import Motion
+from numpy.typing import NDArray
 
+from ros2_memory.core.arrays import Floats
 from tests.home import camera, days
+from tests.home.camera import Detected
 from tests.home.drift import AHEAD_S
 from tests.home.world import VISION, Beats, Recording, Stream, World
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from benchmarks.motion import Floats
-    from numpy.typing import NDArray
-
-    from tests.home.camera import Detected
 
 OPTICAL: Final = "camera_optical_frame"
 """The frame of the detections: z ahead, x right, y down."""

@@ -4,20 +4,16 @@ A `Path` is a list of knots between which position and yaw change evenly, so tha
 distance at any moment are exact.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ros2_memory.core.arrays import Floats
 from tests.home.flat import way
-
-if TYPE_CHECKING:
-    from benchmarks.motion import Floats
-    from numpy.typing import NDArray
 
 SPEED: Final = 0.4
 TURNING: Final = 0.9

@@ -1,15 +1,11 @@
 """The people of the flat: asleep at night, about by day, two of them out for a part of it."""
 
-from __future__ import annotations
+from typing import Final, NamedTuple
 
-from typing import TYPE_CHECKING, Final, NamedTuple
-
+from tests.home.days import Scale
 from tests.home.flat import HALL_X, ROOMS
 from tests.home.paths import Knots, Path, finished
 from tests.home.things import DAY, HOUR
-
-if TYPE_CHECKING:
-    from tests.home.days import Scale
 
 
 class Person(NamedTuple):

@@ -1,21 +1,13 @@
 """Sixty questions of an owner: of things, places and habits, of reasons, and of trust."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 from tests.home.about_places import about_places
 from tests.home.about_things import about_things
-from tests.home.asking import Asked, Is, Number, Question, Words, between, in_words
-from tests.home.days import CLOCK_STEP_S
+from tests.home.asking import Asked, Is, Number, Question, Row, Words, between, in_words
+from tests.home.days import CLOCK_STEP_S, Scale
 from tests.home.truth import truth_of
 from tests.home.world import VISION, world_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from tests.home.asking import Row
-    from tests.home.days import Scale
 
 _REASONS = {
     "blocked": ("block", "abort", "no way", "no path", "failed to create plan"),

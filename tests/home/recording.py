@@ -5,17 +5,17 @@ in every split, `/tf_static` once in each; `metadata.yaml` closes a recording, u
 failed: then its last split ends in the middle of a chunk, without a summary.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 import yaml
 from benchmarks.bags import Recording as WrittenRecording
 from benchmarks.bags import Row, Topic
 
+from tests.home.days import Scale
 from tests.home.messages import (
     TF_STATIC,
     TRANSIENT_LOCAL,
@@ -27,11 +27,6 @@ from tests.home.messages import (
 from tests.home.things import LABELS
 from tests.home.truth import places
 from tests.home.world import Recording, World, world_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.home.days import Scale
 
 _CHUNK_BYTES: Final = 16 * 1024
 

@@ -1,9 +1,8 @@
 """The sixty questions about a home's first days when their bags are gone."""
 
-from __future__ import annotations
-
 import shutil
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -13,9 +12,6 @@ from tests.home.days import Scale
 from tests.home.questions import questions
 from tests.home.year import Year, about, write_later_days
 from tests.support.examples import LONG
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = [pytest.mark.xdist_group("home"), pytest.mark.usefixtures("in_utc")]
 

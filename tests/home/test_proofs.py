@@ -1,8 +1,7 @@
 """`ros2-memory prove`: over the messages that an answer rests on, the answer is the same."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -11,10 +10,6 @@ from ros2_memory.things import known
 from ros2_memory.tools.build import build_tools
 from tests.support.examples import LONG
 from tests.support.program import Program, exits
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 __all__ = ["exits"]
 

@@ -1,29 +1,24 @@
 """The home robot's sixty questions, asked by a script and judged by the truth of its world."""
 
-from __future__ import annotations
-
 import json
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pytest
 
+from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.home import asking, flat
 from tests.home.asking import Row, since, stays
 from tests.home.camera import in_view
 from tests.home.days import Scale
 from tests.home.paths import Pose
 from tests.home.questions import questions
+from tests.home.things import Place
 from tests.home.truth import truth_of
 from tests.home.world import VISION, world_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.serving.mcp_server import EpisodicServer
-    from tests.home.things import Place
 
 pytestmark = [pytest.mark.xdist_group("home"), pytest.mark.usefixtures("in_utc")]
 

@@ -1,8 +1,6 @@
 """What the home robot did not perceive, by the world's truth: one blind time, one step."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -10,9 +8,6 @@ from tests.home.days import CLOCK_STEP_S, Scale
 from tests.home.truth import truth_of
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.xdist_group("home")
 

@@ -4,17 +4,13 @@ Things of one label are at least 1 m apart. Near-names (mug and cup, phone and h
 notebook) are different things; spellings (Mug, coffee mug, mugs) are one.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
+
+import numpy as np
 
 from tests.home.flat import room_at
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    import numpy as np
 
 HOUR: Final = 3600.0
 DAY: Final = 86400.0

@@ -5,28 +5,22 @@ be known of a thing comes from the state, too: `in_view` is when the camera had 
 the detector ran and the recorder as well; `detected` adds the detector's own luck.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
+from ros2_memory.core.arrays import Floats
+from ros2_memory.core.model import JsonValue
 from tests.home import flat
 from tests.home.days import CLOCK_STEP_S, Scale
 from tests.home.things import DAY, Place
 from tests.home.world import START_S, World, world_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from benchmarks.motion import Floats
-
-    from ros2_memory.core.model import JsonValue
 
 Span: TypeAlias = tuple[float, float]
 VIEW_GAP_S: Final = 5.0

@@ -1,26 +1,21 @@
 """The whole world of a scale: life, people, things, frames, and when the robot is recorded."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ros2_memory.core.arrays import Floats
 from tests.home import camera, days, drift, things
+from tests.home.camera import Sights
+from tests.home.days import Life, Scale
+from tests.home.drift import Drift
 from tests.home.paths import Pose
 from tests.home.people import Person, people
-
-if TYPE_CHECKING:
-    from benchmarks.motion import Floats
-    from numpy.typing import NDArray
-
-    from tests.home.camera import Sights
-    from tests.home.days import Life, Scale
-    from tests.home.drift import Drift
-    from tests.home.things import Thing
+from tests.home.things import Thing
 
 START_S: Final = 1_772_409_600
 """When the world begins: Monday, 2026-03-02, 00:00 UTC, in Unix seconds."""

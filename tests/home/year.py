@@ -3,11 +3,12 @@
 What follows is another life in the same flat: the robot begins it a minute after its first days.
 """
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
+
+import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.timebase import NS_PER_S
@@ -17,18 +18,12 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.home import world
+from tests.home.asking import Question
 from tests.home.days import Scale
 from tests.home.recording import write
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import HOUR, PLENTY, Direct, own_all
 from tests.support.memories import shipped_extractor
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
-
-    from tests.home.asking import Question
 
 DAY_S: Final = 86_400
 _LATER_S: Final = 60

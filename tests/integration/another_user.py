@@ -1,7 +1,5 @@
 """Programs of another user, in a network of their own, for tests that root runs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

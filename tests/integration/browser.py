@@ -3,23 +3,19 @@
 A few commands over HTTP are all that the tests need, so there is no driver library.
 """
 
-from __future__ import annotations
-
 import base64
 import shutil
 import socket
 import subprocess
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import httpx2
 import pytest
 
 from tests.support.processes import PATIENCE_S, until
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
 CHROMEDRIVER: Final = shutil.which("chromedriver")

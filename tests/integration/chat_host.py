@@ -5,17 +5,13 @@ may run scripts and nothing else, under the policy for a resource that declares 
 view asks is answered by the test.
 """
 
-from __future__ import annotations
-
 import http.server
 import threading
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from tests.integration.browser import Browser
+from tests.integration.browser import Browser
 
 POLICY: Final = (
     "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "

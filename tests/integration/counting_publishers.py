@@ -11,8 +11,6 @@ clock, and the topics' rates and stamps are by it. `--log FILE` has a line for e
 number and when it was sent (ns). All of it ends with the process: kill it.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

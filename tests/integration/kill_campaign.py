@@ -5,15 +5,15 @@ moment. What may be lost: the newest messages before the kill, which had not rea
 what was published while nobody recorded. Everything else must count, once.
 """
 
-from __future__ import annotations
-
 import math
 import random
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import RecorderState
@@ -36,14 +36,9 @@ from tests.support.live_recorder import (
     moment_of,
     ticks,
 )
+from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import end, publishing_robot, ros_environment
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from tests.support.real_recorder import RealRecorder
-    from tests.support.served import Served
+from tests.support.served import Served
 
 KINDS: Final = ("child", "daemon", "both")
 RECORD_OVERHEAD_BYTES: Final = 31  # of one MCAP message besides its payload

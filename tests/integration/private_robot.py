@@ -6,8 +6,6 @@ SIGUSR1 sets the mode and makes a map, SIGUSR2 ends it, SIGHUP makes a map: the 
 message is then appended to TRUTH, and is that of the map.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import time

@@ -3,8 +3,6 @@
 python -m tests.integration.rival_housekeeper BAG_DIR MAX_BYTES STOP_FILE
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

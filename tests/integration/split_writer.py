@@ -1,18 +1,13 @@
 """Writes records as rosbag2 lays splits out, one step further at a time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from mcap.writer import CompressionType
 
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from tests.support.bags import McapLayout, Msg, mcap_content, odom, text, tf, transform
 from tests.support.heartbeats import beat
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SPLIT = 10 * NS_PER_S
 SPLITS_IN_RECORDING = 5

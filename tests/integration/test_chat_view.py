@@ -1,9 +1,9 @@
 """The view of MCP Apps in real Chromium, in a host made from the extension's specification."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
@@ -18,11 +18,6 @@ from tests.integration.chat_host import ChatHost, chat_host
 from tests.integration.test_page import ATTACK, painted, write_history
 from tests.support.demo_bags import ASKED_AT_S, recorded
 from tests.support.robot_run import T0_S
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
 
 pytestmark = needs_chromium
 

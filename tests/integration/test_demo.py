@@ -1,7 +1,5 @@
 """`ros2-memory demo` as a user runs it: the whole program, its server and its client."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Ctrl-C before a program has begun."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

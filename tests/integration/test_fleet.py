@@ -1,10 +1,8 @@
 """A server of several robots, as a process: what its clients are told, and about whom."""
 
-from __future__ import annotations
-
 import json
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import httpx2
 from mcp import Client
@@ -14,9 +12,6 @@ from mcp.client.streamable_http import streamable_http_client
 from tests.support.fleets import START_S, seeded, write_robot
 from tests.support.robot_run import ask
 from tests.support.served import serving
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NAMES = ("r1", "r2", "r3", "offline")
 MUG = {"topic": "/vision/*/scene_objects", "condition_type": "contains", "value": "mug"}

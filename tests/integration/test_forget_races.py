@@ -4,8 +4,6 @@ Nothing that a moment keeps is lost, nothing foreign is deleted, and nobody ends
 8 rounds; EPISODIC_LONG=1 makes it 24.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import random

@@ -1,21 +1,17 @@
 """What no sound client writes on stdin: the server answers what can be answered, and goes on."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import threading
-from typing import IO, TYPE_CHECKING
+from pathlib import Path
+from typing import IO
 
 from tests.soak.clients import hostile_bodies, opening
 from tests.soak.wire import call
 from tests.support.forked_commands import write_command
 from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import T0_S, write_run
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 GARBAGE = (b"", b"\x00", b"\xff\xff", b'"x"', b"[]", b"7", b"{", b"[" * 100_000)
 DEEP = '{"timestamp": ' + "[" * 500 + "]" * 500 + "}"

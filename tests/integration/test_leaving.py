@@ -1,28 +1,23 @@
 """Clients that leave in mid-call: the query that nobody waits for ends, and its place is free."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import threading
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import anyio
 import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.history.context import Call
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.web_app import web_app
 from tests.soak.clients import modern, opening
 from tests.soak.wire import call, connected, head, posted
 from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_dispatch import served, tool
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from ros2_memory.history.context import Call
 
 
 class Endless:

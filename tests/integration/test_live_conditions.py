@@ -1,15 +1,14 @@
 """The recorder under conditions that a robot meets: no room, another user, publishers amiss."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
@@ -25,6 +24,7 @@ from tests.support.live_recorder import (
     moment_of,
     ticks,
 )
+from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import (
     Robot,
     publishing_robot,
@@ -32,11 +32,6 @@ from tests.support.ros_processes import (
     wait_for,
 )
 from tests.timing import in_time
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from tests.support.real_recorder import RealRecorder
 
 HZ: Final = 20.0
 DISK_BYTES: Final = 8_000_000

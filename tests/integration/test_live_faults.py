@@ -3,23 +3,18 @@
 Ten kills at each rate; EPISODIC_LONG=1 makes it 50. EPISODIC_SEED chooses other moments.
 """
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
 from tests.integration.kill_campaign import Campaign, Terms, place_is_right, run_campaign
 from tests.support.examples import LONG
+from tests.support.real_recorder import RealRecorder
 from tests.timing import Watch, driven
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.support.real_recorder import RealRecorder
 
 KILLS: Final = 50 if LONG else 6
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))

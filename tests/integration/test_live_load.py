@@ -3,15 +3,14 @@
 Seconds of each; EPISODIC_LONG=1 makes it an hour of 10 topics at 200 Hz, and two simulated days.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.state_files import read_losses
@@ -26,13 +25,9 @@ from tests.support.live_recorder import (
     number_of,
     publishing,
 )
+from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import ros_environment, wait_for
 from tests.timing import each_in_time
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from tests.support.real_recorder import RealRecorder
 
 LOAD_S: Final = 3600 if LONG else 8
 LOAD: Final = [f"/sensor_{number}" for number in range(10 if LONG else 3)]

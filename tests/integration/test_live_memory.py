@@ -4,14 +4,13 @@ Three recorders record the same drive, each with a server of its own: one rotate
 recorder process killed and is restarted later, and one, with splits of 10 s, is killed whole.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 
@@ -34,18 +33,14 @@ from tests.support.live_recorder import (
     stamp_of,
     ticks,
 )
+from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import (
     Robot,
     publishing_robot,
     ros_environment,
 )
+from tests.support.served import Served
 from tests.timing import Watch, driven
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.support.real_recorder import RealRecorder
-    from tests.support.served import Served
 
 HZ: Final = 50.0
 AGO_S: Final = 10

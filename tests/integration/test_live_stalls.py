@@ -3,15 +3,14 @@
 Three rotations; EPISODIC_LONG=1 makes it 100. EPISODIC_SEED chooses other stalls.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal
 import time
 from collections import Counter
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import pytest
 
@@ -24,13 +23,8 @@ from tests.support.live_recorder import (
     machine,
     ticks,
 )
+from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import publishing_robot, ros_environment
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.support.real_recorder import RealRecorder
-
 
 ROTATIONS: Final = 100 if LONG else 3
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "13"))

@@ -4,14 +4,14 @@ Two recorders record the same drive in splits of 4 s: one in a single recording,
 rotates.
 """
 
-from __future__ import annotations
-
 import math
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import chain, groupby
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -29,14 +29,9 @@ from tests.support.live_recorder import (
     machine,
     ticks,
 )
+from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import publishing_robot, ros_environment
 from tests.timing import Watch, driven
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.support.real_recorder import RealRecorder
 
 HZ: Final = 50.0
 SPLIT_S: Final = 4

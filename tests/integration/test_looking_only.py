@@ -1,7 +1,5 @@
 """Whatever only looks leaves a folder of other people's bags as it is, entry for entry."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -10,7 +8,8 @@ import sqlite3
 import subprocess
 from collections.abc import Mapping
 from contextlib import closing, redirect_stderr, redirect_stdout
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 from unittest.mock import patch
 
 import anyio
@@ -27,9 +26,6 @@ from tests.support.housekeepers import recorded_before
 from tests.support.processes import until
 from tests.support.robot_run import T0, ask_everything, write_run
 from tests.support.served import Served, serving
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 COMMANDS: Final = {
     "info": ["info"],

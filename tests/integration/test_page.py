@@ -1,13 +1,12 @@
 """The page at `/` in real Chromium, over a history that holds what a hostile sender would send."""
 
-from __future__ import annotations
-
 import math
 import re
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import httpx2
 import pytest
@@ -21,11 +20,6 @@ from tests.support.processes import until
 from tests.support.robot_run import T0, T0_S
 from tests.support.served import Served, serving
 from tests.unit.test_positions import fix
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
 
 pytestmark = needs_chromium
 

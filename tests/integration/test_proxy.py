@@ -3,8 +3,6 @@
 Where nginx or Caddy is not on the PATH its test skips.
 """
 
-from __future__ import annotations
-
 import http.client
 import json
 import re
@@ -12,8 +10,10 @@ import shutil
 import socket
 import ssl
 import subprocess
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,10 +21,6 @@ from tests.support.memories import ROOT
 from tests.support.processes import until
 from tests.support.robot_run import write_run
 from tests.support.served import serving
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 PAGE = (ROOT / "docs/how-to/tls.md").read_text(encoding="utf-8")
 NAME = "robot.example"

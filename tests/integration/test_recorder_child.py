@@ -1,7 +1,5 @@
 """One child process: how it is started, what it inherits, and that it always comes to an end."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

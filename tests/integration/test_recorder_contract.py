@@ -1,26 +1,21 @@
 """The contract of the port `Recorder`, held by both adapters."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.recorder.background import Background
+from ros2_memory.recorder.base import Recorder
 from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
 from tests.support.processes import until
 from tests.support.simulated_recorders import PlayedHousekeeper
-
-if TYPE_CHECKING:
-    from ros2_memory.recorder.base import Recorder
 
 
 def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Ros2BagRecorder:

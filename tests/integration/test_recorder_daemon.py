@@ -1,7 +1,5 @@
 """The recorder's program, run whole over a stand-in for `ros2`: `tests/support/stub_ros2.py`."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """The environment that `ros2` gets: setup files sourced by a real bash, and nothing of ours."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,12 +1,12 @@
 """A privacy mode beside the real `ros2 bag record`: over a rotation, and a kill of everything."""
 
-from __future__ import annotations
-
 import signal
 import struct
 import subprocess
+from collections.abc import Callable, Iterator
+from collections.abc import Set as AbstractSet
 from functools import cache
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 import yaml
@@ -19,12 +19,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.live_recorder import LiveRecorder, Machine
 from tests.support.processes import PATIENCE_S
 from tests.support.ros_processes import end, wait_for
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from collections.abc import Set as AbstractSet
-    from pathlib import Path
-
 
 RULES = """
 rules:

@@ -1,10 +1,9 @@
 """Moments, through both programs: a planner asks the server, and the recorder's daemon keeps."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -15,9 +14,6 @@ from tests.support.live_recorder import answer
 from tests.support.processes import until
 from tests.support.served import Served, serving
 from tests.timing import each_in_time
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Queues deep enough for a stall, and publishers that come with weaker QoS: the real recorder."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

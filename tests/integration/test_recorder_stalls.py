@@ -4,13 +4,12 @@ Its process is stopped again and again. What was sent is in the publishers' own 
 recorded is in the bags; what the server says is compared with both.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, groupby, pairwise
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import pytest
 from mcap.reader import make_reader
@@ -26,12 +25,8 @@ from tests.support.live_recorder import (
     publishing,
     stall,
 )
+from tests.support.served import Served
 from tests.timing import in_time
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from tests.support.served import Served
 
 STALLS: Final = 3
 STALL_S: Final = 3.0

@@ -1,25 +1,19 @@
 """Which topics the real recorder records: a list that changes, and children that write nothing."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from ros2_memory.bag_dir.heartbeat import Heartbeat
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.live_recorder import LiveRecorder, Machine, bag_files, machine, ticks
+from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import Robot, publishing_robot, ros_environment, wait_for
 from tests.timing import each_in_time
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from tests.support.real_recorder import RealRecorder
 
 TOPICS = ("/odom", "/tf", "/cmd_vel", "/px4/position")
 

@@ -1,21 +1,16 @@
 """Rules beside the real `ros2 bag record`: through rotations, and a kill of everything."""
 
-from __future__ import annotations
-
 import re
 import time
 from datetime import datetime
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.live_recorder import Machine, bag_files
 from tests.support.processes import until
 from tests.support.ros_processes import publishing_robot
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 SPLIT_S: Final = 2
 ISO_TIME: Final = r"\d{4}-\d\d-\d\dT\S+?[+-]\d\d:\d\d"

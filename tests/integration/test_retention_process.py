@@ -3,17 +3,16 @@
 20 splits; EPISODIC_LONG=1 makes it 200.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
 import subprocess
 import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 from mcp import Client
@@ -38,9 +37,6 @@ from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ask_everything, write_run
 from tests.support.served import serving
 from tests.unit.core.test_deep_directories import DEEP, within
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 SPLITS: Final = 200 if LONG else 20

@@ -1,7 +1,5 @@
 """The memory of a server over small bags that decompress to gigabytes, asked by a real client."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from itertools import product

@@ -1,7 +1,5 @@
 """The query server tells the service manager when it listens, and when it stops."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,13 +1,12 @@
 """The query server as its own process, scraped as Prometheus does, and sending spans."""
 
-from __future__ import annotations
-
 import http.server
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import httpx2
 import pytest
@@ -23,10 +22,6 @@ from tests.support.served import (
     refusal,
     serving,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 GOOD = "kJ7-x._~+/0123456789=="
 SHOWN = {"Authorization": f"Bearer {GOOD}"}

@@ -1,13 +1,11 @@
 """The query server as its own process, asked by the SDK's real client over each transport."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import anyio
 import pytest
@@ -22,9 +20,6 @@ from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import CALLS, T0_S, ask, ask_everything, write_run
 from tests.support.served import PROGRAM, Served, command, environment, refusal, serving
 from tests.timing import in_time
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BETWEEN_ATTEMPTS_S = 0.05
 ENDS_WITHIN_S = 5.0

@@ -1,10 +1,9 @@
 """Progress of a call reaches the client over every transport, from a server in its own process."""
 
-from __future__ import annotations
-
 import json
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import anyio
 import httpx2
@@ -16,9 +15,6 @@ from mcp.types import TextContent
 from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import write_run
 from tests.support.served import Served, serving
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 REPORTS = 2
 SLOW = "list_frames"

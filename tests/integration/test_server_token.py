@@ -1,9 +1,7 @@
 """The query server where others can reach it: no start and no answer without a token."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import httpx2
 import pytest
@@ -14,9 +12,6 @@ from mcp.client.streamable_http import streamable_http_client
 from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import ask, write_run
 from tests.support.served import Served, command, refusal, serving
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 GOOD = "kJ7-x._~+/0123456789=="
 SHOWN = {"Authorization": f"Bearer {GOOD}"}

@@ -3,8 +3,6 @@
 Robots record on meanwhile. Messages have numbers, so that afterwards they can be counted.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

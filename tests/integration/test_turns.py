@@ -1,28 +1,23 @@
 """Whom the server takes for one client, over each way to ask: those are whom it gives turns to."""
 
-from __future__ import annotations
-
 import asyncio
+from collections.abc import AsyncIterator, Hashable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import anyio
 import pytest
 from mcp import Client
 from mcp.client.sse import sse_client
 
+from ros2_memory.history.context import Memory
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.serving.web_app import web_app
 from ros2_memory.tools.replies import Replies, Reply
 from tests.soak.wire import call, posted
 from tests.support.processes import PATIENCE_S, listening
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Hashable, Mapping
-
-    from ros2_memory.history.context import Memory
 
 
 class Listening(Dispatcher):

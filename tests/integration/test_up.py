@@ -1,16 +1,15 @@
 """`ros2-memory up` with the real `ros2 bag record`: publishers, a client, and how it ends."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 import yaml
@@ -19,10 +18,6 @@ from tests.support.live_recorder import Machine, answer
 from tests.support.processes import PATIENCE_S, until
 from tests.support.ros_processes import end, publishing_robot
 from tests.support.served import Served
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 QUICK: Final = ("server.port=0", "recording.split_duration_s=1", "retention.min_free_gb=0")

@@ -4,14 +4,14 @@ A check returns None where the answer is right, else what is wrong with it. Time
 window are right on either side within a microsecond, which is what float seconds resolve.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from random import Random
+from typing import Any, Final
 
 import anyio
 import numpy as np
@@ -21,12 +21,7 @@ from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
 from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from tests.oracle.truth import SLACK_NS, History, Row, Topic, path_of, planar
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from random import Random
-
-    from tests.oracle.worlds import World
+from tests.oracle.worlds import World
 
 NEAR_M: Final = 0.5
 """`data.position_tolerance_m` as shipped."""

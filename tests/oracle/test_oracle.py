@@ -1,10 +1,9 @@
 """Answers agree with brute force over odd histories, the recorded sessions and public bags."""
 
-from __future__ import annotations
-
 import os
 import random
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -13,9 +12,6 @@ from tests.oracle.truth import History
 from tests.oracle.worlds import WORLDS, World
 from tests.support.examples import LONG
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.xdist_group("heavy")
 

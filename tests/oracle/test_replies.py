@@ -1,10 +1,9 @@
 """Replies are those that were recorded; UPDATE_REPLIES=1 records what is replied instead."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
@@ -12,9 +11,6 @@ from tests.oracle.replies.fixture import Record
 from tests.oracle.replies.recording import compare, renew, sample
 from tests.oracle.replies.worlds import WORLDS
 from tests.support.examples import LONG
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 pytestmark = pytest.mark.xdist_group("heavy")
 

@@ -5,26 +5,21 @@ checked, `sqlite3` reads the table of messages row by row, `rosbags` decodes, nu
 calculate. Times are nanoseconds since the Unix epoch, lengths metres.
 """
 
-from __future__ import annotations
-
 import sqlite3
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
+from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyped]
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-    from rosbags.typesys.store import Typestore
 
 SLACK_NS: Final = 1_000
 """A time in float seconds lies up to half a microsecond beside its nanoseconds."""

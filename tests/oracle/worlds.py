@@ -3,11 +3,12 @@
 A world is a folder of recordings; each recording is a folder of splits.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from random import Random
+from typing import Any, Final
 
 from mcap.writer import CompressionType
 
@@ -24,11 +25,6 @@ from tests.support.bags import (
     write_db3,
     write_mcap,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-    from pathlib import Path
-    from random import Random
 
 S: Final = 10**9
 START: Final = 1_795_000_000 * S

@@ -4,35 +4,30 @@ Each stands in its page between `<!-- begin: NAME -->` and `<!-- end: NAME -->`;
 around it, and the last column of the log events, is theirs.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re
 import textwrap
 from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import yaml
 from pydantic import TypeAdapter
 
 from ros2_memory.cli.app import COMMANDS, COMMON_EXIT_CODES
 from ros2_memory.config import DuckdbNode, Ros2BagNode, Rosbag2Node, Settings
+from ros2_memory.core.errors import EpisodicError
 from ros2_memory.lake.tables import KEYS, TABLES
 from ros2_memory.recorder import event_log
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.tools.arguments import TIME_KINDS
+from ros2_memory.tools.declaration import Tool
 from tests.support.documented_history import CALLS
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
-
-    from ros2_memory.core.errors import EpisodicError
-    from ros2_memory.tools.declaration import Tool
 
 SOURCE: Final = ROOT / "src" / "ros2_memory"
 LEVELS: Final = {

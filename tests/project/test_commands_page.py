@@ -1,10 +1,8 @@
 """The commands of "From the command line" and of docs/how-to/forget.md run."""
 
-from __future__ import annotations
-
 import re
 import shlex
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -15,9 +13,6 @@ from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
 from tests.support.housekeepers import own_all
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FORGET = (ROOT / "docs/how-to/forget.md").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8")

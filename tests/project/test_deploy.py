@@ -1,7 +1,5 @@
 """What `deploy/` promises: units that systemd understands, a user, directories, an environment."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """What documents name exists, and AGENTS.md and the package's map leave no room out."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields
 from pathlib import Path

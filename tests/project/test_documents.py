@@ -3,17 +3,16 @@
 What cannot be run here stands in `NOT_RUN`, with the reason.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import anyio
 import duckdb
@@ -28,9 +27,6 @@ from ros2_memory.serving.web_app import STREAM_PATH
 from tests.support.documented_history import START_S, write_history
 from tests.support.forked_commands import write_command
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 DOCUMENTS: Final = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS: Final = Path(sys.executable).parent

@@ -4,8 +4,6 @@ A fresh clone, an empty home, and a PATH with the system's commands and one Pyth
 from the network, so they run with EPISODIC_LONG=1 alone: in `.ci/run` and in the workflow.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

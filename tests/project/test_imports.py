@@ -1,22 +1,18 @@
 """What programs do not import, which would have them start later, and take more memory."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
 
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
 from tests.support.housekeepers import own_all
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 T0: Final = 1_700_000_000 * NS_PER_S
 SERVING: Final = {"mcp", "mcp_types", "sse_starlette", "starlette", "uvicorn"}

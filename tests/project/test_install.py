@@ -1,7 +1,5 @@
 """`deploy/install.sh --root DIR`: what it makes, and what it leaves as it is when it runs again."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,9 +1,7 @@
 """The page on metrics and the alerts ask for series that there are; what spans contain."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import anyio
 import pytest
@@ -19,9 +17,6 @@ from tests.project.reference_tables import codes
 from tests.support.bags import text, write_mcap
 from tests.support.heartbeats import beat
 from tests.support.memories import ROOT, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytest.importorskip("prometheus_client", reason="needs the extra observability")
 pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")

@@ -1,18 +1,19 @@
 """docs/reference says what the code does. `UPDATE_DOCS=1` writes the parts that are made of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import time
+from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
 import pytest
 
 from ros2_memory import results
 from ros2_memory.core.errors import EpisodicError, NoDataReason
+from ros2_memory.core.reply import Declared
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import (
     MOMENT,
@@ -23,12 +24,6 @@ from ros2_memory.tools.build import build_tools
 from tests.project import reference_tables as reference
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from ros2_memory.core.reply import Declared
 
 FOLDER = ROOT / "docs" / "reference"
 TOOLS = build_tools(QuerySettings(), writing=True)

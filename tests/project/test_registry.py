@@ -4,8 +4,6 @@ It is validated against the registry's schema (2025-12-11, in tests/data/mcp_reg
 for what the registry demands of packages of PyPI.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """What the repository promises about itself: the wheel, its dependencies, the examples."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

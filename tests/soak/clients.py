@@ -1,15 +1,14 @@
 """Clients of every habit. Each returns how often it saw what, and none leaves anything open."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re
 from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from itertools import chain, count
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from mcp import Client
 from mcp.client.sse import sse_client
@@ -17,9 +16,6 @@ from mcp.client.sse import sse_client
 from tests.soak.wire import BOUND_S, answer, asked, call, connected, head, posted
 from tests.support import examples
 from tests.support.robot_run import ANSWERED, T0_S, ask
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
 
 Seen: TypeAlias = "Counter[str]"
 Habit: TypeAlias = "Callable[[int], Awaitable[Seen]]"

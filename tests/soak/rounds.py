@@ -1,21 +1,17 @@
 """Rounds of all habits against one server, with what it held after each."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from tests.soak import clients
+from tests.soak.clients import Habit
 from tests.soak.server import Held, came_back_to, held
 from tests.support.examples import LONG
 from tests.support.processes import PATIENCE_S
-
-if TYPE_CHECKING:
-    from tests.soak.clients import Habit
-    from tests.support.served import Served
+from tests.support.served import Served
 
 SHORT: Final[tuple[Habit, ...]] = (
     clients.all_tools,

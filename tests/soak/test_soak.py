@@ -1,18 +1,13 @@
 """A bounded soak: what the server holds in the end is what it held at the start."""
 
-from __future__ import annotations
-
 import asyncio
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from tests.soak.rounds import SHORT, SLOW, soaked
 from tests.support.examples import LONG
 from tests.support.robot_run import write_run
 from tests.support.served import PROGRAM, serving
 from tests.timing import in_time
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SECONDS = 600.0 if LONG else 2.0
 """Of rounds, besides the one that warms the server up and the slow requests that it waits for."""

@@ -1,17 +1,13 @@
 """HTTP by hand, for what no well-behaved client library does."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from tests.support.processes import PATIENCE_S
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
 
 BOUND_S: Final = PATIENCE_S
 """No client waits longer: that is a hang."""

@@ -1,7 +1,5 @@
 """Clocks that tests read and set."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ros2_memory.core.timebase import Clock, Ns

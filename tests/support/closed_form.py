@@ -4,8 +4,6 @@ A circle of radius 2 m at 0.5 m/s, t seconds after its start: from (0, 0) facing
 about (0, 2).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

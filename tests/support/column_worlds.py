@@ -1,10 +1,9 @@
 """Memories with a store of columns, and what they scan beside what plain reading finds."""
 
-from __future__ import annotations
-
 from collections import defaultdict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -14,9 +13,11 @@ from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.stored import StoredTable
+from ros2_memory.columns.table import Table
 from ros2_memory.columns.writing import Level
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.core.timebase import Clock
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
@@ -24,13 +25,6 @@ from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.leaves import Comparison
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    from ros2_memory.columns.table import Table
-    from ros2_memory.core.timebase import Clock
 
 EVERYTHING = TimeWindow.everything()
 
@@ -56,7 +50,7 @@ class World:
         file: Path | None = None,
         clock: Clock | None = None,
         definitions: str = "",
-    ) -> World:
+    ) -> "World":
         reader = BagDirReader(Rosbag2Reader(), bag_dir)
         memory = memory_of(bag_dir, clock=clock, reader=reader)
         paths = [file or store_file(bag_dir)]
@@ -101,7 +95,7 @@ class World:
         bags = self.memory.index.snapshot().timeline.bags
         return {str(bag.path.relative_to(self.bag_dir)) for bag in bags if bag.file not in missing}
 
-    def unstored(self) -> World:
+    def unstored(self) -> "World":
         """The same world without a store: everything is read from bags."""
         columns = Scanner(None, self.bag_dir)
         return replace(self, memory=replace(self.memory, scanner=columns))

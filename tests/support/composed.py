@@ -4,27 +4,21 @@ Hydra takes 70 ms of processor time for it; what is assigned to single keys it a
 file of message schemas takes 50 ms.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import IO, Any, Final
 from unittest.mock import patch
 
 from hydra import compose
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from tests.support.measured import untraced
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from omegaconf import DictConfig, ListConfig
 
 SHIPPED: Final = Path(__file__).resolve().parents[2] / "config"
 

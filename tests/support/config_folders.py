@@ -1,7 +1,5 @@
 """What the tests of the configuration share: a folder of it to change, and its refusals."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

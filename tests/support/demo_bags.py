@@ -1,20 +1,15 @@
 """The bags of the demo's robot at a moment at which somebody asks about it."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.demo.messages import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
 
 STARTED_S: Final = 1_784_023_200
 """When the robot started, in Unix seconds: it was on its dock."""

@@ -6,12 +6,12 @@ a drive of one minute, from 08:00:00 UTC on 20 November 2026, in six splits of 1
   40 to 60 s  along y at 0.5 m/s, to (10, 10)
 """
 
-from __future__ import annotations
-
 import math
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import anyio
 
@@ -31,11 +31,6 @@ from tests.support.bags import McapLayout, Msg, detections, odom, text, tf, tran
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import recorder_at_work
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
 
 START_S: Final = 1_795_161_600
 RECORDING: Final = "rec_20261120T080000Z"

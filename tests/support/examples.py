@@ -3,8 +3,6 @@
 Each run draws other examples, so what many short runs try together is what a long one tries.
 """
 
-from __future__ import annotations
-
 import os
 from typing import Final
 

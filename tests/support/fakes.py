@@ -1,15 +1,11 @@
 """Disks that take no more, or fail."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Never
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+from typing import Never
 
 
 @contextmanager

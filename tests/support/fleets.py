@@ -1,7 +1,5 @@
 """A small fleet: for each robot a minute in two splits, seeded by its name, and what it saw."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -7,8 +7,6 @@ learns its process number and how it ended. What tests the start of a program it
 starts it anew.
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import os
@@ -19,12 +17,10 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+from typing import IO, Any, Final
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 ADDRESS: Final = "EPISODIC_FORKING"

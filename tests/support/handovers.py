@@ -1,17 +1,11 @@
 """Handovers that an earlier run left, settled as a recorder does that starts."""
 
-from __future__ import annotations
-
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.handover import settle_handover, unsettled_handovers
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.storage.base import BagReader
+from ros2_memory.storage.base import BagReader
 
 
 def recover_handovers(bag_dir: Path, reader: BagReader) -> None:

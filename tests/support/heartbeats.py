@@ -1,13 +1,9 @@
 """What a recorder writes of itself."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def beat(

@@ -1,18 +1,13 @@
 """What no sound client sends, and what a careless or hostile one does, as arguments of tools."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
 
 from tests.support.robot_run import ANSWERED, T0_S
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from hypothesis.strategies import SearchStrategy
 
 DEEP: Final = 10_000
 """Levels of nesting: past what Python's own recursion allows."""

@@ -1,13 +1,13 @@
 """A housekeeper over a folder of bags, as the recorder's daemon has one."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from mcap.writer import Writer
 
@@ -28,17 +28,12 @@ from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.storage.base import BagReader, BagWriter
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from ros2_memory.storage.base import BagReader, BagWriter
 
 PLENTY = 10**15
 HOUR = 3600 * NS_PER_S

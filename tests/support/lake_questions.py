@@ -1,7 +1,5 @@
 """Questions with every tool about one robot, to ask its bags and a lake alike."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from random import Random
 

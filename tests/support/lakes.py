@@ -1,7 +1,5 @@
 """A lake in a folder, and robots of a few messages: shipped into it, and asked over it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace

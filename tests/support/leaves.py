@@ -1,18 +1,14 @@
 """Compares tables with decoded messages, leaf by leaf, without the plan they were made by."""
 
-from __future__ import annotations
-
 import dataclasses
 import keyword
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Container, Iterator, Sequence
+from typing import Final
 
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES, Elements, Table, Texts
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterator, Sequence
 
 FILLER: Final = "structure_needs_at_least_one_member"
 TIMES: Final = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}

@@ -1,7 +1,5 @@
 """Bags as the index lists them, without their files."""
 
-from __future__ import annotations
-
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import Ns

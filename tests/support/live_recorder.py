@@ -4,8 +4,6 @@ The robot is `tests/support/robot_publishers.py`. A message of `/odom` carries i
 (T0 + tick / hz) in its header, so each one is known by name, however often and wherever it stands.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -15,11 +13,12 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import anyio
 from mcp import Client
@@ -41,9 +40,6 @@ from tests.support.real_recorder import env_without_ros
 from tests.support.robot_run import ask
 from tests.support.ros_processes import end, wait_for
 from tests.support.served import Served, serving
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
 
 RECORDED_TOPICS: Final = (
     "/odom",

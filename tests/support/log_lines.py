@@ -1,7 +1,5 @@
 """Lines of the logs in `.episodic`, as a test writes them by hand."""
 
-from __future__ import annotations
-
 from zlib import crc32
 
 

@@ -1,23 +1,18 @@
 """MCAP files in layouts and with faults that no writer makes on request."""
 
-from __future__ import annotations
-
 import random
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
 
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
 from tests.support.bags import McapLayout, Msg, text
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from mcap.records import ChunkIndex
 
 SMALL: Final = McapLayout(chunk_size=400)
 RECORD: Final = struct.Struct("<BQ")

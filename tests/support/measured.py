@@ -4,21 +4,17 @@ Measured is the first example of each plain test; what the others run, tests of 
 the tools above it run as well: 89 % of all lines and branches together, the gate is 85 %.
 """
 
-from __future__ import annotations
-
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.machinery import SourceFileLoader
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, ParamSpec, TypeVar
+from types import ModuleType
+from typing import Final, ParamSpec, TypeVar
 from unittest.mock import patch
 
 import pytest
 from coverage import Coverage
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from types import ModuleType
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

@@ -1,14 +1,13 @@
 """A whole memory over a folder of bags, as the composition root would build it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import yaml
@@ -27,16 +26,12 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.backfill import make_fragments
+from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies, Reply
 from tests.support.clocks import SettableClock
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from ros2_memory.storage.base import BagReader
 
 LAST_WRITTEN = 1_800_000_000 * NS_PER_S
 """Tests date no bag later, unless that is what they test."""

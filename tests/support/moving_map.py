@@ -1,17 +1,12 @@
 """A robot whose map moves under its odometry: a localiser corrects it, now and then by a lot."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING
 
 from tests.support.bags import Msg, detections, mcap_content, odom, tf, transform
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 MS = 10**6

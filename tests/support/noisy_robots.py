@@ -1,7 +1,5 @@
 """Robots as they are: noisy poses, a map that moves, a detector that errs, and many changes."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from random import Random

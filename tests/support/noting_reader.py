@@ -1,20 +1,15 @@
 """Readers of MCAP bags that note what they are asked, or fail."""
 
-from __future__ import annotations
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
+import pytest
 
+from ros2_memory.core.bag_summary import BagSummary
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import Channel, Record
 from ros2_memory.storage.mcap_reader import McapReader
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
-    from pathlib import Path
-
-    import pytest
-
-    from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.model import TimeWindow
-    from ros2_memory.storage.base import Channel, Record
 
 
 class NotingReader(McapReader):

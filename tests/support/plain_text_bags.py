@@ -4,19 +4,14 @@ A file is `BAG`, a line `topic type log_time` for each message or `topic type -`
 any, and `END` once it is closed.
 """
 
-from __future__ import annotations
-
 from collections import Counter
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
 
 
 def plain(

@@ -1,12 +1,11 @@
 """Waiting for something that a process is about to do: for as long as it takes, up to a bound."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import uvicorn
 
@@ -14,9 +13,6 @@ from ros2_memory.serving.connection_limits import (
     ACCEPTED_AT_ONCE,
     BoundedConnection,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
 
 T = TypeVar("T")
 

@@ -1,7 +1,5 @@
 """The program `ros2-memory` in this process, held to its exit code."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from typing import Any, NamedTuple

@@ -1,13 +1,12 @@
 """Histories of a robot with everything odd that bags can have, drawn at random."""
 
-from __future__ import annotations
-
 import json
 import math
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
+from random import Random
 
 from mcap.exceptions import McapError
 from mcap.writer import Writer
@@ -32,10 +31,6 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.mcap_surgery import spoil_chunk
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from random import Random
 
 S = 10**9
 MS = 10**6

@@ -1,26 +1,21 @@
 """Every reader over every kind of file that it reads, for tests that hold for all of them."""
 
-from __future__ import annotations
-
 import sqlite3
+from collections.abc import Callable, Collection, Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import zstandard
 from mcap.writer import CompressionType, IndexType
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, write_db3, write_mcap
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
-    from pathlib import Path
-
-    from ros2_memory.storage.base import BagReader
 
 NO_CHUNK_INDEX: Final = IndexType.ATTACHMENT | IndexType.MESSAGE | IndexType.METADATA
 NO_MESSAGE_INDEX: Final = IndexType.ATTACHMENT | IndexType.CHUNK | IndexType.METADATA

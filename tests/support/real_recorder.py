@@ -7,20 +7,16 @@ tests that need it skip and say why; with EPISODIC_REQUIRE_REAL=1 they fail inst
         with ros_environment(tmp_path, real=real_recorder) as env:
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 ROS_NAMES: Final = ("ROS", "RMW", "RCUTILS", "FASTDDS", "FASTRTPS", "AMENT", "COLCON", "CMAKE")

@@ -1,7 +1,5 @@
 """An Iceberg REST catalogue over an SQLite one, with what this program asks of it."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Iterator

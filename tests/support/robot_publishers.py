@@ -24,8 +24,6 @@ that says it has subscribed may be reached some seconds later. It also tells how
 worst, in seconds, in having published a tick.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,21 +1,16 @@
 """A short run of a robot, and questions about it that go through the whole house."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+from mcp import Client
 from mcp.types import TextContent
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, boolean, detections, mcap_content, odom, tf, transform
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from mcp import Client
 
 T0_S = 1_784_023_200
 T0 = T0_S * NS_PER_S

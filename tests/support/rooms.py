@@ -4,24 +4,19 @@ It is where it is at whole seconds, half a step (0.25 m) or more from every wall
 crossed half a second after the last message in the room before.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import groupby
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.core.regions import Place, Rectangle
+from ros2_memory.history.context import Memory
 from tests.support.bags import Msg, header, make, odom, point, text, write_mcap
 from tests.support.memories import memory_of, with_store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from ros2_memory.history.context import Memory
 
 S: Final = 10**9
 BEGIN: Final = 1_784_000_000

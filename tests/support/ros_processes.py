@@ -5,18 +5,17 @@ that of the real recorder (`tests/support/real_recorder.py`): a `ROS_DOMAIN_ID` 
 on this machine has, and discovery on this machine alone.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import socket
 import subprocess
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
@@ -24,9 +23,6 @@ from tests.support.processes import PATIENCE_S, until
 from tests.support.real_recorder import (
     RealRecorder,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 SHARED_MEMORY: Final = Path("/dev/shm")  # noqa: S108

@@ -10,8 +10,6 @@ The structs are those of `rosidl_runtime_c/message_type_support_struct.h`,
 wheels' include folder; so this is for `rmw_fastrtps_cpp` only.
 """
 
-from __future__ import annotations
-
 import ctypes
 from functools import cache
 from importlib import import_module

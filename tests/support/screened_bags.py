@@ -1,8 +1,7 @@
 """A bag directory that a recorder of ours fills split by split, and screens before it is served."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from pathlib import Path
 
 from mcap.reader import make_reader
 
@@ -16,10 +15,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.screening import ExclusionRule, Screening
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.memories import shipped_extractor
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
 
 S = 10**9
 T0 = 1_790_000_000 * S

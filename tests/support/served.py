@@ -1,22 +1,18 @@
 """The query server as its own process."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
 PROGRAM = (sys.executable, "-m", "ros2_memory.server", "data.now=latest")
 

@@ -1,21 +1,16 @@
 """Sights of messages that a test writes down one by one."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.sights import TABLES, DetectorMessages, Sights, sights_of
 from ros2_memory.columns.sights import JoinedSights, joined, packed
 from ros2_memory.columns.table import Texts
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ros2_memory.core.model import Vector3
-    from ros2_memory.core.timebase import Ns
+from ros2_memory.core.model import Vector3
+from ros2_memory.core.timebase import Ns
 
 
 class PlacedDetection(NamedTuple):

@@ -4,14 +4,13 @@ The recorders write real MCAP files. On each topic one message is published at e
 second; all recorders that have subscribed receive it, each a little later.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import yaml
 from structlog.testing import capture_logs
@@ -32,10 +31,6 @@ from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, write_mcap
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-
 T0 = 1_795_150_800 * NS_PER_S
 PERIOD = NS_PER_S // 4
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -48,7 +43,7 @@ class PlayedRecorder(Child):
     """A `ros2 bag record` as far as its supervision sees it."""
 
     pid: int
-    world: World
+    world: "World"
     directory: Path
     ready_s: float = 0.5
     subscribe_s: float = 1.0
@@ -155,7 +150,7 @@ class Inline(Background):
 
 
 class WorldClock(Clock):
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: "World") -> None:
         self._world = world
 
     def now(self) -> int:
@@ -244,7 +239,7 @@ class World:
         self.recorders.append(recorder)
         return recorder
 
-    def started(self, run_s: float = 0.0) -> World:
+    def started(self, run_s: float = 0.0) -> "World":
         """Starts the supervisor and lets time pass; returns this world."""
         self.supervisor.start()
         self.run(run_s)

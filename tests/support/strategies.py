@@ -1,18 +1,12 @@
 """What property tests draw from."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
 
 from ros2_memory.core.geometry import normalised
 from ros2_memory.core.model import JsonValue, Quaternion, Transform, Vector3
-
-if TYPE_CHECKING:
-    from hypothesis.strategies import SearchStrategy
-
 
 metres = st.floats(-1e4, 1e4, allow_nan=False)
 points: SearchStrategy[Vector3] = st.tuples(metres, metres, metres)

@@ -10,8 +10,6 @@ Environment: STUB_PERIOD_MS, STUB_SUBSCRIBE_S (when topics are subscribed to), S
 the help lists besides the common ones).
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re
@@ -19,13 +17,10 @@ import signal
 import sys
 import time
 from contextlib import suppress
+from io import BufferedWriter
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mcap.writer import CompressionType, Writer
-
-if TYPE_CHECKING:
-    from io import BufferedWriter
 
 ENDED = False
 LOST = "/events/rosbag2_messages_lost"

@@ -1,7 +1,5 @@
 """Replies that count `by` something, as dictionaries."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

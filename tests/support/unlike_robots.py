@@ -1,7 +1,5 @@
 """Five robots that have little in common, a minute each."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,9 +1,9 @@
 """A bag directory that a recorder of ours fills split by split, and a watch of rules over it."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, MutableMapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import structlog
 
@@ -25,11 +25,6 @@ from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import keeper_of
 from tests.support.memories import shipped_extractor
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, MutableMapping, Sequence
-    from pathlib import Path
-
 
 S = 10**9
 T0 = 1_790_000_000 * S

@@ -4,20 +4,15 @@ All other tests run on whichever worker is free. Node ids stay as they are, for 
 `--dist=loadgroup` goes by what it adds to them, which pytest 9.2 no longer takes up.
 """
 
-from __future__ import annotations
-
 import os
 import re
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from xdist.scheduler import LoadScopeScheduling
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from xdist.workermanage import WorkerController
+from xdist.workermanage import WorkerController
 
 TESTS: Final = Path(__file__).parents[1]
 GROUPS: Final[Mapping[str, Sequence[str]]] = {

@@ -1,12 +1,10 @@
 """Configuration: what files, environment and command line come to."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import traceback
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
@@ -23,9 +21,6 @@ from ros2_memory.config_sources import Sources
 from ros2_memory.core.errors import ConfigError
 from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, copied, refusal
 from tests.support.examples import examples
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
     codec="utf-8", exclude_characters="\0"

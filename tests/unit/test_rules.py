@@ -1,20 +1,16 @@
 """The rules of `recording.keep_when` and `recording.exclude_when`, as they are configured."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 from ros2_memory.bootstrap import exclusions_of, query_settings_of, rules_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.triggers.rules import Rule
+from ros2_memory.triggers.screening import ExclusionRule
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from ros2_memory.triggers.rules import Rule
-    from ros2_memory.triggers.screening import ExclusionRule
 
 BUMPER: Final = "topic: /bumper, condition_type: equals, value: true"
 

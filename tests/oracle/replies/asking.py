@@ -4,8 +4,6 @@ Nothing of a reply depends on the date, on where the folder lies, or on how fast
 the clock stands still, paths are replaced, and what is measured by the clock is left out.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging
@@ -15,10 +13,12 @@ import re
 import shutil
 import time
 from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 from unittest.mock import patch
 from xml.etree import ElementTree as ET
 
@@ -40,11 +40,6 @@ from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
 from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.triggers.rules import SplitSearch, chains_to_search
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
 
 NOW_NS: Final = 1_900_000_000 * NS_PER_S
 """The wall clock of every call: later than all worlds but for the clocks that are wrong."""
@@ -84,7 +79,7 @@ class Call:
         return found
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Call:
+    def from_json(cls, found: Mapping[str, Any]) -> "Call":
         """The call that `as_json` wrote."""
         return cls(found["way"], found["name"], found.get("given"), tuple(found.get("words", ())))
 

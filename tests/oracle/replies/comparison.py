@@ -4,16 +4,12 @@ Texts, integers and booleans are exact. Numbers with decimals, also within sente
 one unit of the last decimal that is shown, as another processor may round them. Notes are sets.
 """
 
-from __future__ import annotations
-
 import math
 import re
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterator
+from typing import Any, Final
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from tests.oracle.replies.asking import Call
+from tests.oracle.replies.asking import Call
 
 _UNORDERED: Final = frozenset({"notes", "problems", "lines"})
 _NUMBER: Final = re.compile(r"(?<![\w:.])-?\d+\.\d+(?![\w:.]*[-:])")

@@ -4,19 +4,15 @@ The first line has the world's name, its settings and its named places; each oth
 reply from the bags alone, and, under `stored`, the reply with a store where that differs.
 """
 
-from __future__ import annotations
-
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import zstandard
 
 from tests.oracle.replies.asking import Call
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 FOLDER: Final = Path(__file__).resolve().parents[2] / "data" / "replies"
 _LEVEL: Final = 22
@@ -55,7 +51,7 @@ class Record:
         return len(packed)
 
     @classmethod
-    def read(cls, world: str) -> Record:
+    def read(cls, world: str) -> "Record":
         """The record of a world.
 
         Raises:

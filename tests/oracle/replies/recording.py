@@ -1,21 +1,16 @@
 """Asking a world again what was recorded of it, and choosing a sample of its calls."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import defaultdict
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from tests.oracle.replies.asking import Asked, still_time
 from tests.oracle.replies.comparison import differences
 from tests.oracle.replies.fixture import Record, Replied
 from tests.oracle.replies.worlds import WORLDS, ReplyWorld
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
 
 _SAMPLE_SEED: Final = "sample 2"
 _SLOW: Final = frozenset({"plot plot", "parquet export", "cli info", "cli forget"})

@@ -3,15 +3,14 @@
 Those of the shared folder are copied, so that times of files and stores lie apart from it.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
@@ -25,9 +24,6 @@ from tests.support.moving_map import write_moving_map
 from tests.support.noisy_robots import write_noisy_robot
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import BAGS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 S: Final = 10**9
 MS: Final = 10**6

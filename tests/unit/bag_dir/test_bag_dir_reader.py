@@ -1,7 +1,5 @@
 """The reader of a bag directory: what counts elsewhere is left out, the rest is as in the files."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

@@ -4,8 +4,6 @@ What a program opens is heard from the interpreter itself (`sys.addaudithook`), 
 opening a file is forgotten here.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -13,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -33,6 +31,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.file_state import files_in_metadata
 from ros2_memory.index.scan import Tree
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
+from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -41,9 +40,6 @@ from tests.support.examples import LONG
 from tests.support.handovers import recover_handovers
 from tests.support.housekeepers import keeper_of
 from tests.support.robot_run import ANSWERED, T0, T0_S, write_run
-
-if TYPE_CHECKING:
-    from ros2_memory.serving.mcp_server import EpisodicServer
 
 SECRET = "/outside/secret"  # noqa: S105  the name of a topic
 HEARD = {

@@ -1,7 +1,5 @@
 """Small files that are replaced at once, and closed bags that survive a power cut."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`handover.json`: which messages of two recordings count, and what may stand in the file."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

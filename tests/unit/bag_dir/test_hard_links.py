@@ -1,27 +1,20 @@
 """A bag that moments keep is one bag, whichever of its names the index meets first."""
 
-from __future__ import annotations
-
 import os
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, SnapshotSource
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of
 from tests.unit.index.test_unchanged_bags import Start
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.history.context import SnapshotSource
 
 S = 10**9
 

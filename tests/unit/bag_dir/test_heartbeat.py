@@ -1,7 +1,5 @@
 """What the recorder says of itself, and how little of it is believed."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The names of what the recorder puts into the bag directory."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ros2_memory.bag_dir.layout import (

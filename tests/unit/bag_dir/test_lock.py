@@ -1,7 +1,5 @@
 """One recorder for one bag directory."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

@@ -1,10 +1,9 @@
 """metadata.yaml after files of its recording were deleted."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -22,9 +21,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.housekeepers import bag, described
 from tests.support.shared_bags import RECORDED, needs_recorded
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ROOT = "rosbag2_bagfile_information"
 FILES: list[dict[str, Any]] = [

@@ -1,13 +1,11 @@
 """Saved moments, and the requests for them."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
 import re
 import stat
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -32,9 +30,6 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from tests.support.fakes import failing
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 T0 = 1_795_150_800 * S  # 2026-11-20T05:00:00Z

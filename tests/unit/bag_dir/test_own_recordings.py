@@ -1,12 +1,12 @@
 """The list of a bag directory's own recordings: whatever stops the recorder, and wherever."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading
+from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -29,10 +29,6 @@ from tests.support.heartbeats import beat
 from tests.support.housekeepers import embedding, lines, own_all
 from tests.support.log_lines import with_checks
 from tests.support.simulated_recorders import World, events, rotating
-
-if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-    from pathlib import Path
 
 A, B, C = "rec_20260921T101320Z", "rec_20260921T102320Z", "rec_20260921T103320Z"
 

@@ -3,8 +3,6 @@
 They are given as an installed robot has them on its disk, so their formats are tested, too.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re

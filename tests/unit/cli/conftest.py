@@ -1,22 +1,17 @@
 """What the tests of the commands share."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import time
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.columns.pack import decompressed
 from tests.support.program import exits
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 __all__ = ["exits"]
 

@@ -1,10 +1,8 @@
 """`ros2-memory`: what its commands that only look print, and how they end."""
 
-from __future__ import annotations
-
 import json
 import os
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 import yaml
@@ -13,11 +11,7 @@ from ros2_memory.cli.app import COMMANDS, epilog
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
 from tests.support.housekeepers import later, recording_now
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.support.program import Program
+from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
 

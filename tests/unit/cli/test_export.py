@@ -1,17 +1,16 @@
 """`ros2-memory export`: what comes out is what was recorded, and other programs read it."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import duckdb
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer as McapFile
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
@@ -22,6 +21,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
+from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import (
@@ -36,16 +36,9 @@ from tests.support.bags import (
 )
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import memory_of
+from tests.support.program import Program
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 from tests.unit.cli.conftest import left
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from mcap.writer import Writer as McapFile
-
-    from ros2_memory.history.stored_message import StoredMessage
-    from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
 NOW = datetime.fromisoformat("2023-11-14T20:00:00").timestamp()

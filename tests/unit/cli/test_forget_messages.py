@@ -4,8 +4,6 @@ What stays is read by plain rosbags, before and after; what goes is looked for i
 bag directory, in decompressed chunks and in what is stored of them.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os
@@ -13,9 +11,10 @@ import shutil
 import sqlite3
 import subprocess
 from collections import Counter
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from mcap.reader import NonSeekingReader
@@ -47,9 +46,6 @@ from tests.support.bags import (
 )
 from tests.support.housekeepers import described, made_moment, own_all
 from tests.unit.cli.conftest import columns_in, left, locked
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 S = NS_PER_S
 T0 = 1_700_000_000 * S

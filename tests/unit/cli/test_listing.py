@@ -1,7 +1,5 @@
 """`info`, `topics`, `recordings` and `cat` on bags of any origin, and `--recording`."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -12,7 +10,7 @@ import subprocess
 import sys
 from contextlib import closing
 from io import BytesIO, TextIOWrapper
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -23,16 +21,12 @@ from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, log_entry, odom, text, write_mcap
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import own_all
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.core.model import JsonValue
-    from tests.support.program import Program
+from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
 

@@ -1,12 +1,10 @@
 """`ros2-memory plot`: pictures of bags, and what is said where there can be none."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -17,6 +15,7 @@ from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import battery, boolean, odom, text, write_mcap
 from tests.support.memories import memory_of
+from tests.support.program import Program
 
 pytest.importorskip("matplotlib", reason="needs the extra plot")
 
@@ -24,11 +23,6 @@ from matplotlib.figure import Figure
 
 from ros2_memory.cli import plot
 from ros2_memory.places.local_map import east_north
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
 S = NS_PER_S

@@ -1,7 +1,5 @@
 """Which topics are proposed, why, and what they are estimated to take."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,20 +1,15 @@
 """`ros2-memory prove`: a file with what an answer rests on, which alone gives that answer."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from mcap.reader import make_reader
 
 from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
 from tests.support.moving_map import BEGIN, S, write_moving_map
-
-if TYPE_CHECKING:
-    from tests.support.program import Program
+from tests.support.program import Program
 
 DAY_S = 86_400
 ABOVE = {"topic": "/odom", "condition_type": "above", "value": 0.1, "field": "position.x"}

@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import io
 import os
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from mcap.reader import make_reader
@@ -19,10 +16,8 @@ from ros2_memory.core.directories import identity_of
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
 from tests.support.housekeepers import copied, files_in, later, recording_now
+from tests.support.program import Program
 from tests.support.shared_bags import RECORDED, needs_recorded
-
-if TYPE_CHECKING:
-    from tests.support.program import Program
 
 S = 10**9
 T0 = 1_790_000_000 * S

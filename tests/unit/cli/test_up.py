@@ -1,22 +1,16 @@
 """What `ros2-memory up` refuses before it starts anything."""
 
-from __future__ import annotations
-
 import io
 import os
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from ros2_memory.recorder.process.topics import load_topics
 from tests.support import stub_ros2
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.support.program import Program
+from tests.support.program import Program
 
 
 @pytest.fixture(autouse=True)

@@ -1,12 +1,10 @@
 """`ros2-memory watch`: what is not as usual is seen, on a terminal and in a log."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -14,11 +12,7 @@ from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, assessment
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.support.program import Program
+from tests.support.program import Program
 
 
 @pytest.fixture(autouse=True)

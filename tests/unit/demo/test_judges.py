@@ -1,7 +1,5 @@
 """The demo's questions, asked of a memory over the demo's own bags: right, and able to be wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What the demo prints, which fits a terminal and leaves nothing unsaid; and what it refuses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

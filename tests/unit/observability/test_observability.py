@@ -3,36 +3,29 @@
 Gauges of a memory are measured without a look at its bags.
 """
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from mcp import Client, MCPError
+from opentelemetry.sdk.trace import ReadableSpan
+from prometheus_client.metrics_core import Metric
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.results import Answer
 from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.support.bags import text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.memories import memory_of
 from tests.unit.serving.test_dispatch import served, tool, value
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from opentelemetry.sdk.trace import ReadableSpan
-    from prometheus_client.metrics_core import Metric
-
-    from ros2_memory.history.context import Call
-    from ros2_memory.results import Answer
-    from ros2_memory.serving.mcp_server import EpisodicServer
 
 pytest.importorskip("prometheus_client", reason="needs the extra observability")
 pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")

@@ -1,7 +1,5 @@
 """The folder `memory/`: what stays of bags that retention deletes."""
 
-from __future__ import annotations
-
 import errno
 import json
 import operator

@@ -3,13 +3,12 @@
 What either of them holds counts, and once.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import pytest
 from hypothesis import given, settings
@@ -40,9 +39,6 @@ from tests.support.bags import McapLayout, Msg, boolean, text, tf, transform, wr
 from tests.support.examples import examples
 from tests.support.handovers import recover_handovers
 from tests.support.simulated_recorders import World
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 S = 10**9
 T0 = 1_795_150_800 * S

@@ -1,11 +1,12 @@
-from __future__ import annotations
-
 import errno
 import os
 import threading
+from collections.abc import Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import zstandard
@@ -40,11 +41,6 @@ from tests.support.housekeepers import (
 )
 from tests.support.memories import asked, memory_of
 from tests.support.simulated_recorders import events
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, MutableMapping
-    from pathlib import Path
-from unittest.mock import Mock
 
 S = 10**9
 T0 = 1_790_000_000 * S

@@ -1,12 +1,10 @@
 """What is known of the bag directory."""
 
-from __future__ import annotations
-
 import os
 import threading
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from structlog.testing import capture_logs
@@ -16,10 +14,6 @@ from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
 from tests.support.plain_text_bags import PlainReader, plain
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
 
 S = 10**9
 NOW = 1_800_000_000 * S

@@ -1,7 +1,5 @@
 """How topics arrive: holes, from counters and stamps, across splits; which have stopped."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 

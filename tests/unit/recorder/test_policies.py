@@ -1,7 +1,5 @@
 """When a recording begins anew, and when a robot has fallen silent."""
 
-from __future__ import annotations
-
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S

@@ -1,7 +1,5 @@
 """What closed splits show of a topic, and when that takes a new recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

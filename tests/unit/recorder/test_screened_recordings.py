@@ -1,8 +1,6 @@
 """A recorder that screens what it records before it is served: sessions, handovers, the house."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
@@ -16,10 +14,6 @@ from tests.support.fakes import failing
 from tests.support.housekeepers import keeper_of, recording_now
 from tests.support.screened_bags import ScreenedBags, off, on, privacy, words
 from tests.support.simulated_recorders import assert_each_counts_once, rotating
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 

@@ -1,7 +1,5 @@
 """The bag files of a recording while it is being written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What the supervisor does and tells as time passes: no process runs, no second is waited for."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

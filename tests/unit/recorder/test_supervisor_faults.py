@@ -1,7 +1,5 @@
 """What the supervisor does when a recorder dies, the disk fails it, fills or is unmounted."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

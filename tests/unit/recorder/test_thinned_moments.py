@@ -1,7 +1,5 @@
 """Moments whose day is thinned: their bags have all messages, and answer alone."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Which messages of a topic stay of a day: what changes, what is seen, and enough of the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whether the clock is synchronised: asked of timedated, and of the kernel where there is none."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

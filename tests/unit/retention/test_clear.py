@@ -1,7 +1,5 @@
 """`clear_on_startup`: what is deleted, and what never is."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

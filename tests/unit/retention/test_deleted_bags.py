@@ -1,10 +1,9 @@
 """What retention deleted is known as deleted: it is not missing, nor was it never recorded."""
 
-from __future__ import annotations
-
 import errno
 import shutil
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -39,9 +38,6 @@ from tests.support.housekeepers import (
     size_of,
 )
 from tests.support.memories import asked, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 T0_S = T0 // S
 TRUE = {"topic": "/odom", "condition_type": "above", "value": 1e6, "field": "position.x"}

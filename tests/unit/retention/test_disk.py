@@ -1,7 +1,5 @@
 """The disk under the bag directory, and how it is known again."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,10 +1,10 @@
 """Bags that the recorder did not make are neither deleted, repaired nor counted in a limit."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import anyio
 import pytest
@@ -16,6 +16,7 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.status import memory_status
+from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
@@ -39,13 +40,6 @@ from tests.support.housekeepers import (
 )
 from tests.support.memories import memory_of
 from tests.support.simulated_recorders import events
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from ros2_memory.recorder.housekeeping import Housekeeping
-
 
 Capture = pytest.CaptureFixture[str]
 S = 10**9

@@ -1,9 +1,8 @@
 """What is kept outlives retention, and counts once."""
 
-from __future__ import annotations
-
 import shutil
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -12,6 +11,7 @@ from structlog.testing import capture_logs
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.model import Sample
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import odom, tf, transform, write_mcap
@@ -30,12 +30,6 @@ from tests.support.housekeepers import (
     size_of,
 )
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from ros2_memory.core.model import Sample
 
 
 class TestRetention:

@@ -1,7 +1,6 @@
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -23,7 +22,7 @@ from ros2_memory.retention.latched_carry import (
     MessageIdentity,
     worth_carrying,
 )
-from ros2_memory.storage.base import REPEATED_NS
+from ros2_memory.storage.base import REPEATED_NS, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
@@ -33,12 +32,6 @@ from tests.support.housekeepers import files_in, keeper_of
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 from tests.support.noting_reader import fail_reading
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from ros2_memory.storage.base import Record
 
 S = 10**9
 T0 = 1_790_000_000 * S

@@ -1,8 +1,6 @@
-from __future__ import annotations
-
 import zlib
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -16,9 +14,6 @@ from ros2_memory.retention.policy import (
     StoredFile,
     plan_deletions,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 S = 10**9
 HOUR = 3600 * S

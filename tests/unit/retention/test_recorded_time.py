@@ -1,9 +1,7 @@
 """How long was recorded after each recording, across restarts and full disks."""
 
-from __future__ import annotations
-
 import errno
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
@@ -13,9 +11,6 @@ from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.fakes import failing
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 T0_S = 1_790_000_000.0

@@ -1,9 +1,9 @@
-from __future__ import annotations
-
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
+from mcap.records import McapRecord
 
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.retention.repair import Repairer
@@ -15,13 +15,6 @@ from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import files_in
 from tests.unit.storage.mcap.test_writer import contents
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from mcap.records import McapRecord
-
 
 S = 10**9
 T0 = 1_790_000_000 * S

@@ -1,7 +1,5 @@
 """Age against clocks that step: what the pure plan deletes, over whole lives of a robot."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path

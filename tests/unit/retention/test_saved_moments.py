@@ -1,10 +1,9 @@
 """What is kept, over real files: by the keeper, through crashes, and past a wipe."""
 
-from __future__ import annotations
-
 import errno
 import os
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -15,6 +14,7 @@ from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
 )
+from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.saved_moments import (
     LONGEST_WAIT_NS,
@@ -40,12 +40,6 @@ from tests.support.housekeepers import (
     told_of,
 )
 from tests.support.simulated_recorders import events
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ros2_memory.recorder.housekeeping import Housekeeping
-
 
 # A file has one size.
 FILES = st.lists(st.integers(0, 8).map(lambda inode: (inode, 7 * inode)), max_size=12)

@@ -1,7 +1,5 @@
 """`retention.topics`: topics with a shorter life leave bags that stay."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 from collections.abc import Callable

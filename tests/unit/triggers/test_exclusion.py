@@ -1,8 +1,7 @@
 """When nothing recorded may stay, over what recordings heard alone."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,9 +17,6 @@ from ros2_memory.triggers.screening import (
     add_message,
     excluded_intervals,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 LAST = 40
 STALE = 3

@@ -1,11 +1,10 @@
 """When rules fire: over streams of messages alone, and over splits and rotations."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -17,9 +16,6 @@ from ros2_memory.bag_dir.state_files import RunRecord
 from tests.support.bags import Msg, boolean
 from tests.support.examples import examples
 from tests.support.watched_bags import SILENT, T0, S, WatchedBags, flag, rule
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 Stream = list[tuple[int, bool | None]]
 

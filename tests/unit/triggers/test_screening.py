@@ -1,10 +1,9 @@
 """Splits that are screened before they are served, with real files."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -18,6 +17,7 @@ from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.triggers.screening import ExclusionRule
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.examples import LONG
 from tests.support.fakes import failing
@@ -34,12 +34,6 @@ from tests.support.screened_bags import (
     word,
     words,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from ros2_memory.triggers.screening import ExclusionRule
 
 VOLATILE = McapLayout(latched=frozenset())
 

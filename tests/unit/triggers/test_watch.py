@@ -1,11 +1,10 @@
 """Rules over recordings as a recorder leaves them, with real files."""
 
-from __future__ import annotations
-
 import errno
 import os
+from collections.abc import Collection
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -14,15 +13,10 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import BagUnreachableError
+from ros2_memory.triggers.rules import Rule
 from tests.support.bags import McapLayout, Msg, boolean, text
 from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-    from pathlib import Path
-
-    from ros2_memory.triggers.rules import Rule
 
 LATCHED = McapLayout(latched=frozenset({"/bumper"}))
 

@@ -1,7 +1,5 @@
 """The command line of `ros2 bag record`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which setup file is taken, and what an RMW needs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

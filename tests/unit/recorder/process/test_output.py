@@ -1,7 +1,5 @@
 """What the recorder says, from the logs of the real one and from the texts of its sources."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

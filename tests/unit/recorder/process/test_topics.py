@@ -1,7 +1,5 @@
 """`topics.yaml`: what it may list, and the regular expression that comes of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
