@@ -165,6 +165,11 @@ def _reason(record: Record, error: Exception) -> str:
     return f"the payload does not fit the definition: {words}"
 
 
+def _format_of(path: Path) -> str:
+    """Returns the suffix of a bag's file, or of the file that is compressed there."""
+    return path.with_suffix("").suffix if path.suffix == COMPRESSED else path.suffix
+
+
 MUCH_DECODED_BYTES: Final = 1 << 20
 """A larger message counts as large: decoded it may take thirty times as much."""
 
@@ -206,7 +211,7 @@ class FileReader(BagReader):
 
     def reads(self, path: Path) -> bool:
         """Returns whether the name ends with one of the four suffixes."""
-        return path.name.endswith(BAG_KINDS) and path.name not in BAG_KINDS
+        return _format_of(path) in self._formats
 
     def closing(self, path: Path) -> Closing:
         """Checks closing magic for MCAP, journals beside a `.db3`, whole frames for `.zstd`."""
@@ -223,10 +228,9 @@ class FileReader(BagReader):
         """
         if not self.reads(path):
             raise UnreadableError(f"not of a kind that is read ({', '.join(BAG_KINDS)})")
-        is_compressed = path.suffix == COMPRESSED
-        bags = self._formats[path.with_suffix("").suffix if is_compressed else path.suffix]
+        bags = self._formats[_format_of(path)]
         sources = [path]
-        if is_compressed:
+        if path.suffix == COMPRESSED:
             fill = partial(unpack, path)
         elif isinstance(bags, SqliteBags) and journals_beside(path):
             sources += journals_beside(path)

@@ -70,7 +70,7 @@ SILENCE_NS: Final = 5 * NS_PER_S // 2
 """Between poses farther apart nothing is known: a standstill ends there."""
 SLOT_NS: Final = 2 * NS_PER_S // 5
 BLOCK_NS: Final = 5 * SLOT_NS
-BESIDE_NS: Final = 6 * NS_PER_S
+BESIDE_NS: Final = SHORTEST_NS + 3 * NS_PER_S
 """Poses so far beside a stretch of time decide what its blocks are: those of the block beside."""
 CREEP_NS: Final = 15 * BLOCK_NS
 """A robot that moves farther than `LARGEST_M` in this time creeps; a slower one drifts."""
