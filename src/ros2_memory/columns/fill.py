@@ -23,7 +23,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, Span, ms_from_ns
-from ros2_memory.index.scan import Stamp, settled
+from ros2_memory.index.scan import Stamp, settled, sidecar_ns_of
 from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
@@ -444,7 +444,7 @@ def _by_slot(bags: Iterable[BagFile], level: Level) -> list[list[BagFile]]:
 def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
     """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
     try:
-        stamp = Stamp.of(os.lstat(bag.path), _mtime_ns(bag.path.with_name(HANDOVER_FILE)))
+        stamp = Stamp.of(os.lstat(bag.path), _sidecar_ns(bag.path.with_name(HANDOVER_FILE)))
     except OSError:
         return False
     return (
@@ -455,8 +455,8 @@ def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
     )
 
 
-def _mtime_ns(path: Path) -> Ns:
+def _sidecar_ns(path: Path) -> Ns:
     try:
-        return os.lstat(path).st_mtime_ns
+        return sidecar_ns_of(os.lstat(path))
     except OSError:
         return 0

@@ -69,8 +69,12 @@ def ns_from_unix(seconds: float) -> Ns:
     if not math.isfinite(seconds):
         raise ValueError(f"{seconds} is not a finite number of seconds")
     whole = math.floor(seconds)
-    ns = whole * NS_PER_S + round((seconds - whole) * NS_PER_S)
-    return min(max(ns, MIN_NS), MAX_NS)
+    return limited(whole * NS_PER_S + round((seconds - whole) * NS_PER_S))
+
+
+def limited(time: Ns) -> Ns:
+    """Returns the nearest time of 64 bits: a file may be dated after 2262."""
+    return min(max(time, MIN_NS), MAX_NS)
 
 
 def unix_from_ns(ns: Ns) -> float:

@@ -24,7 +24,7 @@ from ros2_memory.bag_dir.layout import (
     bag_kind,
 )
 from ros2_memory.core.model import SetAside
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, limited
 from ros2_memory.index.recordings import paths_named
 
 if TYPE_CHECKING:
@@ -70,14 +70,18 @@ class Stamp(NamedTuple):
     @classmethod
     def of(cls, status: os.stat_result, sidecar_ns: Ns = 0) -> Stamp:
         """Returns the stamp of a stat result."""
-        return cls(
-            status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, sidecar_ns
-        )
+        times = limited(status.st_mtime_ns), limited(status.st_ctime_ns)
+        return cls(status.st_size, *times, status.st_ino, sidecar_ns)
 
     @property
     def content(self) -> tuple[int, Ns, Ns]:
         """What changes when other messages count: size, mtime and mtime of the sidecar."""
         return self.size, self.mtime_ns, self.sidecar_ns
+
+
+def sidecar_ns_of(status: os.stat_result) -> Ns:
+    """Returns the `sidecar_ns` of stamps beside a `handover.json`; a link is as good as none."""
+    return 0 if stat.S_ISLNK(status.st_mode) else limited(status.st_mtime_ns)
 
 
 _UNSEEN: Final = Stamp(-1, 0, 0, 0)
@@ -174,7 +178,7 @@ class _Folder:
         except OSError:
             self.trusted = False
             return
-        self.sidecar_ns = 0 if stat.S_ISLNK(status.st_mode) else status.st_mtime_ns
+        self.sidecar_ns = sidecar_ns_of(status)
 
     def enter(
         self, entry: os.DirEntry[str], stamps: dict[str, Stamp], before: Mapping[str, Stamp]

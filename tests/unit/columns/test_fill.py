@@ -309,3 +309,9 @@ def test_a_handover_has_only_those_bags_stored_again_that_it_changes(
         assert len(world.stored()) == 4
         assert check_all(world) > 0
         world.store.close()
+
+
+def test_beside_a_link_in_place_of_a_handover_bags_are_stored(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, 0)
+    (path.parent / HANDOVER_FILE).symlink_to(path)
+    assert World.of(tmp_path).fill() == 1

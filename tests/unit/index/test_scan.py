@@ -166,3 +166,15 @@ def test_another_bag_written_over_one_of_its_size_and_mtime_is_read_anew(
     assert path.stat()[:7] == before[:7]
     memory.index.refresh()
     assert driven() == 1.8
+
+
+@each_way
+@pytest.mark.parametrize("dated", ["rec_1.mcap", "handover.json"])
+def test_a_file_dated_after_2262_hides_no_bag(tmp_path: Path, recalls: bool, dated: str) -> None:
+    paths = [tmp_path / "rec" / f"rec_{number}.mcap" for number in range(2)]
+    for path in paths:
+        write_odometry(path, 0.1, later=int(path == paths[1]) * 10 * S)
+    _file(tmp_path / "rec" / "handover.json", '{"format": 1}')
+    os.utime(tmp_path / "rec" / dated, ns=(LONG_AGO, 10_413_792_000 * S))
+    [odometry] = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "list_recorded_topics")
+    assert odometry["count"] == 20

@@ -106,6 +106,12 @@ class TestRetention:
         keeper_of(bags, max_bytes=total).apply()
         assert first.exists()
 
+    def test_a_bag_dated_after_2262_stops_no_deletion(self, tmp_path: Path) -> None:
+        first, second, _ = recording(tmp_path, "a", 0)
+        os.utime(second, ns=(T0, 10_413_792_000 * S))
+        keeper_of(tmp_path, max_bytes=size_of(tmp_path) - 1).apply()
+        assert not first.exists()
+
     def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
         self, tmp_path: Path
     ) -> None:
