@@ -137,7 +137,7 @@ class _Folder:
     folders: list[str] = field(default_factory=list)
     names: str = ""
     rows: NDArray[np.void] = field(default_factory=lambda: np.empty(0, _ROW))
-    linked: frozenset[int] = frozenset()
+    linked: set[int] = field(default_factory=set)
     newer: dict[str, Stamp] = field(default_factory=dict)
     links: list[Path] = field(default_factory=list)
     odd: list[SetAside] = field(default_factory=list)
@@ -218,7 +218,7 @@ class _Folder:
         else:
             stamps[entry.path] = Stamp.of(status, self.sidecar_ns)
             if status.st_nlink > 1:
-                self.linked |= {status.st_ino}
+                self.linked.add(status.st_ino)
 
 
 class Tree:
