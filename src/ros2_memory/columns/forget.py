@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.database import PRAGMAS, is_busy
 from ros2_memory.columns.pack import FORMAT
-from ros2_memory.columns.writing import delete_bags
+from ros2_memory.columns.writing import UNUSED_SUMMARIES, delete_bags
 from ros2_memory.core.errors import BagError
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def _delete_unused(base: sqlite3.Connection) -> None:
     base.execute("DELETE FROM listing")
     base.execute("DELETE FROM topic WHERE id NOT IN (SELECT topic FROM part)")
     base.execute("DELETE FROM definition WHERE id NOT IN (SELECT definition FROM topic)")
-    base.execute("DELETE FROM summary WHERE id NOT IN (SELECT summary FROM bag)")
+    base.execute(UNUSED_SUMMARIES)
 
 
 def _executed(base: sqlite3.Connection, statement: str) -> bool:

@@ -29,6 +29,7 @@ from ros2_memory.columns.pack import Packed
 from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.writing import (
     BELOW,
+    UNUSED_SUMMARIES,
     Layouts,
     Level,
     LongBag,
@@ -566,8 +567,14 @@ class ColumnStore(Database):
         return not shares or self.write(write)
 
     def delete(self, paths: Sequence[str]) -> bool:
-        """Deletes bags, and the parts that have rows of none that is left."""
-        return self.write(partial(delete_bags, paths=paths))
+        """Deletes bags, and the parts and summaries that are of none that is left."""
+
+        def write(connection: sqlite3.Connection) -> None:
+            delete_bags(connection, paths)
+            # Those that state pauses are of one bag alone.
+            connection.execute(UNUSED_SUMMARIES)
+
+        return self.write(write)
 
     def merged_bytes(self) -> tuple[int, int]:
         """Returns the bytes of the bags that are in whole parts, and those of their columns."""

@@ -70,6 +70,7 @@ ZONE_ALONE: Final = "zone"
 """The codec of a column of which there is never more than the zone."""
 DROPPED: Final = "dropped"
 """The codec of a column of which only the zone is stored: the rest is beyond the bags' share."""
+UNUSED_SUMMARIES: Final = "DELETE FROM summary WHERE id NOT IN (SELECT summary FROM bag)"
 ALWAYS: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
 
 
@@ -278,8 +279,14 @@ def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> bool
     )
     connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (listed, part))
     # Who knows the part looks again.
-    connection.execute("INSERT INTO deletion DEFAULT VALUES")
+    _number_deletion(connection)
     return True
+
+
+def _number_deletion(connection: sqlite3.Connection) -> None:
+    """Gives the newest deletion the next number; the table has no other."""
+    connection.execute("DELETE FROM deletion")
+    connection.execute("INSERT INTO deletion DEFAULT VALUES")
 
 
 def _by_hour(table: Table) -> Iterator[Table]:
@@ -488,4 +495,4 @@ def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
     connection.execute("DELETE FROM fragment_part WHERE fragment NOT IN (SELECT id FROM fragment)")
     connection.executemany("DELETE FROM part_column WHERE part = ?", numbers)
     connection.executemany("DELETE FROM part WHERE id = ?", numbers)
-    connection.execute("INSERT INTO deletion DEFAULT VALUES")
+    _number_deletion(connection)

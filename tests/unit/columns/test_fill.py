@@ -145,6 +145,19 @@ def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(tmp_path:
     assert times(again, "/odom") == times(again.unstored(), "/odom")
 
 
+def test_with_a_bag_goes_all_that_it_had_alone(tmp_path: Path) -> None:
+    paths = [write_bag(tmp_path, number) for number in range(3)]
+    write_mcap(paths[2], [text(T0 + 120 * S, "word", "/other")])
+    os.utime(paths[2], ns=(T0, T0))
+    world = World.of(tmp_path)
+    world.fill()
+    assert count(world, "summary") == 2
+    for path in paths[1:]:
+        path.unlink()
+        world.prune()
+    assert (count(world, "bag"), count(world, "summary"), count(world, "deletion")) == (1, 1, 1)
+
+
 def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     write_bag(bag_dir, 0, rows=900)
