@@ -476,9 +476,9 @@ def _back_up(source: Path, temporary: Path) -> bool:
     """Copies a database to a temporary file; returns False if it is of another version."""
     temporary.unlink(missing_ok=True)
     _refuse_links(source)
-    # Without a log no program has it open; immutable: SQLite creates no file beside it.
-    mode = "mode=ro" if files_of(source)[1].exists() else "mode=ro&immutable=1"
-    address = f"{source.absolute().as_uri()}?{mode}"
+    # Without a log no program has it open. Either way SQLite writes no file beside it.
+    mode = "readonly_shm=1" if files_of(source)[1].exists() else "immutable=1"
+    address = f"{source.absolute().as_uri()}?mode=ro&{mode}"
     with (
         closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
         closing(sqlite3.connect(temporary)) as copy,

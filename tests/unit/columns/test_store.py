@@ -2,16 +2,18 @@
 
 import hashlib
 import os
+import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from ros2_memory.columns.pack import FORMAT, decompressed
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.store import ColumnStore
+from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.units import GoneError
 from tests.support.bags import (
     battery,
@@ -196,6 +198,20 @@ def test_where_the_folder_cannot_be_written_the_next_one_is_used_or_memory(tmp_p
     assert in_memory.fill() == 4
     assert check_all(in_memory) == 4 * 24
     assert len(in_memory.stored()) == 4
+
+
+@pytest.mark.parametrize(("lost", "taken"), [("", 4), ("*-shm", 0)], ids=["whole", "no index"])
+def test_where_a_store_is_copied_from_nothing_changes(
+    world: World, tmp_path: Path, lost: str, taken: int
+) -> None:
+    """Also where its program was killed, so that its write-ahead log is there still."""
+    assert world.store.path is not None
+    folder = tmp_path / "strangers"
+    shutil.copytree(world.store.path.parent, folder, ignore=shutil.ignore_patterns(lost))
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    store = ColumnStore([tmp_path / "cache" / FILE], Mock(), sources=[folder / FILE])
+    assert len(store.paths()) == taken
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
 def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(
