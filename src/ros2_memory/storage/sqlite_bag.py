@@ -88,6 +88,8 @@ _DEFINITIONS: Final = """
     SELECT topic_type, encoding, substr(encoded_message_definition, 1, ?)
     FROM message_definitions LIMIT ?
 """
+_TEXT: Final = partial(str, encoding="utf-8", errors="replace")
+"""A name that is not UTF-8 must not hide the others."""
 _PAYLOAD: Final = "SELECT data, timestamp, topic_id FROM messages WHERE rowid = ?"
 
 
@@ -235,8 +237,7 @@ class SqliteBags:
             # SQLite opens by name, and has by now: it must be the file that was opened above.
             if path.lstat().st_ino != key.inode:
                 raise UnreadableError("it was replaced while it was being opened")
-            # A name that is not UTF-8 must not hide the others.
-            base.text_factory = partial(str, encoding="utf-8", errors="replace")
+            base.text_factory = _TEXT
             guard(base, self._limit.max_bytes, file_bytes)
             topics = self._known.get(key)
             if topics is None:
@@ -406,6 +407,7 @@ def require_short_texts(base: sqlite3.Connection, table: str, columns: Sequence[
 _MORE_WORK: Final = 8
 """`VACUUM` and the comparison go through a file so many times more often than a reader."""
 _TRIGGERS: Final = "SELECT count(*) FROM sqlite_master WHERE type = 'trigger'"
+_GOING: Final = "FROM messages NOT INDEXED WHERE goes(topic_id, timestamp)"
 _HAS_METADATA: Final = (
     "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = 'metadata'"
 )
@@ -429,7 +431,7 @@ def cut_sqlite(
     Raises:
         UnreadableError: the source has a journal or is no plain bag, or the target is not right.
     """
-    if any(source.with_name(source.name + suffix).exists() for suffix in JOURNALS):
+    if journals_beside(source):
         raise UnreadableError("its writer did not finish it: a journal lies beside it")
     with os.fdopen(open_regular(source), "rb") as original:
         shutil.copyfileobj(original, stream)
@@ -441,21 +443,25 @@ def cut_sqlite(
         require_plain_tables(base)
         if base.execute(_TRIGGERS).fetchone()[0]:
             raise UnreadableError("not a rosbag2 file: it has triggers")
-        # No journal may lie beside the file: it would hold what is deleted.
+        # Beside the file a journal would hold what is deleted, and in memory all of the file. Who
+        # made the file deletes it after a failure.
         base.execute("PRAGMA journal_mode = DELETE")
-        base.execute("PRAGMA journal_mode = MEMORY")
+        base.execute("PRAGMA journal_mode = OFF")
         base.execute("PRAGMA secure_delete = ON")
         require_short_texts(base, "topics", ("name",))
+        base.text_factory = _TEXT
         topics = dict(base.execute("SELECT id, name FROM topics").fetchall())
-        going: list[tuple[int]] = []
-        for row, number, at in base.execute("SELECT rowid, topic_id, timestamp FROM messages"):
+
+        def goes(number: int, at: Ns) -> bool:
             topic = topics.get(number)
-            if topic is not None and takes(str(topic), at, at):
-                taken[str(topic)] += 1
-                going.append((row,))
-        before = _digest(base, without={row for (row,) in going})
+            return topic is not None and takes(str(topic), at, at)
+
+        base.create_function("goes", 2, goes)
+        for number, count in base.execute(f"SELECT topic_id, count(*) {_GOING} GROUP BY topic_id"):
+            taken[str(topics[number])] += count
+        before = _digest(base, "WHERE NOT goes(topic_id, timestamp)")
         base.execute("BEGIN")
-        base.executemany("DELETE FROM messages WHERE rowid = ?", going)
+        base.execute(f"DELETE {_GOING}")
         if base.execute(_HAS_METADATA).fetchone()[0]:
             base.execute("DELETE FROM metadata")
         base.execute("COMMIT")
@@ -467,13 +473,12 @@ def cut_sqlite(
     return taken
 
 
-def _digest(base: sqlite3.Connection, without: Collection[int] = ()) -> bytes:
-    """Returns a digest of all messages but these rows, in order."""
+def _digest(base: sqlite3.Connection, where: str = "") -> bytes:
+    """Returns a digest of all messages, or of those of a condition, in order."""
     digest = hashlib.blake2b()
-    rows = base.execute("SELECT rowid, * FROM messages ORDER BY rowid")
-    for row in rows:
-        if row[0] not in without:
-            *numbers, payload = row
-            digest.update(repr(numbers).encode())
-            digest.update(payload if isinstance(payload, bytes) else repr(payload).encode())
+    for *numbers, payload in base.execute(
+        f"SELECT rowid, * FROM messages {where} ORDER BY rowid"  # noqa: S608
+    ):
+        digest.update(repr(numbers).encode())
+        digest.update(payload if isinstance(payload, bytes) else repr(payload).encode())
     return digest.digest()

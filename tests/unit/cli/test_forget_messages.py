@@ -339,6 +339,28 @@ def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
     assert f"{SAID} 0 3".encode() in path.read_bytes()
 
 
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "PRAGMA journal_mode = WAL",  # who reads such a file leaves an empty log beside it
+        "UPDATE topics SET name = CAST(x'ff' AS TEXT) WHERE name = '/mic'",
+    ],
+    ids=["empty log", "name of other bytes"],
+)
+def test_sqlite_bags_that_are_read_are_written_anew(bag_dir: Path, statement: str) -> None:
+    path = write_db3(bag_dir / "rec_s" / "rec_s_0.db3", messages(0))
+    with closing(sqlite3.connect(path)) as base:
+        base.execute(statement)
+        base.commit()
+    with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as base:
+        base.execute("SELECT id FROM topics").fetchall()
+    left(path)
+    own_all(bag_dir)
+    assert forget(0, 100, f"--topic {CAMERA} storage=rosbag2") == 0
+    assert SAID.encode() not in path.read_bytes()
+    assert b"hum 9" in path.read_bytes()
+
+
 def test_the_time_in_a_place_goes_with_a_second_on_either_side(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:

@@ -3,6 +3,8 @@
 import random
 import sqlite3
 import struct
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -48,6 +50,19 @@ MB = 1 << 20
 TOO_LONG = "a" * MAX_NAMES_CHARS
 EVERYTHING = TimeWindow.everything()
 STRINGS = [schema(1, "std_msgs/msg/String", "ros2msg", b"string data\n"), channel(1, 1, "/chatter")]
+
+CUTTING = """\
+import sys
+from pathlib import Path
+from ros2_memory.storage.mcap.writer import McapWriter
+
+def peak_kb():
+    return int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])
+
+before = peak_kb()
+taken = McapWriter().cut(*map(Path, sys.argv[1:]), lambda _topic, time, _: time % 2 == 0)
+print(taken.total(), peak_kb() - before)
+"""
 
 
 def string_message(name: str = "x", time: int = 5) -> Piece:
@@ -364,3 +379,19 @@ def test_what_works_longer_than_the_size_explains_is_interrupted() -> None:
         )
         with pytest.raises(sqlite3.OperationalError, match="interrupted"):
             base.execute(endless)
+
+
+def test_cutting_a_file_does_not_take_memory_as_large_as_the_file(tmp_path: Path) -> None:
+    path = write_db3(tmp_path / "a.db3", [text(1, "x")])
+    with closing(sqlite3.connect(path)) as base:
+        base.execute(
+            "WITH RECURSIVE every (time) AS (SELECT 2 UNION ALL SELECT time + 1 FROM every LIMIT ?)"
+            " INSERT INTO messages (topic_id, timestamp, data)"
+            " SELECT 1, time, zeroblob(1000) FROM every",
+            (40_000,),
+        )
+        base.commit()
+    program = [sys.executable, "-c", CUTTING, str(path), str(tmp_path / "b.db3")]
+    taken, grown_kb = map(int, subprocess.check_output(program).split())
+    assert taken == 20_000
+    assert grown_kb << 10 < path.stat().st_size // 4
