@@ -15,7 +15,14 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Channel, Record, Rewritten, Schema
-from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
+from ros2_memory.storage.errors import (
+    MAX_CHUNK_MB,
+    MAX_CHUNKS,
+    UnreadableError,
+    max_decompressed_bytes,
+    reading,
+    reason_of,
+)
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.mcap.records import is_finished
@@ -30,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.timebase import Ns
 
-_DENSE_CHUNK_BYTES: Final = 512 << 10
+_LARGEST_CHUNK_BYTES: Final = 512 << 10
 CHUNK_BYTES: Final = 64 << 10
 """Small, since a reader decompresses a whole chunk for one message."""
 LIBRARY: Final = "ros2-memory"
@@ -84,7 +91,7 @@ class McapWriter(BagWriter):
         with _written(target) as stream:
             with reading(source), OpenFile(source) as file:
                 salvage = Salvage(file, self._max_chunk_mb << 20)
-                copy = _Copy(_writer(stream))
+                copy = _Copy(_writer(stream, file.size))
                 digest = ContentDigest()
                 for record in salvage.records():
                     if digest.add(record):
@@ -110,7 +117,7 @@ class McapWriter(BagWriter):
                 if not is_finished(file):
                     raise UnreadableError("its writer did not finish it")
                 salvage = Salvage(file, self._max_chunk_mb << 20)
-                copy, digest = _Copy(_writer(stream)), ContentDigest()
+                copy, digest = _Copy(_writer(stream, file.size)), ContentDigest()
                 for record in _without(salvage, takes, taken):
                     if is_of_rosbag2(record):
                         continue
@@ -228,11 +235,13 @@ def _exported(channel: Channel) -> Schema:
     return replace(schema, name=full_name(schema.name))
 
 
-def _writer(stream: IO[bytes], *, dense: bool = False) -> Writer:
+def _writer(stream: IO[bytes], source_bytes: int = 0, *, dense: bool = False) -> Writer:
     if not dense:
-        return Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
+        # Of a large source larger ones: of a file no more chunks than `MAX_CHUNKS` are read.
+        chunk_bytes = max(CHUNK_BYTES, max_decompressed_bytes(source_bytes) // MAX_CHUNKS)
+        return Writer(stream, min(chunk_bytes, _LARGEST_CHUNK_BYTES), CompressionType.ZSTD)
     indexes = IndexType.ALL & ~IndexType.MESSAGE
-    return Writer(stream, _DENSE_CHUNK_BYTES, CompressionType.ZSTD, indexes)
+    return Writer(stream, _LARGEST_CHUNK_BYTES, CompressionType.ZSTD, indexes)
 
 
 @contextmanager

@@ -142,3 +142,15 @@ def test_a_disk_that_takes_no_more_is_reported_and_nothing_is_left(tmp_path: Pat
     with files_limited_to(500_000), pytest.raises(BagError, match="cannot be written: File"):
         McapWriter().write(tmp_path / "b.mcap", records)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_copy_has_no_more_chunks_than_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("chunk", "index", "writer"):
+        monkeypatch.setattr(f"ros2_memory.storage.mcap.{module}.MAX_CHUNKS", 20)
+    lines = [text(T0 + n * S, "x" * 50_000) for n in range(60)]
+    source = write_mcap(tmp_path / "a.mcap", lines)
+    assert McapWriter().rewrite(source, tmp_path / "b.mcap").messages == 60
+    assert not McapWriter().cut(source, tmp_path / "c.mcap", lambda *_: False)
+    assert contents(tmp_path / "b.mcap") == contents(tmp_path / "c.mcap") == contents(source)
