@@ -174,6 +174,7 @@ class BagDirReader(BagReader):
 
         Raises:
             BagVanishedError: a folder of the path does not exist.
+            BagUnreachableError: the disk does not tell.
             BagError: the path leads out of the directory.
         """
         if self.bag_dir is None:
@@ -186,8 +187,11 @@ class BagDirReader(BagReader):
             folder += name
             try:
                 mode = os.lstat(folder).st_mode
-            except OSError as error:
+            except (FileNotFoundError, NotADirectoryError) as error:
                 raise BagVanishedError(text, "the file is not there any more") from error
+            except OSError as error:
+                reason = f"it cannot be opened or read: {error.strerror or error}"
+                raise BagUnreachableError(text, reason) from error
             if stat.S_ISLNK(mode):
                 raise BagError(text, LINK_NOT_FOLLOWED)
             folder += os.sep

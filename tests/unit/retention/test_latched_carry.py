@@ -1,6 +1,9 @@
+import errno
+import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -8,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import queries
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -244,6 +248,26 @@ class TestTheBagOfCarriedMessages:
         now.at = 86_400 * S
         keeper.apply()
         assert not (tmp_path / "rec" / "rec_0.mcap").exists()
+
+    def test_a_bag_stays_while_the_disk_does_not_tell_of_its_folder(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        at_home(tmp_path)
+        reader, lstat = BagDirReader(McapReader(), tmp_path), os.lstat
+        keeper = keeper_of(tmp_path, measure_free=lambda _: 0, reader=reader)
+        keeper.apply()
+
+        def failing_there(path: Any, **how: Any) -> os.stat_result:
+            if path == str(tmp_path / "rec"):
+                raise OSError(errno.EIO, "Input/output error", path)
+            return lstat(path, **how)
+
+        with monkeypatch.context() as disk:
+            disk.setattr(os, "lstat", failing_there)
+            keeper.make_room(1)
+        assert (tmp_path / "rec" / "rec_0.mcap").exists()
+        keeper.make_room(1)
+        assert carried_at(tmp_path) == [T0]
 
     def test_what_lies_behind_a_damaged_part_of_a_bag_is_carried(self, tmp_path: Path) -> None:
         recording(tmp_path, "rec", (), drive_in(1))
