@@ -1,3 +1,4 @@
+import os
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from ros2_memory.bootstrap import (
 )
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import ConfigError
-from tests.support.robot_run import ANSWERED, ask
+from tests.support.robot_run import ANSWERED, T0_S, ask, write_run
 
 
 def settings(bag_dir: Path, *overrides: str) -> Settings:
@@ -62,3 +63,32 @@ async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:
                 assert reply == []
             elif name not in {"data_time_range", "memory_status"}:
                 assert reply["reason"] == "empty_memory", (name, reply)
+
+
+@pytest.mark.parametrize("lost", ["from the start", "after a look", "the recorder's files"])
+async def test_where_the_disk_does_not_tell_no_question_is_an_internal_error(
+    tmp_path: Path, lost: str
+) -> None:
+    """As at a mount whose robot is gone. Here a link leads to a name that is too long."""
+    write_run(tmp_path / "run")
+    for path in (tmp_path / "run").rglob("*.mcap"):
+        os.utime(path, (T0_S - 3600, T0_S - 3600))  # nobody writes it any more
+    bag_dir = tmp_path / "bags"
+    bag_dir.symlink_to(tmp_path / "run")
+    chosen = settings(bag_dir, "recorder=none", "data.now=latest", "reader.index_refresh_s=1000")
+    memory = build_memory(chosen)
+    if lost == "after a look":
+        memory.index.snapshot()
+    out_of_reach = bag_dir
+    if lost == "the recorder's files":
+        out_of_reach = tmp_path / "run" / ".episodic"
+    out_of_reach.unlink(missing_ok=True)
+    out_of_reach.symlink_to("x" * 300)
+    async with Client(build_server(chosen, memory)) as client:
+        for name, given, _ in ANSWERED:
+            reply, _ = await ask(client, name, given)
+            assert "internal" not in str(reply), (name, reply)
+    filler = build_backfill(chosen, memory)
+    for batch in filler.batches():
+        filler.store(batch)
+    filler.prune()

@@ -316,7 +316,9 @@ class Database:
     # The methods below run under the lock, except `_move_to_preferred_path`.
 
     def _may_open(self) -> bool:
-        return not self._closed and (self._waits_for is None or self._waits_for.is_dir())
+        # `Path.is_dir` raises where the disk does not tell.
+        is_there = self._waits_for is None or os.path.isdir(self._waits_for)  # noqa: PTH112
+        return not self._closed and is_there
 
     def _ready(self) -> OpenDatabase | None:
         """Returns the open database, opening one first if need be; None where it may not."""

@@ -445,14 +445,14 @@ def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
     """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
     try:
         stamp = Stamp.of(os.lstat(bag.path), _sidecar_ns(bag.path.with_name(HANDOVER_FILE)))
+        return (
+            stamp.content == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+            and settled(stamp.mtime_ns, now)
+            and settled(stamp.sidecar_ns, now)
+            and not (bag_dir / ERASING_FILE).exists()
+        )
     except OSError:
         return False
-    return (
-        stamp.content == (bag.size, bag.mtime_ns, bag.sidecar_ns)
-        and settled(stamp.mtime_ns, now)
-        and settled(stamp.sidecar_ns, now)
-        and not (bag_dir / ERASING_FILE).exists()
-    )
 
 
 def _sidecar_ns(path: Path) -> Ns:

@@ -20,6 +20,7 @@ The first few of each kind are named, and the others counted:
 
 from __future__ import annotations
 
+import os
 from collections import Counter, defaultdict
 from itertools import chain
 from typing import TYPE_CHECKING, Final
@@ -101,7 +102,8 @@ def note_unread(
     if nothing or search:
         view.notes.add(*describe_thinned(view.snapshot, window))
     bag_dir = view.bag_dir
-    if (bag_dir / OWN_FOLDER).is_dir():
+    # `Path.is_dir` raises where the disk does not tell.
+    if os.path.isdir(bag_dir / OWN_FOLDER):  # noqa: PTH112
         view.notes.add(
             *describe_deleted(view, window),
             *(f"{of}{sentence}" for sentence in describe_lost(bag_dir, window)),
