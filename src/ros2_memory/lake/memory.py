@@ -158,7 +158,11 @@ class LakeIndex:
             RefusedError: the lake cannot be read.
         """
         current = self._snapshot
-        if current is None or self.clock.now() - current.scanned_at > self.refresh_s * 1e9:
+        # A clock that was set back says nothing about its age.
+        if (
+            current is None
+            or not 0 <= self.clock.now() - current.scanned_at <= self.refresh_s * 1e9
+        ):
             current = self.refresh()
         if reach is None or current.older is None or reach > current.older:
             return current
@@ -221,7 +225,8 @@ class LakeIndex:
         """Returns the bags of some days by path; those that are known keep path and object."""
         files = chain.from_iterable(made_of.values())
         rows = self.lake.rows("bags", files, _BAGS).sort_by(_IN_ORDER)
-        owners = {path: bag.bag_id for path, bag in known.items()}
+        windows = self._windows.values()
+        owners = {path: bag.bag_id for each in windows for path, bag in each.bags.items()}
         schemas: dict[str, SummarySchema] = {}
         together, day = dict[str, int](), date.min
         bags: dict[str, LakeBag] = {}

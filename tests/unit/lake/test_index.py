@@ -18,13 +18,13 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.lake.engine import Lake
-from ros2_memory.lake.memory import newest
+from ros2_memory.lake.memory import LakeIndex, newest
 from ros2_memory.lake.tables import day_of
 from ros2_memory.lake.warehouse import Days, LakeFile
 from ros2_memory.queries import find_last_match
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
-from tests.support.clocks import FixedClock
+from tests.support.clocks import FixedClock, SettableClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
 from tests.support.lakes import lake_in, lake_robot, lake_robots, robot_bags, ship
 
@@ -171,6 +171,28 @@ def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:
     for bag in bags:
         [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
         assert record.log_time == bag.start
+
+
+def test_a_bag_of_older_days_that_shares_a_name_with_a_newer_one_is_searched(
+    shipping: Shipping,
+) -> None:
+    for ago, label in ((4, "mug"), (2, "fork"), (0, "cup")):
+        shipping.ship([START_S - ago * DAY_S], label, name="rec_0")
+    robot = Robot("hall", Path("/hall"), shipping.robot(days=1, most_bags=1), in_lake=True)
+    for label, ago in (("cup", 0), ("fork", 2), ("mug", 4)):
+        found = asked(robot, "find_last_match", label)
+        assert [row["timestamp"] for row in found["matches"]] == [START_S - ago * DAY_S]
+
+
+def test_after_a_clock_was_set_back_what_is_shipped_is_found(shipping: Shipping) -> None:
+    clock = SettableClock(NOW)
+    index = LakeIndex(shipping.lake, "hall", Path("/hall"), clock)
+    shipping.ship([START_S])
+    assert len(index.snapshot().bags) == 1
+    clock.at -= 3600 * NS_PER_S
+    shipping.ship([START_S + 60])
+    shipping.lake.refresh(0)
+    assert len(index.snapshot().bags) == 2
 
 
 FIRST = date(2024, 2, 27)
