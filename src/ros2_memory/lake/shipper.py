@@ -12,7 +12,7 @@ import os
 import threading
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
-from functools import partial
+from functools import cache, partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -303,7 +303,8 @@ class RobotBags:
         """
         if self.filling is None or not times:
             return []
-        if not (self.answers(PATIENCE_S) and self.bag_dir.is_dir()):
+        # `Path.is_dir` raises where the disk does not tell.
+        if not (self.answers(PATIENCE_S) and os.path.isdir(self.bag_dir)):  # noqa: PTH112
             do = "delete the cache folder of ros2-memory, which may have columns of it"
             return [f"{self.name}: {self.bag_dir} is not there: {do}"]
         try:
@@ -340,6 +341,7 @@ class RobotBags:
     ) -> Iterator[_BagToShip]:
         """Yields those of some bags that are to be shipped; the others are confirmed at the end."""
         by_file = {shipped.file: shipped for shipped in self.known.values()}
+        receipts = cache(partial(read_receipts, self.bag_dir))
         ids, confirmed = set[str](), list[ShippedBag]()
         copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
         # A saved moment's copy of a bag counts where the bag itself is gone.
@@ -358,16 +360,18 @@ class RobotBags:
                     done.problems.append(f"{self.name}: {why}")
                     continue
                 ids.add(bag_id)
+                same_file = by_file.get(self.name_of(bag))
+                if same_file is not None and _is_cut(same_file, bag, receipts):
+                    continue
                 shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
             except (EpisodicError, OSError, ValueError) as error:
-                done.problems.append(f"{self.name}: {error}")
+                problem = f"{self.name}: {error}"
+                if problem not in done.problems:  # once where receipts cannot be read
+                    done.problems.append(problem)
                 continue
             # The rows of a copy are the same, which has another path and mtime.
             if before and before == shipped._replace(mtime_ns=before.mtime_ns, file=before.file):
                 confirmed.append(shipped)
-                continue
-            same_file = by_file.get(shipped.file)
-            if same_file is not None and self._is_cut(same_file, bag):
                 continue
             replaced = {before} if before is not None else set()
             # As where its first messages were deleted by request: what is left lies within it.
@@ -496,16 +500,6 @@ class RobotBags:
         day = day_of(bag.start)
         return ShippedBag(self.name, bag_id, day, *file_columns, made_of, bag.start, bag.end)
 
-    def _is_cut(self, before: ShippedBag, bag: BagFile) -> bool:
-        """Returns whether only retention took messages out of a bag after it was shipped.
-
-        The lake keeps those, as it keeps the bags that retention deletes.
-        """
-        if before.size == bag.size:
-            return False
-        receipt = read_receipts(self.bag_dir).get(before.file)
-        return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
-
     def confirm(self, bags: Sequence[ShippedBag], shipper: Shipper, done: Shipped) -> None:
         """Notes that bags are in the lake; writes receipts for the robot's recorder, if any."""
         self.known |= {bag.bag_id: bag for bag in bags}
@@ -525,6 +519,19 @@ class RobotBags:
         except OSError as error:
             what = f"no receipts can be written into {self.bag_dir} ({error.strerror or error})"
             done.problems.append(f"{self.name}: {what}: its recorder cannot wait for shipping")
+
+
+def _is_cut(
+    before: ShippedBag, bag: BagFile, receipts: Callable[[], Mapping[str, Receipt]]
+) -> bool:
+    """Returns whether only retention took messages out of a bag after it was shipped.
+
+    The lake keeps those, as it keeps the bags that retention deletes.
+    """
+    if before.size == bag.size:
+        return False
+    receipt = receipts().get(before.file)
+    return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
 
 
 def _are_made_together(bags: Sequence[_BagToShip], most: int) -> bool:

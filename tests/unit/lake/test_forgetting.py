@@ -192,6 +192,9 @@ def test_columns_that_cannot_be_forgotten_are_named(tmp_path: Path) -> None:
     (tmp_path / "hall").rmdir()
     [problem] = robot.forget([TimeWindow(0, 1)])
     assert "is not there: delete the cache folder" in problem
+    # As a mount whose robot is gone: to look for it is an error.
+    (tmp_path / "hall").symlink_to("x" * 300)
+    assert robot.forget([TimeWindow(0, 1)]) == [problem]
 
 
 def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_comes_again(

@@ -7,18 +7,20 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.manifest import ManifestEntry
 from pyiceberg.table.update.snapshot import _OverwriteFiles
 
+from ros2_memory.bag_dir.layout import SHIPPED_FILE
 from ros2_memory.bag_dir.state_files import append_receipts, read_receipts
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.store import FILE
 from ros2_memory.columns.units import GoneError
 from ros2_memory.lake import shipper as shipper_module
-from ros2_memory.lake.rows import RowMaker
+from ros2_memory.lake.rows import RowMaker, sha256_of
 from ros2_memory.lake.tables import TABLES
 from tests.support.clocks import FixedClock
 from tests.support.fleets import START_S
@@ -168,6 +170,35 @@ def test_a_bag_that_retention_cut_keeps_its_rows(tmp_path: Path, first: int) -> 
     append_receipts(tmp_path / "hall", [replace(receipt, size=bag.stat().st_size)])
     assert ship_from(tmp_path).bags == 0
     assert values(tmp_path / "lake") == ["n0", "n1", "n2"]
+
+
+@pytest.mark.parametrize("is_readable", [True, False])
+def test_bags_that_retention_cut_are_not_read_again_and_keep_no_others_from_being_shipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_readable: bool
+) -> None:
+    hall, kitchen = (tmp_path / name for name in ROBOTS)
+    write_bag(kitchen, 0)
+    for number in range(BAGS):
+        write_bag(hall, number)
+    with shipping(tmp_path / "lake", [robot_bags(name, tmp_path / name) for name in ROBOTS]) as two:
+        assert two.run().bags == BAGS + 1
+        receipts = read_receipts(hall)
+        for number in range(BAGS):
+            bag = write_bag(hall, number, most=1)
+            receipt = receipts[f"rec/{bag.name}"]
+            append_receipts(hall, [replace(receipt, size=bag.stat().st_size)])
+        if not is_readable:
+            (hall / SHIPPED_FILE).rename(tmp_path / "receipts")
+            (hall / SHIPPED_FILE).symlink_to(tmp_path / "receipts")
+        hashing, reading = Mock(wraps=sha256_of), Mock(wraps=read_receipts)
+        monkeypatch.setattr(shipper_module, "sha256_of", hashing)
+        monkeypatch.setattr(shipper_module, "read_receipts", reading)
+        write_bag(kitchen, 1)
+        done = two.run()
+    assert (done.bags, len(done.problems)) == (1, 0 if is_readable else 1)
+    assert hashing.call_count == 1
+    assert not is_readable or reading.call_count <= len(ROBOTS)
+    assert len(values(tmp_path / "lake")) == 3 * (BAGS + 2)
 
 
 def test_a_saved_copy_of_a_bag_is_shipped_only_where_the_bag_is_not(tmp_path: Path) -> None:
