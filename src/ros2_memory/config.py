@@ -38,7 +38,6 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
-from pydantic.types import PathType
 from pydantic_core import to_jsonable_python
 
 from ros2_memory.config_errors import (
@@ -84,7 +83,14 @@ def _in_config_dir(path: Path, info: ValidationInfo[Sequence[Path]]) -> Path:
     if path.parts[0] != "config":
         return path
     files = [folder.joinpath(*path.parts[1:]) for folder in info.context]
-    return next((file for file in files if file.is_file()), files[-1])
+    return next((file for file in files if os.path.isfile(file)), files[-1])  # noqa: PTH113
+
+
+def _existing_folder(path: Path) -> Path:
+    # `Path.is_dir` raises in a folder that must not be searched.
+    if not os.path.isdir(path):  # noqa: PTH112
+        raise ValueError("must be an existing folder")
+    return path
 
 
 def _written_as(pattern: str, what: str) -> AfterValidator:
@@ -111,6 +117,14 @@ def _robot_name(name: str) -> str:
     return name
 
 
+def _may_be_folder(path: str) -> bool:
+    """Returns whether it is a folder, or the disk does not tell: a robot may be out of reach."""
+    try:
+        return Path(path).is_dir()
+    except OSError:
+        return True
+
+
 def _robots_found(value: object) -> object:
     """Returns the robots of a pattern such as `/data/*/bags`, by what its `*` stands for."""
     if value is None:
@@ -121,7 +135,7 @@ def _robots_found(value: object) -> object:
     before, star, after = pattern.partition("*")
     if not star or any(mark in after for mark in "*?[") or any(mark in before for mark in "?["):
         raise ValueError("must have one *, which stands for the robot's name, as /data/*/bags has")
-    folders = [folder for folder in sorted(glob.glob(pattern)) if Path(folder).is_dir()]  # noqa: PTH207
+    folders = [*filter(_may_be_folder, sorted(glob.glob(pattern)))]  # noqa: PTH207
     if not folders:
         raise ValueError("must match the folders of robots, and matches none")
     return {folder[len(before) : len(folder) - len(after)]: folder for folder in folders}
@@ -185,7 +199,7 @@ Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=Fa
 Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 Span: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=3600)]
 AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
-Folder: TypeAlias = Annotated[AnyPath, PathType("dir")]
+Folder: TypeAlias = Annotated[AnyPath, AfterValidator(_existing_folder)]
 ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
 MessageType: TypeAlias = Annotated[
     Text, _written_as(r"\w+/msg/\w+", "be a message type such as nav_msgs/msg/Odometry")
@@ -727,7 +741,7 @@ def config_dir(env: Mapping[str, str]) -> Path:
         folder = package / "_config"
     else:
         folder = package.parents[1] / "config"
-    if not (folder / "config.yaml").is_file():
+    if not os.path.isfile(folder / "config.yaml"):  # noqa: PTH113 - as `_existing_folder`
         raise ConfigError(
             f"MEMORY_CONFIG_DIR: {str(folder)!r} is not allowed; must be a folder with a "
             "config.yaml, laid out as the repository's config/"
@@ -852,7 +866,7 @@ def _append_interface_folder(composed: DictConfig, given: Mapping[str, str]) -> 
     folder = given.get(INTERFACES_VARIABLE)
     if not folder:
         return
-    if not expand_home(folder).is_dir():
+    if not os.path.isdir(expand_home(folder)):  # noqa: PTH112 - as `_existing_folder`
         raise ConfigError(
             f"{INTERFACES_VARIABLE}: {folder!r} is not allowed; must be an existing folder "
             "of message packages (or one package, with msg/*.msg)"

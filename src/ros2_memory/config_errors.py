@@ -39,7 +39,6 @@ _FOREIGN: Final = (
 _RULES: Final = {
     "tuple_type": "must be a list",
     "path_type": "must be a path",
-    "path_not_directory": "must be an existing folder",
     "string_too_short": "must not be empty",
     "int_type": "must be a whole number",
     "int_from_float": "must be a whole number",

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bootstrap import query_settings_of
+from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.config import (
     Settings,
     load_labels,
@@ -21,11 +22,15 @@ from ros2_memory.config_sources import Sources
 from ros2_memory.core.errors import ConfigError
 from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, copied, refusal
 from tests.support.examples import examples
+from tests.support.fleets import reply
+from tests.support.robot_run import write_run
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
     codec="utf-8", exclude_characters="\0"
 )
 """Those that a shell, YAML or Hydra reads as its own come often."""
+UNSEARCHABLE = "/" + "x" * 300
+"""To look for it is an error, as in a folder that must not be searched."""
 
 
 class TestDefaults:
@@ -92,7 +97,14 @@ class TestEnvironment:
             ("MEMORY_BAG_DIR", "${HOME}/bags", ["'${HOME}/bags'", "not expanded"]),
             ("ROS_VISION_INTERFACES_PATH", "/no/such", ["'/no/such'", "existing folder"]),
             ("ROS_VISION_INTERFACES_PATH", "~nobody-here/x", ["existing folder"]),
+            ("ROS_VISION_INTERFACES_PATH", UNSEARCHABLE, ["existing folder"]),
+            (
+                "MEMORY_CONFIG_OVERRIDES",
+                f"reader.custom_msg_paths=[{UNSEARCHABLE}]",
+                ["reader.custom_msg_paths", "existing folder"],
+            ),
             ("MEMORY_CONFIG_DIR", "/no/such", ["'/no/such'", "config.yaml"]),
+            ("MEMORY_CONFIG_DIR", UNSEARCHABLE, ["config.yaml"]),
             ("MEMORY_CONFIG_OVERRIDES", "'server.port=1", ["'server.port=1", "quotation"]),
             (
                 "MEMORY_CONFIG_OVERRIDES",
@@ -120,6 +132,15 @@ class TestFleet:
             (tmp_path / name / "bags").mkdir()
         settings = fleet_of(f"{tmp_path}/*/bags")
         assert settings.fleet.robots == {name: tmp_path / name / "bags" for name in ("r1", "r2")}
+
+    def test_a_robot_out_of_reach_is_named_and_the_others_are_served(self, tmp_path: Path) -> None:
+        write_run(tmp_path / "r1")
+        (tmp_path / "r2").symlink_to(UNSEARCHABLE)
+        fleet = build_fleet(fleet_of(f"{tmp_path}/*", f"fleet.places={tmp_path}/*/places.yaml"))
+        assert fleet is not None
+        found = reply(fleet, "list_recorded_topics", {})
+        assert {name for topic in found["topics"] for name in topic["robot_names"]} == {"r1"}
+        assert found["robots_failed"] == {"r2": "refused"}
 
     @pytest.mark.parametrize(
         ("robots", "fragment"),
