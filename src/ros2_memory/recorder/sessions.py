@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import Enum, auto
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 MAX_DISTINCT: Final = 200
-"""How many warnings that differ in more than their numbers are reported for one recording."""
+"""How many warnings of a kind that differ in more than their numbers one recording reports."""
 EMPTY_GRACE_S: Final = 5.0
 """A file that is still 0 bytes so long after a newer one appeared was lost to a full disk."""
 _LAST_LINES: Final = 6
@@ -210,7 +210,7 @@ class RecordingSession:
         self.grew_at = self.began.wall
         self.subscribed: set[str] = set()
         self.of_unknown_type: set[str] = set()
-        self._reported: set[tuple[str | None, str]] = set()
+        self._reported = defaultdict[LineKind, set[tuple[str | None, str]]](set)
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
         self._lost, self._lost_before = Counter[str](), Counter[str]()
 
@@ -287,9 +287,10 @@ class RecordingSession:
     def _is_new(self, line: Line) -> bool:
         without_numbers = "".join(char for char in line.text if not char.isdigit())
         key = (line.topic, without_numbers)
-        if key in self._reported or len(self._reported) >= MAX_DISTINCT:
+        reported = self._reported[line.kind]
+        if key in reported or len(reported) >= MAX_DISTINCT:
             return False
-        self._reported.add(key)
+        reported.add(key)
         return True
 
 
@@ -381,7 +382,7 @@ class RecordingSessions:
         return self._ended_bytes + sum(session.splits.bytes_written for session in self.running)
 
     def begin(self, now: ClockReading) -> None:
-        """Starts a recording if none is running.
+        """Starts a recording; none may be current.
 
         Raises:
             RecorderError: it cannot be started.

@@ -278,6 +278,13 @@ class TestWatch:
         assert told.startswith("/scan: messages of this publisher are not recorded")
         assert world.heartbeat()["last_error"] == told
 
+    def test_many_other_warnings_hide_no_topic_that_is_not_recorded(self, world: World) -> None:
+        world.recorders[0].lines += [
+            *(f"[WARN] [1.5] [rmw]: Failed to parse the hash of {'x' * n}" for n in range(300)),
+            "[WARN] [1.5] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/State' .",
+        ]
+        assert world.logged(3, "unknown_type")
+
     @pytest.mark.parametrize(("topic", "found"), [("/door", {"refused"}), ("/other", set())])
     def test_what_comes_of_another_type_than_subscribed_is_noted_as_missing(
         self, tmp_path: Path, topic: str, found: set[str]
