@@ -326,8 +326,7 @@ class RequestLimits:
 
         async def send_on(message: Message) -> None:
             nonlocal is_complete
-            is_last = message["type"] == "http.response.body" and not message.get("more_body")
-            is_complete = is_complete or is_last
+            is_complete = is_complete or _is_last(message)
             await send(message)
 
         async def cancel_on_disconnect(running: anyio.CancelScope) -> None:
@@ -348,19 +347,24 @@ class RequestLimits:
 
 
 def _once(send: Send) -> Send:
-    """Returns a `send` that takes a second response for the end of the first.
+    """Returns a `send` that takes a second response for the end of the first, if that is open.
 
-    When the server stops, the MCP library leaves an event stream open, and answers once more.
+    When the server stops, the MCP library leaves an event stream open, and answers once more; so
+    it does after the whole response to a HEAD.
     """
     has_begun = has_ended = False
 
     async def send_first(message: Message) -> None:
         nonlocal has_begun, has_ended
+        if has_ended:
+            return
         if has_begun and message["type"] == "http.response.start":
-            has_ended = True
-            await send({"type": "http.response.body", "body": b"", "more_body": False})
-        has_begun = True
-        if not has_ended:
-            await send(message)
+            message = {"type": "http.response.body"}
+        has_begun, has_ended = True, _is_last(message)
+        await send(message)
 
     return send_first
+
+
+def _is_last(message: Message) -> bool:
+    return message["type"] == "http.response.body" and not message.get("more_body")

@@ -6,6 +6,7 @@ import struct
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import Any
+from unittest.mock import Mock
 
 import anyio
 import anyio.lowlevel
@@ -323,6 +324,26 @@ async def test_what_an_application_does_after_its_answer_is_not_cut_off_and_may_
     async with client(RequestLimits(accepting)) as http:
         assert (await http.post("/messages/", content=b"{}")).status_code == 202
     assert done == ["handed over"]
+
+
+@pytest.mark.parametrize("is_whole", [True, False])
+async def test_of_two_responses_to_a_request_the_first_is_sent_to_its_end(is_whole: bool) -> None:
+    """The MCP library answers a HEAD twice, and an event stream again when the server stops."""
+    sent = list[Any]()
+
+    async def twice(_scope: Any, _receive: Any, send: Any) -> None:
+        for _ in range(2):
+            await send({"type": "http.response.start", "status": 200, "headers": []})
+            await send({"type": "http.response.body", "body": b"x", "more_body": not is_whole})
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    scope = {"type": "http", "method": "HEAD", "path": "/sse", "headers": []}
+    await RequestLimits(twice)(scope, Mock(), send)
+    assert sent[0]["type"] == "http.response.start"
+    ends = [not message.get("more_body") for message in sent[1:]]
+    assert ends == ([True] if is_whole else [False, True])
 
 
 async def test_a_fault_of_the_application_is_not_hidden() -> None:
