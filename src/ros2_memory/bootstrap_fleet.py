@@ -206,8 +206,7 @@ def robot_settings(settings: Settings, name: str) -> Settings:
     bag_dir = fleet.robots.get(name, Path(os.devnull) / name)
     if fleet.places is not None:
         places_file = Path(fleet.places.replace("*", name))
-        # `Path.is_file` raises where the robot is out of reach.
-        if os.path.isfile(places_file):  # noqa: PTH113
+        if os.path.isfile(places_file):
             data = replace(data, places_file=places_file)
     return replace(
         settings,

@@ -83,12 +83,11 @@ def _in_config_dir(path: Path, info: ValidationInfo[Sequence[Path]]) -> Path:
     if path.parts[0] != "config":
         return path
     files = [folder.joinpath(*path.parts[1:]) for folder in info.context]
-    return next((file for file in files if os.path.isfile(file)), files[-1])  # noqa: PTH113
+    return next((file for file in files if os.path.isfile(file)), files[-1])
 
 
 def _existing_folder(path: Path) -> Path:
-    # `Path.is_dir` raises in a folder that must not be searched.
-    if not os.path.isdir(path):  # noqa: PTH112
+    if not os.path.isdir(path):
         raise ValueError("must be an existing folder")
     return path
 
@@ -741,7 +740,7 @@ def config_dir(env: Mapping[str, str]) -> Path:
         folder = package / "_config"
     else:
         folder = package.parents[1] / "config"
-    if not os.path.isfile(folder / "config.yaml"):  # noqa: PTH113 - as `_existing_folder`
+    if not os.path.isfile(folder / "config.yaml"):
         raise ConfigError(
             f"MEMORY_CONFIG_DIR: {str(folder)!r} is not allowed; must be a folder with a "
             "config.yaml, laid out as the repository's config/"
@@ -866,7 +865,7 @@ def _append_interface_folder(composed: DictConfig, given: Mapping[str, str]) -> 
     folder = given.get(INTERFACES_VARIABLE)
     if not folder:
         return
-    if not os.path.isdir(expand_home(folder)):  # noqa: PTH112 - as `_existing_folder`
+    if not os.path.isdir(expand_home(folder)):
         raise ConfigError(
             f"{INTERFACES_VARIABLE}: {folder!r} is not allowed; must be an existing folder "
             "of message packages (or one package, with msg/*.msg)"

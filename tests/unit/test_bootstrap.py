@@ -88,6 +88,10 @@ async def test_where_the_disk_does_not_tell_no_question_is_an_internal_error(
         for name, given, _ in ANSWERED:
             reply, _ = await ask(client, name, given)
             assert "internal" not in str(reply), (name, reply)
+        asked = {"topic": "/vision/*/scene_objects", "condition_type": "contains", "value": "x"}
+        reply, _ = await ask(client, "find_last_match", asked)
+    if lost == "the recorder's files":
+        assert ".episodic cannot be read: what was lost or deleted is not known" in reply["notes"]
     filler = build_backfill(chosen, memory)
     for batch in filler.batches():
         filler.store(batch)

@@ -316,8 +316,7 @@ class Database:
     # The methods below run under the lock, except `_move_to_preferred_path`.
 
     def _may_open(self) -> bool:
-        # `Path.is_dir` raises where the disk does not tell.
-        is_there = self._waits_for is None or os.path.isdir(self._waits_for)  # noqa: PTH112
+        is_there = self._waits_for is None or os.path.isdir(self._waits_for)
         return not self._closed and is_there
 
     def _ready(self) -> OpenDatabase | None:

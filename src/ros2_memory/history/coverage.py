@@ -102,17 +102,23 @@ def note_unread(
     if nothing or search:
         view.notes.add(*describe_thinned(view.snapshot, window))
     bag_dir = view.bag_dir
-    # `Path.is_dir` raises where the disk does not tell.
-    if os.path.isdir(bag_dir / OWN_FOLDER):  # noqa: PTH112
+    if os.path.lexists(bag_dir / OWN_FOLDER):
         view.notes.add(
             *describe_deleted(view, window),
             *(f"{of}{sentence}" for sentence in describe_lost(bag_dir, window)),
             *describe_excluded(bag_dir, window),
         )
+    if (nothing or search) and _are_losses_hidden(bag_dir):
+        view.notes.add_lack(f"{OWN_FOLDER} cannot be read: what was lost or deleted is not known")
     view.notes.add(*unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd))
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
         view.notes.add_remarks(odd)
+
+
+def _are_losses_hidden(bag_dir: Path) -> bool:
+    own = bag_dir / OWN_FOLDER
+    return os.path.lexists(own) and not os.access(own, os.X_OK)
 
 
 def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
@@ -371,7 +377,8 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     """
     is_complete = view.notes.complete and all(map(is_whole, view.timeline.faulty(window)))
     if is_complete and not (
-        lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
+        _are_losses_hidden(view.bag_dir)
+        or lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
         or excluded_between(view.bag_dir, window.start, window.stop)
         or any(cut_spans(view.bag_dir, topic, window) for topic in topics)
         or deleted_between(view, window)

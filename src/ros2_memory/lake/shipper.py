@@ -303,8 +303,7 @@ class RobotBags:
         """
         if self.filling is None or not times:
             return []
-        # `Path.is_dir` raises where the disk does not tell.
-        if not (self.answers(PATIENCE_S) and os.path.isdir(self.bag_dir)):  # noqa: PTH112
+        if not (self.answers(PATIENCE_S) and os.path.isdir(self.bag_dir)):
             do = "delete the cache folder of ros2-memory, which may have columns of it"
             return [f"{self.name}: {self.bag_dir} is not there: {do}"]
         try:
