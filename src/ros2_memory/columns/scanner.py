@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, fields
-from functools import partial
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -44,8 +44,8 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes, besides the numbers of its bags."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
-_FEW_DELETED: Final = 256
-"""So many deleted parts are remembered of each topic."""
+_TOGETHER: Final = 512
+"""Parts with so many numbers in a row, as a day has, are known together."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 DECODED_BYTES: Final = 8 << 20
 """The tables of a bag that is not stored are remembered if they take no more memory than this."""
@@ -89,19 +89,17 @@ class _Heads(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What is known of a column of a topic in all parts up to the newest, without values.
+    """What is known of a column of a topic in neighbouring parts, without values.
 
     Attributes:
         newest: the newest of these parts; it need not have the column.
         packed: by part, how the column is packed; also of parts that were deleted since.
         zones: those of the parts.
-        many: of more parts than this it is read anew, as many may have been deleted.
     """
 
     newest: int
     packed: Mapping[int, Packed]
     zones: Zones
-    many: int
 
     def joined(self, newest: int, packed: Mapping[int, Packed]) -> _Known:
         """Returns it with what is known of newer parts."""
@@ -110,7 +108,6 @@ class _Known(NamedTuple):
             max([newest, *packed]),
             {**self.packed, **packed},
             self.zones.joined(zones),
-            self.many or _FEW_DELETED + 2 * len(packed),
         )
 
     @property
@@ -121,7 +118,7 @@ class _Known(NamedTuple):
         return _COLUMN_BYTES * len(self.packed) + texts + self.zones.memory_bytes
 
 
-_UNKNOWN: Final = _Known(0, {}, Zones.of([], []), 0)
+_UNKNOWN: Final = _Known(0, {}, Zones.of([], []))
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +129,7 @@ class Caches:
 
     Attributes:
         read: by part and path, unpacked columns; by kind and key, fragments.
-        known: by topic and path, what is known of a column in its parts.
+        known: by topic, path and the first of the parts, what is known of a column in them.
         heads: by topic, its parts.
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
         pairs: by part, the parents and children of its transforms.
@@ -318,17 +315,21 @@ class Scanner:
 
     def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
         """Returns the zones of a column in some parts of a topic."""
-        return self._known(topic, path, int(parts.max(initial=0))).zones.among(parts)
+        ascending = np.sort(parts)
+        newest = ascending[np.diff(ascending // _TOGETHER, append=-1) != 0].tolist()
+        known = (self._known(topic, path, part).zones for part in newest)
+        return reduce(Zones.joined, known, _UNKNOWN.zones).among(parts)
 
     def _known(self, topic: int, path: str, part: int) -> _Known:
-        """Returns what is known of a column of a topic, in a part and in all that are older."""
+        """Returns what is known of a column of a topic, in a part and in older ones beside it."""
         store = self._store_of_parts
-        key = (topic, path)
+        first = part // _TOGETHER * _TOGETHER
+        key = (topic, path, first)
         known = self.caches.known.get(key) or _UNKNOWN
         if part > known.newest:
             failures = store.failures
-            known = known if len(known.packed) <= known.many else _UNKNOWN
-            known = known.joined(part, store.zones(topic, path, known.newest))
+            newer = range(max(first, known.newest + 1), first + _TOGETHER)
+            known = known.joined(part, store.zones(topic, path, newer))
             if store.failures == failures:
                 self.caches.known.put(key, known, known.memory_bytes)
         return known

@@ -354,17 +354,17 @@ class ColumnStore(Database):
 
         return self.read(ask, [])
 
-    def zones(self, topic: int, path: str, after: int = 0) -> dict[int, Packed]:
-        """Returns what is known of a column in all parts of a topic that are newer than a part.
+    def zones(self, topic: int, path: str, parts: range) -> dict[int, Packed]:
+        """Returns what is known of a column in parts of a topic with these numbers.
 
-        By the numbers of the parts, which ascend; without values.
+        By the numbers, which ascend; without values.
         """
 
         def ask(connection: sqlite3.Connection) -> dict[int, Packed]:
             rows = connection.execute(
                 "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
-                " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
-                (topic - self.offset, path, max(after - self.offset, 0)),
+                " WHERE topic = ? AND path = ? AND part >= ? AND part < ? ORDER BY part",
+                (topic - self.offset, path, parts.start - self.offset, parts.stop - self.offset),
             )
             return {
                 part + self.offset: Packed(intern(codec), count, error, zone_of(*zone), b"")
