@@ -507,7 +507,7 @@ def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
     """Returns which spots and which looks are of a slice in which localisation was poor."""
     fixes = sights.fixes
     time = fixes[:, Fix.TIME]
-    after = np.diff(time, append=time[-1:])
+    after = np.diff(time, append=time[-1:] + _NEVER_NS)
     after[after < 0] = _NEVER_NS  # the next one is of another session
     turn = np.radians((np.diff(fixes[:, Fix.YAW]) + 1800) % 3600 / 10 - 180)
     off = np.hypot(np.diff(fixes[:, Fix.X]), np.diff(fixes[:, Fix.Y])) + AHEAD_MM * np.abs(turn)

@@ -107,26 +107,33 @@ def seen_off(start: int, stop: int, off: float) -> list[Msg]:
         message
         for at in range(start, stop)
         for message in scene(
-            at, (1.0, off, 0.0), [("mug", 3.0, 0.5 + off), ("book", 3.0, -1.0 + off)], map_off=off
+            at + 0.5,
+            (1.0, off, 0.0),
+            [("mug", 3.0, 0.5 + off), ("book", 3.0, -1.0 + off)],
+            map_off=off,
         )
     ]
 
 
-@pytest.mark.parametrize(("sigma_m", "is_poor"), [(0.1, False), (1.0, True)])
+@pytest.mark.parametrize(
+    ("sigma_m", "stop", "is_poor"),
+    [(0.1, 120, False), *((1.0, stop, True) for stop in (108, 111, 116, 120))],
+)
 def test_what_is_seen_with_a_large_covariance_moves_nothing(
-    tmp_path: Path, sigma_m: float, is_poor: bool
+    tmp_path: Path, sigma_m: float, stop: int, is_poor: bool
 ) -> None:
-    good, later = seen_off(0, 30, 0.0), seen_off(90, 120, 0.4)
+    """Also what is seen behind the last fix of the sights."""
+    good, later = seen_off(0, 30, 0.0), seen_off(90, stop, 0.4)
     write_splits(tmp_path, [amcl(0, 0.1), *good, amcl(89.9, sigma_m), *later])
     reply = ask(tmp_path, "find_things")
     for thing in reply["things"]:
         assert ("moved" in thing) == (not is_poor)
         assert (thing["place"]["y"] in {0.5, -1.0}) == is_poor
-        assert (thing["last_seen"], thing["count"]) == (BEGIN + 119, 60)
+        assert (thing["last_seen"], thing["count"]) == (BEGIN + stop - 0.5, stop - 60)
     poor = [note for note in reply.get("notes", []) if "localisation was poor" in note]
     assert [note.endswith(": book, mug") for note in poor] == [True] * is_poor
     windows = {"with_start": BEGIN, "with_end": BEGIN + 30}
-    reply = ask(tmp_path, "compare", start=BEGIN + 90, end=BEGIN + 119, **windows)
+    reply = ask(tmp_path, "compare", start=BEGIN + 90, end=BEGIN + stop, **windows)
     assert reply["things_unchanged"] == 2 * is_poor
     assert ("moved" in reply["things"]) == (not is_poor)
     assert any("localisation was poor" in note for note in reply.get("notes", [])) == is_poor
