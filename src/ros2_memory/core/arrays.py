@@ -88,6 +88,11 @@ def begins_of(group: Ints, groups: int) -> Ints:
     return begins
 
 
+def rows_by(group: Ints, groups: int) -> list[Ints]:
+    """Returns the rows of each of so many groups, in their order."""
+    return np.split(np.argsort(group, kind="stable"), begins_of(group, groups)[1:])[:-1]
+
+
 def run_starts(numbers: Ints) -> Ints:
     """Returns where each run of equal numbers begins."""
     return np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))

@@ -37,6 +37,7 @@ from ros2_memory.core.arrays import (
     in_ranges,
     narrowed,
     numbered,
+    rows_by,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.things.labels import Labels, moves_by_itself
@@ -500,13 +501,13 @@ def _groups(observed: _Observations, keys: Sequence[str]) -> list[_Group]:
     width = len(distinct) + 1
     epoch = observed.sights.epochs[spots[:, Spot.SLICE]]
     group_of = epoch * width + key_of_label[spots[:, Spot.LABEL]]
-    group_of[observed.counts == 0] = -1
+    counting = np.flatnonzero(observed.counts)
+    numbers, nth = np.unique(group_of[counting], return_inverse=True)
+    lost = rows_by(key_of_label[unplaced[:, Unplaced.LABEL]], len(distinct))
     groups = []
-    for number in np.flatnonzero(np.bincount(group_of[group_of >= 0])).tolist():
+    for number, rows in zip(numbers.tolist(), rows_by(nth, len(numbers)), strict=True):
         group_epoch, key = divmod(number, width)
-        without_place = unplaced[np.flatnonzero(key_of_label[unplaced[:, Unplaced.LABEL]] == key)]
-        rows = np.flatnonzero(group_of == number)
-        groups.append(_Group(distinct[key], group_epoch, rows, without_place))
+        groups.append(_Group(distinct[key], group_epoch, counting[rows], unplaced[lost[key]]))
     return groups
 
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
 from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Look, Spot
-from ros2_memory.core.arrays import Flags, Ints, distinct_rows, places_among, run_starts
+from ros2_memory.core.arrays import Flags, Ints, distinct_rows, numbered, places_among, run_starts
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 
@@ -412,19 +412,25 @@ def with_synonyms(
     """
     keys = [labels.key(label) for label in sights.labels]
     by_word: dict[str, list[str]] = defaultdict(list)
-    for key in sorted(set(keys)):
+    placed = np.unique(sights.spots[counts > 0, Spot.LABEL])
+    for key in sorted({keys[label] for label in placed.tolist()}):
         if not moves_by_itself(key):
             by_word[last_word(key)].append(key)
-    has_key = {key: np.array([key == other for other in keys]) for key in set(keys)}
+    distinct, key_of_label = numbered(keys)
+    number_of = {key: number for number, key in enumerate(distinct)}
+
+    def labels_of(key: str) -> Mask:
+        mask: Mask = key_of_label == number_of[key]
+        return mask
 
     def are_two(one: str, other: str) -> bool:
         go_on()
-        return labels.are_apart(one, other) or _are_beside(sights, has_key[one], has_key[other])
+        return labels.are_apart(one, other) or _are_beside(sights, labels_of(one), labels_of(other))
 
     groups = {key: frozenset({key}) for key in keys}
-    pairs = [pair for alike in by_word.values() for pair in combinations(alike, 2)]
+    pairs = (pair for alike in by_word.values() for pair in combinations(alike, 2))
     for one, other in pairs:
-        masks = has_key[one], has_key[other]
+        masks = labels_of(one), labels_of(other)
         if not are_two(one, other) and _alternate(sights, counts, *masks):
             group = groups[one] | groups[other]
             groups |= dict.fromkeys(group, group)

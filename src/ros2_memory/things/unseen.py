@@ -15,7 +15,7 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, Unplaced
-from ros2_memory.core.arrays import Columns, Ints, distinct_rows
+from ros2_memory.core.arrays import Columns, Ints, distinct_rows, numbered, rows_by
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NotInLakeError,
@@ -233,11 +233,11 @@ def vague_notes(
     labels = {*also}
     for window in windows if estimate.poor.any() else ():
         during = estimate.seen_in(np.arange(len(spots)), window)
-        for label in np.unique(spots[during, Spot.LABEL]).tolist():
+        found, number = np.unique(spots[during, Spot.LABEL], return_inverse=True)
+        for label, rows in zip(found.tolist(), rows_by(number, len(found)), strict=True):
             key = known.labels.key(estimate.labels[label])
-            if not keys or key in keys:
-                of_label = during[spots[during, Spot.LABEL] == label]
-                labels |= {estimate.names[key]} if estimate.is_vague(of_label) else set()
+            if (not keys or key in keys) and estimate.is_vague(during[rows]):
+                labels.add(estimate.names[key])
     if labels:
         yield repeating(
             "localisation was poor when these were detected last, which moves nothing, so that "
@@ -313,11 +313,13 @@ def _detected(known: KnownThings, keys: Iterable[str], window: TimeWindow) -> It
     estimate, unplaced = known.estimate, known.estimate.unplaced
     during = _during(window, estimate.spots, Spot.FIRST, Spot.LAST)
     all_lost = unplaced[_during(window, unplaced, Unplaced.FIRST, Unplaced.LAST)]
-    label, lost_label = estimate.spots[during, Spot.LABEL], all_lost[:, Unplaced.LABEL]
-    key_of_label = np.array([known.labels.key(name) for name in estimate.labels], object)
+    names, key_of_label = numbered(map(known.labels.key, estimate.labels))
+    number_of = {key: number for number, key in enumerate(names)}
+    rows_of = rows_by(key_of_label[estimate.spots[during, Spot.LABEL]], len(names))
+    lost_of = rows_by(key_of_label[all_lost[:, Unplaced.LABEL]], len(names))
     for key in keys:
-        has_key = key_of_label == key
-        rows, lost = during[has_key[label]], all_lost[has_key[lost_label]]
+        number = number_of[key]
+        rows, lost = during[rows_of[number]], all_lost[lost_of[number]]
         spots, count = estimate.spots[rows], int(estimate.counts[rows].sum())
         yield _Detected(
             name=estimate.names[key],

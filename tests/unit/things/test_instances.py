@@ -1,5 +1,7 @@
 """When a thing is missed, and which name it has, by its sights alone."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -88,3 +90,17 @@ def test_what_is_seen_upstairs_while_localisation_is_poor_is_no_sighting_of_what
     vague = fixes_of(times, np.zeros((2, 3)), np.array([2.0, 2.0]))
     [mug] = estimate(whole([below, upstairs, vague]), LABELS).instances
     assert mug.stays[-1].last == 19 * 10**9
+
+
+@pytest.mark.parametrize("name", ["{} box", "box{}"])
+def test_labels_without_a_place_are_compared_with_none_and_take_no_more_memory_each_if_many(
+    name: str,
+) -> None:
+    labels = [name.format(nth) for nth in range(1500)]
+    sights = whole([bag_of(*((HERE, [PlacedDetection(label, None)]) for label in labels))])
+    tracemalloc.start()
+    found = estimate(sights, LABELS, go_on=lambda: pytest.fail("compared"))
+    taken_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (found.instances, len(found.names)) == ([], 1500)
+    assert taken_bytes < 1024 * 1500
