@@ -456,15 +456,17 @@ class BinnedWindow:
         start = self.window.start if self._since is None else max(self.window.start, self._since)
         return start, max(start, self.window.stop)
 
-    def count_since(self, since: Ns | None) -> None:
+    def count_since(self, since: Ns | None, too_many: str = "") -> None:
         """Leaves out what is before a moment, and notes that it was not counted, if there is one.
 
-        To be called before columns are added.
+        To be called before columns are added. `too_many` names what there is too much of to count,
+        where the call's time was not over.
         """
         if since is None:
             return
         self._since = since
         self.counted = self.counted.intersect(TimeWindow(since, MAX_NS))
+        why = f"{too_many}; " if too_many else self.view.bags.filling_progress() or "out of time; "
         self.view.notes.add_lack(
             f"only what is after {unix_text(since)} is counted: "
             f"{self.view.bags.filling_progress() or 'out of time; '}"

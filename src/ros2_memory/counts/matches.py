@@ -144,12 +144,12 @@ def count_matches(
     binned = BinnedWindow(view, asked, by, topics, places)
     note_robots_on(view, topics, binned.counted)
     scope = Scope(view, binned.counted, where, during)
-    held, since = None, None
+    held, since, too_many = None, None, ""
     if isinstance(condition.test, Contains | Equals):
         held, since = _held_by_events(binned, topics, condition, value, scope)
     if held is None:
-        held, since = read_sightings(view, topic, condition, scope)
-    binned.count_since(since)
+        held, since, too_many = read_sightings(view, topic, condition, scope)
+    binned.count_since(since, too_many)
     binned.add_heard("topic_s", topics)
     binned.add_unknown(scope.unknown)
     binned.add_held(held)

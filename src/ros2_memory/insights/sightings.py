@@ -259,11 +259,12 @@ def _runs_as_sightings(
 
 def read_sightings(
     view: View, pattern: str, condition: Condition, scope: Scope
-) -> tuple[Ints, Ns | None]:
+) -> tuple[Ints, Ns | None, str]:
     """Returns the times (inclusive) of all sightings in a scope, N x 3.
 
     And whether each is known to begin then: what a latched topic had said before may hold on. With
-    them since when they are known, where the call's time is over before all is searched.
+    them since when they are known, where not all is searched: since there is too much of what the
+    text says, or, where that is empty, since the call's time is over.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
@@ -273,14 +274,15 @@ def read_sightings(
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
     if goals is not None:
-        return held_spans(
-            (goal.first, _goes_on_until(view, goal, scope), True) for goal in goals
-        ), None
+        spans = held_spans((goal.first, _goes_on_until(view, goal, scope), True) for goal in goals)
+        return spans, None, ""
     if says_episodes(view, topics):
         found, _, since = find_episodes(
-            view, topics[0], condition, scope, limit=MOST_COUNTED, oldest_first=True
+            view, topics[0], condition, scope, limit=MOST_COUNTED, oldest_first=False
         )
-        return held_spans((episode.first, episode.until, True) for episode in found), since
+        too_many = f"more than {MOST_COUNTED:,} episodes" if len(found) == MOST_COUNTED else ""
+        spans = held_spans((episode.first, episode.until, True) for episode in found)
+        return spans, since, too_many
     result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
@@ -291,14 +293,14 @@ def read_sightings(
     # Without a scope the oldest may have begun before what there was time to search.
     spans[:, 2] |= not scope.is_bounded
     if result.is_over:
-        return spans, int(spans[-1, 0])
+        return spans, int(spans[-1, 0]), ""
     earlier = [
         (first, last, False)
         for topic in topics
         if met_before(view, topic, condition, start)
         for first, last in scope.parts_of(start, held_until(view, topic, start, end))
     ]
-    return np.concatenate((spans, held_spans(earlier))), None
+    return np.concatenate((spans, held_spans(earlier))), None, ""
 
 
 def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:

@@ -23,6 +23,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.memories import asked, each_way, memory_of
+from tests.support.tables import table
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -164,3 +165,14 @@ def test_values_that_are_too_long_to_be_held_are_named(
     assert [row[0] for row in reply["rows"]] == ["use a butter knife", "wash the pot"]
     [note] = [each for each in reply["notes"] if "more than 40 characters" in each]
     assert f"only what is after {BEGIN + 200}.000000 is counted" in note
+
+
+def test_of_more_episodes_than_are_counted_the_newest_are(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sightings, "MOST_COUNTED", 2)
+    given = {"topic": "/task", "condition_type": "contains", "value": "wash", "by": "day"}
+    reply = ask(memory, "find_matches", **given)
+    assert (reply["start"], table(reply)["all"]["count"]) == (BEGIN + 80, 2)
+    [note] = [each for each in reply["notes"] if "is counted" in each]
+    assert note.endswith("is counted: more than 2 episodes; ask about a shorter window")
