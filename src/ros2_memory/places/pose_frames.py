@@ -376,7 +376,7 @@ def make_tracks(view: View, window: TimeWindow) -> Iterator[Ns]:
 
     Yields a log time (ns) of each, the newest first.
     """
-    with suppress(InvalidArgumentsError, NoDataError):
+    with suppress(InvalidArgumentsError, NoDataError, UndecodableError):
         topic = resolve_path_topic(view)
         frames = map_placement(view, topic).frames
         yield from merge(*(TrackReader(view, frame).made(window) for frame in frames), reverse=True)

@@ -23,7 +23,7 @@ from ros2_memory.history.context import Memory
 from ros2_memory.serving.backfill import BACKLOG, Backfill, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import McapLayout, boolean, odom, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
 
@@ -104,6 +104,15 @@ def test_bags_that_a_crash_left_open_keep_nothing_from_being_joined(
             query = "SELECT kind, start_ns FROM fragment WHERE kind LIKE 'path-joined%'"
             joined.append(base.execute(query).fetchall())
     assert joined[0] == joined[1] != []
+
+
+def test_poses_that_cannot_be_decoded_keep_nothing_else_from_being_joined(tmp_path: Path) -> None:
+    poses = [replace(odom(T0 + n * NS_PER_S, 0.0, 0.0), body=b"") for n in range(10)]
+    bumps = [boolean(T0 + n * NS_PER_S, n > 5) for n in range(10)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*poses, *bumps])
+    _, backfill = storing(tmp_path)
+    fill_store(backfill)
+    assert outlines_in(tmp_path) != []
 
 
 async def test_what_is_stored_of_many_deleted_bags_goes_with_the_next_round(tmp_path: Path) -> None:
