@@ -122,7 +122,7 @@ class HeldValues:
         self._topic = topic
         self._field = field
         self._holds_on = is_text(view, topic) or holds_on(view, [topic])
-        self._breaks = _breaks(view, topic)
+        self._breaks = breaks_of(view, topic)
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
         self.known: list[Held] = []
@@ -288,7 +288,7 @@ class HeldValues:
         return following, True
 
 
-def _breaks(view: View, topic: str) -> list[Ns]:
+def breaks_of(view: View, topic: str) -> list[Ns]:
     """Returns the moments from which on what a topic said before is not known to hold, in order.
 
     Also where bags of a wrong clock end before the others, and where these end before more.
@@ -356,7 +356,7 @@ def held_until(view: View, topic: str, last: Ns, end: Ns) -> Ns:
     stop = end if lasting else last + SILENCE_NS
     following = view.stream.first([topic], TimeWindow(last + 1, stop + 1))
     if lasting:
-        ends = [moment for moment in _breaks(view, topic) if moment >= last]
+        ends = [moment for moment in breaks_of(view, topic) if moment >= last]
         ends += [end, view.snapshot.latest or end]
         return max(last, min([*ends, *([] if following is None else [following.time])]))
     return last if following is None else max(last, min(following.time, end))
@@ -367,8 +367,7 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
     if not is_latched(view, topic):
         return None
     before = view.stream.last(topic, moment)
-    breaks = _breaks(view, topic)
-    if before is None or any(before.time <= at < moment for at in breaks):
+    if before is None or any(before.time <= at < moment for at in breaks_of(view, topic)):
         return None
     return before
 

@@ -35,6 +35,7 @@ from ros2_memory.history.coverage import (
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (
+from ros2_memory.history.held_values import breaks_of, is_latched
     SLACK_NS,
     ChangesBefore,
     before,
@@ -335,7 +336,9 @@ def _reported_events(
         if topic_events is None:
             continue
         _, toggles = topic_events.of_kind(FLAG)
-        if toggles:
+        if toggles and is_latched(view, topic):  # what it said holds through gaps
+            events += _flip_events(topic, toggles, breaks_of(view, topic))
+        elif toggles:
             unrecorded = unrecorded_times(view, topic, TimeWindow(*window.asked()))
             events += _flip_events(topic, toggles, [begin for begin, _ in unrecorded])
         events += map(_error_event, _errors_in_region(view, topic, topic_events, region_stays))
@@ -478,7 +481,7 @@ def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
 def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:
     """Yields each toggle with how long its value held: until the next, or beyond the window.
 
-    Or as long as it was recorded: `ends` are the times at which the topic ceased to be, in order.
+    Or as long as it is known to: `ends` are the times from which on it is not, in order.
     """
     until: dict[str, Ns] = {}
     for toggle in reversed(toggles):

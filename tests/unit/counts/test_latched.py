@@ -122,6 +122,9 @@ def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
         answer = asked(memory, tmp_path, "find_matches", **is_true, by=by)
         whole = table(answer)["all"]
         assert (whole["seconds"], whole["count"]) == (recorded_s, 1)
+    events = asked(memory, tmp_path, "recap", start=T0 / S, end=T0 / S + 200)["events"]
+    [flip] = [event for event in events if event["text"] == "/docked became true"]
+    assert ("duration_s" in flip, flip["goes_on"]) == (False, True)
     answers = [
         asked(memory, tmp_path, "find_matches", **is_true),
         asked(memory, tmp_path, "get_topic_in_range", **window, changes=True),

@@ -87,6 +87,9 @@ def test_how_long_a_value_held_ends_where_a_time_was_deleted(bag_dir: Path, reca
     found = asked(asking, bag_dir, "find_matches", **window, **undocked)["sightings"]
     spans = [(row["first_seen"] - T0_S, row["duration_s"]) for row in found]
     assert spans == [(115.5, 3.5), (15.5, 13.5)]
+    events = asked(asking, bag_dir, "recap", start=T0_S, end=T0_S + 130)["events"]
+    flips = [event for event in events if event["text"] == "/docked became false"]
+    assert [flip.get("duration_s") for flip in flips] == [13.5, None]
 
 
 def spell_of(row: dict[str, Any]) -> tuple[Any, ...]:
