@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.intervals import pieces_of
+from ros2_memory.analysis.silences import length_in
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, united, without
@@ -435,8 +436,7 @@ class BinnedWindow:
         edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
         recorded_days, cut_days = set(), set()
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
-            missing = sum(max(min(end, stop) - max(begin, start), 0) for begin, end in self.gaps)
-            if missing < stop - start:
+            if length_in(self.gaps, start, stop) < stop - start:
                 recorded_days.add(day)
             if self._since is not None and start < self._since:
                 cut_days.add(day)
@@ -468,9 +468,7 @@ class BinnedWindow:
         self.counted = self.counted.intersect(TimeWindow(since, MAX_NS))
         why = f"{too_many}; " if too_many else self.view.bags.filling_progress() or "out of time; "
         self.view.notes.add_lack(
-            f"only what is after {unix_text(since)} is counted: "
-            f"{self.view.bags.filling_progress() or 'out of time; '}"
-            "ask about a shorter window"
+            f"only what is after {unix_text(since)} is counted: {why}ask about a shorter window"
         )
 
     def answer(self) -> Bins:

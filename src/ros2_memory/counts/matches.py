@@ -18,9 +18,11 @@ from __future__ import annotations
 import heapq
 import json
 import math
+from bisect import bisect_left
 from collections import Counter, defaultdict
 from dataclasses import replace
 from itertools import groupby, pairwise
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -378,9 +380,8 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
 def _without_gaps(start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[Span]) -> _TrueSpans:
     """Returns a time without the gaps in it; what comes after a gap is not known to begin there."""
     parts: _TrueSpans = []
-    for begin, end in gaps:
-        if end < start or begin >= stop:
-            continue
+    first = bisect_left(gaps, start, key=itemgetter(1))
+    for begin, end in gaps[first : bisect_left(gaps, stop, key=itemgetter(0))]:
         if begin > start or (begin == start and is_begun):  # it may toggle in the last message
             parts.append((start, begin, is_begun))
         start, is_begun = end, False

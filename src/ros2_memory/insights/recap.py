@@ -20,6 +20,8 @@ from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.spans import overlaps_any
+from ros2_memory.core.spans import united as united_spans
 from ros2_memory.core.text import Quoted, counted, listed, repeating
 from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
@@ -33,9 +35,9 @@ from ros2_memory.history.coverage import (
     unexcluded,
 )
 from ros2_memory.history.driven_path import length_notes
+from ros2_memory.history.held_values import breaks_of, is_latched
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (
-from ros2_memory.history.held_values import breaks_of, is_latched
     SLACK_NS,
     ChangesBefore,
     before,
@@ -246,12 +248,13 @@ class _RegionStays:
 
     def __init__(self, spans: Sequence[Stay], elapsed: Elapsed) -> None:
         self.spans = spans
+        self._inside = united_spans((stay.start, stay.stop + 1) for stay in spans)
         self._elapsed = elapsed
 
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
         """Returns whether some of a time, or a moment, is among them."""
         last = start if end is None else end
-        return any(stay.start <= last and start <= stay.stop for stay in self.spans)
+        return overlaps_any(self._inside, start, last)
 
     def has(self, event: Event) -> bool:
         """Returns whether an event happened then; how long a boolean held is of no matter."""
