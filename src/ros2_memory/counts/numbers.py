@@ -504,7 +504,7 @@ def count_range(
     binned.add_last(last, int(last.max()))
     for field, cells in zip(names, cells_of_fields, strict=True):
         if cells[-1] is None:
-            _require_field(view, name, field)
+            _require_field(view, name, field, binned.counted.stop)
             view.notes.add(f"{field} holds no number in the window")
             continue
         for nth, (column, kind) in enumerate(_CELL):
@@ -514,13 +514,13 @@ def count_range(
     return binned.answer()
 
 
-def _require_field(view: View, topic: str, field: str) -> None:
-    """Checks that messages of a topic have a field, by the newest one.
+def _require_field(view: View, topic: str, field: str, until: Ns) -> None:
+    """Checks that messages of a topic have a field, by the newest one before a moment.
 
     Raises:
         InvalidArgumentsError: it has none.
     """
-    newest = view.stream.last(topic)
+    newest = view.stream.last(topic, until)
     message = None if newest is None else view.bags.decode(newest)
     if newest is not None and message is not None:
         view.extractor.shown(message, newest.type, (field,))

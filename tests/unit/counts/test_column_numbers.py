@@ -2,6 +2,7 @@
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.results import Bins
-from tests.support.bags import Msg, battery, make, odom, write_mcap, write_splits
+from tests.support.bags import Msg, battery, make, odom, text, write_mcap, write_splits
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
 
@@ -180,3 +181,17 @@ def test_a_field_that_there_is_not_is_refused(tmp_path: Path) -> None:
         count_range(
             memory_of(tmp_path), Call(), "/battery_state", span(), "hour", fields=["percentge"]
         )
+
+
+def test_a_field_that_a_topic_has_no_more_is_that_of_its_window(tmp_path: Path) -> None:
+    said = [replace(text(BEGIN + HOUR * S, "full"), topic="/battery_state")]
+    write(tmp_path, [battery(BEGIN, math.nan), *said], split=1)
+    answer = count_range(
+        memory_of(tmp_path),
+        Call(),
+        "/battery_state",
+        TimeRange(BEGIN / S, BEGIN / S + 60),
+        "hour",
+        fields=["percentage"],
+    )
+    assert "percentage holds no number in the window" in answer.notes
