@@ -318,7 +318,10 @@ class Condition:
 
     @property
     def can_be_refused(self) -> bool:
-        """Whether some values have a shape that cannot match; see `refusal_for`."""
+        """Whether some values have a shape that cannot match; see `refusal_for`.
+
+        Not of a number or boolean that any part may equal: as JSON, another message may have one.
+        """
         test = self.test
         return (
             self.field is not None

@@ -41,6 +41,7 @@ from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.held_values import is_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 from ros2_memory.history.scan import decoded_rows, scan
 from ros2_memory.history.transforms import connects
@@ -560,7 +561,9 @@ class ReverseSearch:
         Raises:
             InvalidArgumentsError: the newest value of none of the topics has what is tested.
         """
-        if not self.condition.can_be_refused:
+        are_texts = all(is_text(self._view, topic) for topic in self.topics)
+        is_number_in_texts = are_texts and isinstance(self.condition.test, Equals)
+        if not self.condition.can_be_refused and not is_number_in_texts:
             return
         refusals = []
         for topic in self.topics:

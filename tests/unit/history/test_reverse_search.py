@@ -15,6 +15,7 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
+from mcap.writer import Writer
 
 from ros2_memory import queries
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -34,6 +35,7 @@ from tests.support.bags import (
     text,
     write_mcap,
 )
+from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.noting_reader import NotingReader
 
@@ -150,6 +152,22 @@ def test_never_of_a_word_names_the_constant_that_has_it(
             queries.find_last_match(
                 memory_of(tmp_path), Call(), "/winch", kind, word, field="state"
             )
+
+
+@pytest.mark.parametrize("value", [5, True])
+def test_a_number_is_refused_where_all_are_texts_but_not_of_json_that_may_have_one(
+    tmp_path: Path, value: JsonValue
+) -> None:
+    def fill(writer: Writer) -> None:
+        channel = writer.register_channel("/json", "json", 0)
+        writer.add_message(channel, T0, b'{"state": "up"}', T0)
+
+    raw_mcap(tmp_path / "rec" / "rec_0.mcap", fill)
+    write_mcap(tmp_path / "bag.mcap", [text(T0, "5")])
+    memory = memory_of(tmp_path)
+    assert last(memory, "equals", value, topic="/json").found is None
+    with pytest.raises(InvalidArgumentsError, match="the values are texts"):
+        last(memory, "equals", value, topic="/chatter")
 
 
 def last(
