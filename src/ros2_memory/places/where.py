@@ -136,8 +136,11 @@ def parse_where(
         (name, _parse_place(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}"))
         for name, place_value in several.items()
     )
+    # Two spellings of one name are one place.
     places = tuple(
-        replace(place, name=name) if place.name is None else place for name, place in by_name
+        dict.fromkeys(
+            replace(place, name=name) if place.name is None else place for name, place in by_name
+        )
     )
     if len(places) == 1:
         return places[0]

@@ -131,6 +131,15 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
         assert rows["(elsewhere)"]["seconds"] > 0
 
 
+def test_two_spellings_of_a_place_are_one(memory: Memory, folder: Path) -> None:
+    given = {**HELLO, **SPAN, "by": "place"}
+    once, twice = (
+        asked(memory, folder, "find_matches", where=where, **given)
+        for where in (["hall", "den"], ["hall", "den", "Hall "])
+    )
+    assert twice == once
+
+
 @pytest.mark.parametrize(
     ("where", "said"),
     [
