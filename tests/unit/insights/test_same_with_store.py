@@ -4,6 +4,7 @@ from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any, Final, Literal
+from unittest.mock import patch
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -98,12 +99,14 @@ def test_every_question_is_answered_as_without_a_store(
         plain = memory_of(bags, limits=LIMITS, clock=FixedClock(max(moments) + S))
         known = with_store(plain, bags, part=part)
 
-        for tool, question in questions:
-            first, last = draw.choice([sorted(draw.choices(moments, k=2)), [0, 4 * 10**18]])
-            given_ = {**question, "start": first / S, "end": last / S}
-            if tool == "compare":
-                given_ |= {"with_start": moments[0] / S - 1, "with_end": moments[1] / S}
-            answer = asked(plain, bags, tool, **given_)
-            # What was joined of all that is stored serves when it is asked for again.
-            for _ in range(2):
-                assert_same_counts(asked(known, bags, tool, **given_), answer)
+        # Parts are few here: what is known of columns is still read in several pieces.
+        with patch("ros2_memory.columns.scanner._TOGETHER", 1 + seed % 9):
+            for tool, question in questions:
+                first, last = draw.choice([sorted(draw.choices(moments, k=2)), [0, 4 * 10**18]])
+                given_ = {**question, "start": first / S, "end": last / S}
+                if tool == "compare":
+                    given_ |= {"with_start": moments[0] / S - 1, "with_end": moments[1] / S}
+                answer = asked(plain, bags, tool, **given_)
+                # What was joined of all that is stored serves when it is asked for again.
+                for _ in range(2):
+                    assert_same_counts(asked(known, bags, tool, **given_), answer)
