@@ -93,7 +93,7 @@ def test_between_two_recordings_is_no_step_where_a_third_one_has_a_pause(tmp_pat
     ]
     write_mcap(tmp_path / "beside" / "beside_0.mcap", beside)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert (BEGIN + 200) * S in [pause.end for pause in memory.index.snapshot().suspects]
+    assert (BEGIN + 200) * S in [pause.end for pause in memory.index.snapshot().pauses]
     assert steps(memory, tmp_path) == []
 
 
