@@ -25,7 +25,6 @@ from ros2_memory.core.timebase import (
     Ns,
     Span,
     ns_from_unix,
-    unix_from_ns,
 )
 from ros2_memory.counts.bins import local_offset
 from ros2_memory.history.coverage import recorded_reach
@@ -88,8 +87,11 @@ def in_each(
     wall = memory.clock.now()
     snapshot = memory.snapshot(min(search_window(span, wall).stop, wall))
     whole = search_window(span, memory.now(wall, snapshot.latest, call))
+    start, end = whole.asked()
     first, last = recorded_reach(snapshot, whole) or (0, -1)
-    windows = hours_of_days(whole.intersect(TimeWindow(first, last + 1)), *between)
+    # Up to midnight is no part of the next day.
+    asked = TimeWindow(start, max(end, start + 1)).intersect(TimeWindow(first, last + 1))
+    windows = hours_of_days(asked, *between)
     begins = {window.start for window in windows}
     fixed_memory = replace(memory, fixed=snapshot)
     answers: list[InWindow] = []
@@ -132,7 +134,7 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
     if window.empty:
         return []
     first, last = (
-        datetime.fromtimestamp(unix_from_ns(at)).astimezone().date()
+        datetime.fromtimestamp(at // NS_PER_S).astimezone().date()
         for at in (window.start, window.stop - 1)
     )
     if (last - first).days >= MOST_WINDOWS:

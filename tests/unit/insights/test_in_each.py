@@ -99,6 +99,17 @@ def test_what_comes_as_hours_end_and_begin_counts_once(tmp_path: Path, hours: st
     assert reply["all"]["total"] == len(ticks)
 
 
+def test_a_month_of_dates_has_the_hours_of_its_own_days(tmp_path: Path) -> None:
+    ticks = [text((MIDNIGHT + 3600 * nth) * S, "tick") for nth in range(-24, 24 * 32)]
+    write_mcap(tmp_path / "bag.mcap", ticks)
+    given = {"topic": "/chatter", "start": "2026-07-14", "end": "2026-08-13", "max_samples": 1}
+    reply = asked(
+        memory_of(tmp_path), tmp_path, "get_topic_in_range", **given, between="20:00-24:00"
+    )
+    begins = [row["start"] - MIDNIGHT for row in reply["windows"]]
+    assert begins == [day * DAY_S + 20 * 3600 for day in range(31)]
+
+
 def _without_ages(value: Any) -> Any:
     if isinstance(value, list):
         return [_without_ages(each) for each in value]
