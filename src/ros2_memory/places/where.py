@@ -26,7 +26,7 @@ from ros2_memory.core.text import abbreviate, caseless
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import deletions, holds_on
+from ros2_memory.history.held_values import breaks_of, deletions, holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
@@ -382,22 +382,35 @@ class _ConditionStates:
         condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
         self.search = ReverseSearch(view, topic, condition)
         self._holds_on = holds_on(view, self.search.topics)
-        self._deletions = sorted(
-            chain.from_iterable(deletions(view, topic) for topic in self.search.topics)
-        )
+        found = breaks_of if self._holds_on else deletions
+        moments = chain.from_iterable(found(view, topic) for topic in self.search.topics)
+        self._breaks = sorted(moments)
         self._known = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._values: list[bool] = []
 
     def known_in(self, window: TimeWindow) -> Spans:
-        """Returns when the topics said something: without silences, unless that holds on."""
+        """Returns when it is known what the topics said: without silences, unless that holds on."""
         topics, timeline = self.search.topics, self._view.timeline
         if self._holds_on:
             spans = (span for topic in topics for span in timeline.recordings(topic).values())
             known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
+            known = without(known, self._after_breaks(window))
         else:
             known = _heard(self._view, topics, window.widened(SILENCE_NS))
         return without(known, note_robots_on(self._view, topics, window))
+
+    def _after_breaks(self, window: TimeWindow) -> Spans:
+        """Returns from each break to the next message, as far as they reach into a window."""
+        spans: Spans = []
+        reached = MIN_NS
+        for at in self._breaks[max(bisect_right(self._breaks, window.start) - 1, 0) :]:
+            if reached <= at < window.stop:
+                after = TimeWindow(at + 1, window.stop)
+                message = self._view.stream.first(self.search.topics, after)
+                reached = MAX_NS if message is None else message.time
+                spans.append((at, reached))
+        return spans
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether the newest message then met the condition; False without one."""
@@ -410,7 +423,7 @@ class _ConditionStates:
         return (
             self._values[number - 1]
             and (self._holds_on or time - last <= SILENCE_NS)
-            and self._deleted_from(last) >= time
+            and self._broken_from(last) >= time
         )
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
@@ -420,15 +433,15 @@ class _ConditionStates:
             last, following = self._times[number - 1], self._next_after(time, end)
             if not self._holds_on and min(following, end) - last > SILENCE_NS:
                 return max(time, last)
-            if (deleted := self._deleted_from(last)) < min(following, end):
-                return max(time, deleted)
+            if (broken := self._broken_from(last)) < min(following, end):
+                return max(time, broken)
             time = following
         return min(time, end)
 
-    def _deleted_from(self, last: Ns) -> Ns:
-        """Returns from when on messages after one may have been deleted; `MAX_NS`: none was."""
-        nth = bisect_left(self._deletions, last)
-        return self._deletions[nth] if nth < len(self._deletions) else MAX_NS
+    def _broken_from(self, last: Ns) -> Ns:
+        """Returns from when on what a message said is not known to hold; `MAX_NS`: it may hold."""
+        nth = bisect_left(self._breaks, last)
+        return self._breaks[nth] if nth < len(self._breaks) else MAX_NS
 
     def parts_of(self, first: Ns, last: Ns) -> Iterator[Span]:
         """Yields the parts of a time (inclusive) in which the condition is met, in order."""

@@ -112,5 +112,7 @@ def test_a_value_is_not_held_on_across_messages_that_were_deleted_by_request(
     docked_then = {"topic": DOCKED, "condition_type": "equals", "value": True}
     for end, last in ((12, 12), (50, 20)):
         span = {"start": T0_S, "end": T0_S + end, "while": docked_then}
-        [found] = asked(asking, tmp_path, "find_matches", **odometry, **span)["sightings"]
+        answer = asked(asking, tmp_path, "find_matches", **odometry, **span)
+        [found] = answer["sightings"]
         assert (found["first_seen"] - T0_S, found["last_seen"] - T0_S) == (6, last)
+    assert answer["unknown_s"] == 30

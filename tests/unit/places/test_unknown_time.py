@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from tests.support.bags import Msg, boolean, odom, text, write_splits
+from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.support.tables import table
@@ -53,6 +53,21 @@ def test_pauses_of_the_recording_are_no_unknown_time(tmp_path: Path) -> None:
     for scope in ({"where": HERE}, {"while": CALM}):
         assert "unknown_s" not in asked(memory, tmp_path, "find_matches", **PRESSED, **scope)
     assert "unknown_s" not in asked(memory, tmp_path, "visits", **HERE)
+
+
+@pytest.mark.parametrize("latched", [False, True])
+def test_what_a_seldom_topic_said_holds_in_another_run_only_if_it_is_latched(
+    tmp_path: Path, latched: bool
+) -> None:
+    layout = McapLayout(latched=frozenset({"/mood"} if latched else ()))
+    write_splits(tmp_path, life(60, {"/mood": [(1, 60)]}), name="first", layout=layout)
+    said = life(60, {"/mood": [(0, 30), (31, 60)]})
+    later = [replace(one, log_time=one.log_time + 600 * S) for one in said]
+    write_splits(tmp_path, later, name="second", layout=layout)
+    answer = asked(memory_of(tmp_path), tmp_path, "find_matches", **PRESSED, **{"while": CALM})
+    begins = [row["first_seen"] - T0 for row in answer["sightings"]]
+    assert begins == [600 if latched else 630, 0]
+    assert answer.get("unknown_s") == (None if latched else 30)
 
 
 def brute(times: Sequence[int], first: int, last: int, start: int, end: int) -> int:
