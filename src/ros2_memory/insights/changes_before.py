@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import (
@@ -17,6 +18,7 @@ from ros2_memory.analysis.facts import (
     COMMAND,
     FLAG,
     GOAL,
+    GOALS,
     LOG,
     LOW_CHARGES,
     STATUS,
@@ -32,6 +34,7 @@ from ros2_memory.core.text import Quoted, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
+from ros2_memory.history.held_values import is_latched
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (
     GOAL_WORDS,
@@ -178,7 +181,7 @@ def changes_in(
         for change in _changes_of_topic(topic, events)
     ]
     return ChangesBefore(
-        [*changes, *_commanded_stops(command, events_of_topics)],
+        [*changes, *_commanded_stops(view, command, events_of_topics)],
         tuple(looked_at),
         tuple(_state_at_end(view, window, events_of_topics)),
         events_of_topics,
@@ -186,17 +189,28 @@ def changes_in(
 
 
 def _commanded_stops(
-    command: str, events_of_topics: Mapping[str, TopicEvents]
+    view: View, command: str, events_of_topics: Mapping[str, TopicEvents]
 ) -> Iterator[_DatedChange]:
     """Yields when the commanded velocity became zero while a goal was active."""
     if command not in events_of_topics:
         return
-    actions = [[*_goal_activity(events)] for events in events_of_topics.values()]
+    actions = {topic: [*_goal_activity(events)] for topic, events in events_of_topics.items()}
     _, commands = events_of_topics[command].of_kind(COMMAND)
     for change in commands:
-        if not change.value and any(_is_active(action, change.time) for action in actions):
+        if not change.value and any(
+            _is_active(action, change.time) and _is_said_since_break(view, topic, change.time)
+            for topic, action in actions.items()
+        ):
             text = f"{command} went to zero while a goal was active"
             yield _DatedChange(change.time, change.time, text)
+
+
+def _is_said_since_break(view: View, topic: str, at: Ns) -> bool:
+    """Returns whether a topic had a message since the run of the recorder at a moment began."""
+    breaks = view.snapshot.breaks
+    nth = bisect_right(breaks, at, key=itemgetter(1)) - 1
+    begun = breaks[nth][1] if nth >= 0 else MIN_NS
+    return any(view.timeline.extents(topic, TimeWindow(begun, at + 1)))
 
 
 def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
@@ -310,8 +324,14 @@ def _is_active(activity: Sequence[tuple[Ns, bool]], time: Ns) -> bool:
 def _state_at_end(
     view: View, window: TimeWindow, events_of_topics: Mapping[str, TopicEvents]
 ) -> Iterator[tuple[str, bool | str]]:
-    """Yields booleans, statuses that are not ok, and the newest goal of each action, at the end."""
+    """Yields booleans, statuses that are not ok, and the newest goal of each action, at the end.
+
+    Of another run of the recorder only what a latched topic said: no goal goes on.
+    """
     for topic, events in events_of_topics.items():
+        goes_on = is_latched(view, topic) and GOALS not in view.timeline.types_of(topic)
+        if not goes_on and not _is_said_since_break(view, topic, window.stop - 1):
+            continue
         is_battery = any(state.kind == CHARGE for state in events.known)
         for flag in () if is_battery else events.of_kind(FLAG)[0]:
             yield flag_name(topic, flag), bool(flag.last)

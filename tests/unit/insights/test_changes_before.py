@@ -5,6 +5,7 @@ import pytest
 
 from ros2_memory.history.context import Memory
 from tests.support.bags import (
+    McapLayout,
     Msg,
     battery,
     boolean,
@@ -130,3 +131,20 @@ def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None
         ("warning of d: late", 2.4),
     ]
     assert before(memory, 50.0)["after"] == []
+
+
+@pytest.mark.parametrize("listed_again", [False, True])
+def test_of_another_run_only_what_a_latched_topic_said_goes_on(
+    tmp_path: Path, listed_again: bool
+) -> None:
+    layout = McapLayout(latched=frozenset({"/docked", "/drive/_action/status"}))
+    said = [boolean(at(50), True, "/docked"), boolean(at(50), True), goals(at(50), {1: 2})]
+    write_splits(tmp_path, [*driving(60, 60), *said], name="first", layout=layout)
+    later = [odom(at(600 + t), 24.0, 0.0) for t in range(60)]
+    later += [command(at(600 + t), 0.4 if t < 40 else 0.0) for t in range(30, 60)]
+    later += [goals(at(601), {1: 2})] * listed_again
+    write_splits(tmp_path, later, name="second", layout=layout)
+    reply = before(memory_of(tmp_path), 642.0)
+    went_on = [("/cmd_vel went to zero while a goal was active", 2.0)]
+    assert told(reply) == (went_on if listed_again else [])
+    assert reply["state"] == {"/docked": True} | ({"/drive goal": "active"} if listed_again else {})
