@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import is_thinned
@@ -57,9 +58,17 @@ class BagAccess:
         self.notes = Notes()
         self._deadline = call.deadline
 
+    def end_early(self, left_s: float) -> None:
+        """Ends reading so long before the call's time is over, or after half of it."""
+        deadline = self.call.deadline
+        at_s = deadline.at_s - min(left_s, deadline.budget_s / 2)
+        self._deadline = replace(deadline, at_s=at_s)
+
     def finish_within(self, budget_s: float) -> None:
-        """Gives a call whose time is over some more, to say what it found."""
-        self._deadline = Deadline.after(budget_s)
+        """Gives a call the rest of its time, at least so much, to say what it found."""
+        deadline = self.call.deadline
+        is_enough = deadline.left_s() >= budget_s
+        self._deadline = deadline if is_enough else Deadline.after(budget_s)
 
     def check_deadline(self) -> None:
         """Checks that the call has time left.

@@ -44,7 +44,7 @@ from ros2_memory.insights.episodes import (
     says_episodes,
     with_robot,
 )
-from ros2_memory.insights.sighting_search import Run, find_runs
+from ros2_memory.insights.sighting_search import Run, SearchedRuns, find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.insights.topic_events import GoalRun, goals_asked
 from ros2_memory.messages.detections import Detection, detections_of
@@ -65,7 +65,7 @@ _SightingOrEpisode = TypeVar("_SightingOrEpisode", Sighting, Episode)
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
 _LEFT_TO_SAY_S: Final = 2.0
-"""How long the messages of what was found are read after a search ran out of time."""
+"""How long before the end of its time a search ends, to read the messages of what was found."""
 
 
 def find_matches(
@@ -218,12 +218,19 @@ def _episodes_of_text(
     return episodes, total, searched
 
 
+def _search(view: View, search: ReverseSearch, scope: Scope, *, enough: int | None) -> SearchedRuns:
+    """Returns what `find_runs` finds with some of the call's time left to say it."""
+    view.bags.end_early(_LEFT_TO_SAY_S)
+    result = find_runs(view, search, scope, enough=enough)
+    view.bags.finish_within(_LEFT_TO_SAY_S)
+    return result
+
+
 def _runs_as_sightings(
     view: View, search: ReverseSearch, scope: Scope, shown: _Selection, fields: Sequence[str]
 ) -> _Found[Sighting]:
-    result = find_runs(view, search, scope, enough=None if shown.oldest_first else shown.limit)
+    result = _search(view, search, scope, enough=None if shown.oldest_first else shown.limit)
     if result.is_over:
-        view.bags.finish_within(_LEFT_TO_SAY_S)
         view.notes.add_lack(
             f"the search ran out of time at {unix_text(result.searched_to or MIN_NS)}: to "
             "continue, pass that time as end"
@@ -233,7 +240,7 @@ def _runs_as_sightings(
     )
     searched, total = scope.window, len(result.table) if result.searched_to is None else None
     if total is None:
-        searched = TimeWindow(runs[-1].first, searched.stop)
+        searched = TimeWindow(runs[0 if shown.oldest_first else -1].first, searched.stop)
     view.notes.retract_outside(searched)
     # To say where the robot was takes longest.
     sightings: list[Sighting] = []
@@ -269,7 +276,7 @@ def read_sightings(
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
         NoDataError: there is no such topic, or none of its messages can be decoded.
-        QueryTimeoutError: the call's time is over before the first match was result.
+        QueryTimeoutError: the call's time is over before the first match was found.
     """
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
@@ -283,15 +290,22 @@ def read_sightings(
         too_many = f"more than {MOST_COUNTED:,} episodes" if len(found) == MOST_COUNTED else ""
         spans = held_spans((episode.first, episode.until, True) for episode in found)
         return spans, since, too_many
-    result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
-    if result.is_over:
-        view.bags.finish_within(_LEFT_TO_SAY_S)
+    result = _search(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     start, end = scope.window.asked()
     spans, is_log = result.spans, np.array([*map(view.timeline.is_log, topics)], np.bool_)
     states = np.flatnonzero(~is_log[result.table[:, 0]])
-    spans[states, 1] = [_lasted_until(view, run, scope) for run in result.runs(states)]
     # Without a scope the oldest may have begun before what there was time to search.
     spans[:, 2] |= not scope.is_bounded
+    known = 0
+    try:
+        for known, run in zip(states.tolist(), result.runs(states), strict=True):
+            spans[known, 1] = _lasted_until(view, run, scope)
+    except QueryTimeoutError:
+        # Those of several topics overlap.
+        if not known or len(topics) > 1:
+            raise
+        view.bags.finish_within(_LEFT_TO_SAY_S)
+        return spans[:known], int(spans[known - 1, 0]), ""
     if result.is_over:
         return spans, int(spans[-1, 0]), ""
     earlier = [

@@ -15,9 +15,11 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import Deadline
+from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
+from ros2_memory.tools.replies import as_json
 from tests.support.bags import (
     boolean,
     detections,
@@ -31,6 +33,7 @@ from tests.support.bags import (
 )
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import asked, each_way, memory_of
+from tests.support.tables import table
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -192,6 +195,72 @@ def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
         assert sighting.begun != any("ran out of time" in note for note in answer.notes)
     assert counts == sorted(counts)
     assert counts[0] < bags * 10 == counts[-1]
+
+
+def test_a_search_ends_early_enough_to_say_what_it_found(tmp_path: Path) -> None:
+    for nth in range(20):
+        write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(BEGIN + nth * S, True)])
+    # A clock that goes on by 0.1 s at each look.
+    call = Call(Deadline.after(4, (look / 10 for look in range(1000)).__next__))
+    answer = find_matches(memory_of(tmp_path), call, "/bumper", "equals", value=True)
+    assert any("ran out of time" in note for note in answer.notes)
+    assert call.deadline.left_s() > 1
+
+
+def test_spells_whose_ends_are_known_count_where_there_is_no_time_to_look_for_all(
+    tmp_path: Path,
+) -> None:
+    spells = 6
+    for nth in range(spells):
+        times = [BEGIN + (nth * 10 + t) * S for t in range(10)]
+        driven = [odom(at, float(at // S % 10), 0.0) for at in times]
+        moods = [text(at + 1, "calm", topic="/mood") for at in times]
+        write_mcap(tmp_path / f"bag_{nth}.mcap", [*driven, *moods])
+    memory = memory_of(tmp_path)
+    calm = [WhileCondition("/mood", "equals", "calm")]
+    answered: list[bool] = []
+    for looks in range(1, 60):  # how often the clock may be looked at before the time is over
+        call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
+        try:
+            answer = count_matches(
+                memory, call, "/odom", "above", 5.5, by="hour", field="position.x", during=calm
+            )
+        except QueryTimeoutError:
+            answered.append(False)
+            continue
+        answered.append(True)
+        whole = table(as_json(answer, tmp_path))["all"]
+        assert whole["seconds"] == whole["count"] * 4 - 1
+        is_whole = whole["count"] == spells
+        assert is_whole != any("out of time" in note for note in answer.notes)
+    # Once no time was left for the end of the newest one.
+    assert answered[answered.index(True) :].count(False) <= 1
+
+
+def test_a_damaged_bag_between_the_oldest_sightings_is_noted_where_time_is_over(
+    tmp_path: Path,
+) -> None:
+    for nth in range(6):
+        times = [BEGIN + (nth * 10 + t) * S for t in range(10)]
+        write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(at, at < times[5]) for at in times])
+    bag = tmp_path / "bag_3.mcap"
+    data = bytearray(bag.read_bytes())
+    data[200] ^= 0xFF
+    bag.write_bytes(data)
+    memory = memory_of(tmp_path)
+    spanned = 0
+    for looks in range(1, 60):  # how often the clock may be looked at before the time is over
+        call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
+        try:
+            answer = find_matches(
+                memory, call, "/bumper", "equals", value=True, oldest_first=True, limit=2
+            )
+        except QueryTimeoutError:
+            continue
+        if answer.sightings[0].first < BEGIN + 30 * S:
+            assert any("damaged" in note for note in answer.notes)
+            spanned += any("ran out of time" in note for note in answer.notes)
+    assert spanned
 
 
 def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) -> None:
