@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.pauses import SHORTEST_SILENCE_NS, SILENT_PERIODS
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import NS_PER_S, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -150,7 +150,7 @@ def silences(
     for topic, period in periods.items():
         others = frozenset(companions.get(topic, ()))
         if others not in robot_on:
-            robot_on[others] = _heard([runs_of[other] for other in sorted(others)])
+            robot_on[others] = heard([runs_of[other] for other in sorted(others)])
         limit = shortest_silence(period)
         runs = united(runs_of[topic], limit)
         found = _silences_of(topic, runs, robot_on[others], limit, gaps)
@@ -158,7 +158,7 @@ def silences(
     return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
-def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
+def heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
     """Returns when one in `_TOGETHER` of the topics is heard besides one that is silent."""
     enough = max(1, -(-(len(topics) - 1) // _TOGETHER))
     changes = sorted(
@@ -175,6 +175,24 @@ def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
     return united(spans, SHORTEST_NS)
 
 
+def prolonged(
+    silence: Silence, robot_on: Sequence[Span], runs: Sequence[Span], gaps: Sequence[Span]
+) -> Silence:
+    """Returns a silence that goes on as it went on in later bags.
+
+    Args:
+        silence: as bags showed it that were deleted.
+        robot_on: when the robot was on, in order.
+        runs: of its topic, in later bags.
+        gaps: as for `silences`.
+    """
+    again = next((first for first, _ in runs if first >= silence.end), MAX_NS)
+    missed, length, is_parted = _missed(silence.end, again, robot_on, 0, gaps)
+    end = missed[-1][1] if missed else silence.end
+    goes_on = again == MAX_NS and not is_parted
+    return Silence(silence.topic, silence.start, end, silence.length + length, goes_on)
+
+
 def _silences_of(
     topic: str, runs: Sequence[Span], robot_on: Sequence[Span], limit: Ns, gaps: Sequence[Span]
 ) -> Iterator[Silence]:
@@ -183,23 +201,34 @@ def _silences_of(
     end = max(last_heard, robot_on[-1][1] if robot_on else last_heard)
     nexts = [first for first, _ in runs[1:]]
     for (_, start), stop in zip(runs, [*nexts, end], strict=True):
-        nth = bisect_right(robot_on, start, key=itemgetter(1))
-        missed: list[Span] = []
-        length, until, is_parted = 0, start, False
-        for on_from, on_to in robot_on[nth:]:
-            # What follows so long a time is another robot's, perhaps.
-            is_parted = on_from - until > LONGEST_OFF_NS
-            if on_from >= stop or is_parted:
-                break
-            until = on_to
-            first, last = max(on_from, start), min(on_to, stop)
-            recorded = last - first - length_in(gaps, first, last)
-            if recorded > limit:
-                missed.append((first, last))
-                length += recorded
+        missed, length, is_parted = _missed(start, stop, robot_on, limit, gaps)
         if missed:
             goes_on = start == last_heard and not is_parted
             yield Silence(topic, missed[0][0], missed[-1][1], length, goes_on)
+
+
+def _missed(
+    start: Ns, stop: Ns, robot_on: Sequence[Span], limit: Ns, gaps: Sequence[Span]
+) -> tuple[list[Span], Ns, bool]:
+    """Returns when a topic was missed that is absent from a start to a stop.
+
+    As spans in which the robot was on for longer than a limit, in order; for how long it was on in
+    them; and whether it was off for so long that what follows is not known to be the same robot.
+    """
+    missed: list[Span] = []
+    length, until, is_parted = 0, start, False
+    for on_from, on_to in robot_on[bisect_right(robot_on, start, key=itemgetter(1)) :]:
+        # What follows so long a time is another robot's, perhaps.
+        is_parted = on_from - until > LONGEST_OFF_NS
+        if on_from >= stop or is_parted:
+            break
+        until = on_to
+        first, last = max(on_from, start), min(on_to, stop)
+        recorded = last - first - length_in(gaps, first, last)
+        if recorded > limit:
+            missed.append((first, last))
+            length += recorded
+    return missed, length, is_parted
 
 
 def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:

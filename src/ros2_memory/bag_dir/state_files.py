@@ -331,14 +331,21 @@ class Thinned:
     left_open: tuple[Int64, ...] = ()
 
     def from_day(self, day: str) -> Thinned:
-        """Returns what does not end before a day (UTC), as names have it."""
+        """Returns what does not end before a day (UTC), as names have it.
+
+        Of silences that go on, what does not begin before it.
+        """
 
         def stays(last: Ns) -> bool:
             return utc_day(last) >= day
 
         return Thinned(
             self.since,
-            tuple(silence for silence in self.silences if stays(silence[2])),
+            tuple(
+                silence
+                for silence in self.silences
+                if stays(silence[1] if silence[4] else silence[2])
+            ),
             tuple(pause for pause in self.pauses if stays(pause[1])),
             tuple(step for step in self.set_back if stays(step[0])),
             tuple(filter(stays, self.left_open)),

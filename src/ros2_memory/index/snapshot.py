@@ -27,8 +27,10 @@ from ros2_memory.analysis.silences import (
     SHORTEST_NS,
     Pacing,
     Silence,
+    heard,
     joined,
     length_in,
+    prolonged,
     shortest_silence,
     silences,
     usual_periods,
@@ -166,6 +168,17 @@ class Snapshot:
             chain.from_iterable(segment.together for segment in self._dated_segments)
         )
         return tuple(silences(self._periods, self._runs, together, self.gaps))
+
+    def prolonged(self, silence: Silence) -> Silence:
+        """Returns a silence that deleted bags showed, as it went on in later ones."""
+        if not silence.goes_on:
+            return silence
+        return prolonged(silence, self._robot_on, self._runs.get(silence.topic, ()), self.gaps)
+
+    @cached_property
+    def _robot_on(self) -> Sequence[Span]:
+        """When the robot was on, by all topics that have a usual rate."""
+        return heard([self._runs[topic] for topic in self._periods])
 
     def shortest_silence(self, topic: str) -> Ns:
         """Returns how long a topic must have no message to count as silent."""

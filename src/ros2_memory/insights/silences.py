@@ -65,7 +65,7 @@ def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
     # Until its bags are deleted, they show it as well.
     deleted = [
         silence
-        for silence in map(Silence._make, read_thinned(bag_dir).silences)
+        for silence in map(snapshot.prolonged, map(Silence._make, read_thinned(bag_dir).silences))
         if not any(silence.within(kept.start, kept.end) for kept in shown[silence.topic])
     ]
     return sorted(

@@ -28,6 +28,7 @@ import numpy as np
 
 from ros2_memory.analysis.clock_steps import SHORTEST_STEP_NS, STAMPS_BESIDE_NS
 from ros2_memory.analysis.intervals import THINNED_NS
+from ros2_memory.analysis.silences import Silence
 from ros2_memory.bag_dir.layout import utc_day
 from ros2_memory.bag_dir.state_files import Thinned
 from ros2_memory.columns.plan import fields_at, is_time
@@ -455,12 +456,12 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
     def is_in(at: Ns) -> bool:
         return any(bag.start <= at <= bag.end for bag in bags)
 
-    topic_and_start = itemgetter(0, 1)
-    silences = {topic_and_start(silence): silence for silence in known.silences}
-    silences |= {
+    silences = {
         (silence.topic, silence.start): (*silence,)
-        for silence in snapshot.silences
-        if is_in(silence.start)
+        for silence in (
+            *map(snapshot.prolonged, map(Silence._make, known.silences)),
+            *(silence for silence in snapshot.silences if is_in(silence.start)),
+        )
     }
     steps = [
         (fault.at, fault.by)

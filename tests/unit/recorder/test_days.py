@@ -879,6 +879,43 @@ def test_a_silence_is_forgotten_with_its_topic(
     assert not reply_over(blind, "data_time_range").get("silences")
 
 
+def test_a_silence_of_deleted_bags_goes_on_and_ends_as_others_show(bag_dir: Path) -> None:
+    whole = bag_dir.with_name("whole")
+
+    def check() -> None:
+        both = [reply_over(folder, "data_time_range")["silences"] for folder in (bag_dir, whole)]
+        assert both[0] == both[1]
+
+    for folder in (bag_dir, whole):
+        splits(folder, range(3))
+        split(folder, 180, name="rec_B", labels=None)
+    keep_all(bag_dir)
+    shutil.rmtree(bag_dir / "rec_A")
+    check()
+    for start, labels in ((240, None), (300, ("mug",))):
+        for folder in (bag_dir, whole):
+            split(folder, start, name="rec_B", labels=labels)
+        check()
+    for folder in (bag_dir, whole):
+        split(folder, 360, name="rec_C")
+    keep_all(bag_dir, "rec_B")
+    shutil.rmtree(bag_dir / "rec_B")
+    check()
+
+
+def test_a_silence_that_goes_on_goes_with_the_day_in_which_it_began(bag_dir: Path) -> None:
+    later = 2 * 86_400
+    splits(bag_dir, range(3))
+    for start in (180, later):
+        split(bag_dir, start, name="rec_B", labels=None)
+    for name in ("rec_A", "rec_B"):
+        keep_all(bag_dir, name)
+    assert read_thinned(bag_dir).silences
+    limits = MemoryLimits(max_age_ns=86_400 * S)
+    days_of(bag_dir, limits=limits).limit(T0 + (later + 3600) * S)
+    assert not read_thinned(bag_dir).silences
+
+
 def test_what_bags_showed_goes_with_the_last_day_of_that_time(blind: Path) -> None:
     later = 2 * 86_400
     split(blind, later, name="rec_B")
