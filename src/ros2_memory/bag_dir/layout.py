@@ -76,6 +76,10 @@ EXPIRED_FILE: Final = f"{OWN_FOLDER}/expired.json"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""
+TIMED_FILES: Final = frozenset(
+    {LOST_FILE, DELETED_FILE, EXPIRED_FILE, SCREENED_FILE, TRIGGERS_FILE}
+)
+"""What is known of recordings by log times, which those of the next simulation have, too."""
 RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE, THINNED_NAME})
 """Files beside the bags of a recording, which mean nothing without them."""
 

@@ -2,8 +2,9 @@
 
 `recording.clear_on_startup` is for simulation and tests, so moments go too. Bags of other programs
 stay, unless retention deletes those as well (`retention.foreign`). Only files that are known by
-name are deleted, and a directory when that leaves it empty. Links are not followed, and bags of
-another file system that is mounted below are left alone.
+name are deleted, and a directory when that leaves it empty. With the last recording goes what is
+known by log times. Links are not followed, and bags of another file system that is mounted below
+are left alone.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ import os
 import pwd
 from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.bag_dir.json_files import state_path
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
     LOST_AND_FOUND,
@@ -22,7 +25,9 @@ from ros2_memory.bag_dir.layout import (
     MOMENT_FILE,
     MOMENTS_FOLDER,
     OWN_FILES,
+    TIMED_FILES,
     bag_kind,
+    has_own_name,
 )
 from ros2_memory.core import directories
 from ros2_memory.core.directories import known_identity
@@ -30,6 +35,8 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal, remove_bag, remove_emptied
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
@@ -105,10 +112,19 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
     for folder, had_bags in reversed(touched):  # the deepest first
         with suppress(OSError):
             _remove_emptied(root, folder, had_bags=had_bags)
-    for name in OWN_FILES:
+    for name in _state_files(cleared, map(itemgetter(0), touched)):
         with suppress(OSError):
-            (root / name).unlink()
+            state_path(root, name).unlink()
     return cleared
+
+
+def _state_files(cleared: Cleared, folders: Iterable[Path]) -> frozenset[str]:
+    """Returns the recorder's files that go; what is known by log times, with its last recording."""
+    # Beside one that is left, what is held back of it stays so.
+    is_left = cleared.faults or any(
+        has_own_name(folder.name) and folder.exists() for folder in folders
+    )
+    return OWN_FILES if is_left else OWN_FILES | TIMED_FILES
 
 
 def _is_left_alone(name: str) -> bool:

@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.bag_dir.layout import SCREENED_FILE, TIMED_FILES
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
+from tests.support.screened_bags import ScreenedBags, off, on, words
 
 
 def make(root: Path, *names: str) -> None:
@@ -47,6 +49,7 @@ def test_a_directory_that_cannot_be_listed_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make(tmp_path, "rec_1/rec_1_0.mcap", "rec_2/rec_2_0.mcap", "lost+found/x", ".trash/x")
+    make(tmp_path, SCREENED_FILE)
     scandir = os.scandir
 
     def failing(path: str | int) -> object:
@@ -58,6 +61,7 @@ def test_a_directory_that_cannot_be_listed_is_named(
     wiped = clear_bags(tmp_path)
     assert wiped.faults == [f"{tmp_path / 'rec_1'} cannot be deleted: Input/output error"]
     assert wiped.files == 1
+    assert (tmp_path / SCREENED_FILE).exists()
 
 
 def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -> None:
@@ -79,6 +83,29 @@ def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -
         "x",
         "x/recorder.json",
     ]
+
+
+def test_of_the_next_simulation_nothing_is_excluded_by_the_times_of_the_last(
+    tmp_path: Path,
+) -> None:
+    for begin, mode in ((0, on(0)), (3600, off(0))):  # by the wall clock
+        clear_bags(tmp_path)
+        bags = ScreenedBags(tmp_path)
+        bags.split(bags.begin(begin), [mode, *words(0, 5)])
+        bags.end()
+    assert bags.seconds() == [0.5, 1.5, 2.5, 3.5, 4.5]
+
+
+@pytest.mark.parametrize(
+    "folder", ["rec_1", "rec_20260921T130000Z", "moments/a/rec_20260921T130000Z"]
+)
+def test_what_is_known_by_log_times_stays_where_a_recording_is_left(
+    tmp_path: Path, folder: str
+) -> None:
+    make(tmp_path, "rec_1/notes.txt", f"{folder}/notes.txt", *TIMED_FILES)
+    clear_bags(tmp_path)
+    is_left = [(tmp_path / name).exists() for name in sorted(TIMED_FILES)]
+    assert is_left == [folder != "rec_1"] * len(TIMED_FILES)
 
 
 def test_a_bag_directory_that_is_a_link_itself_is_cleared(tmp_path: Path) -> None:
