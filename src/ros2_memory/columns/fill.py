@@ -384,8 +384,10 @@ class Filling:
 
     def _is_over(self, bag: BagFile, level: Level, timeline: Timeline) -> bool:
         """Returns whether no other bag that belongs to the slot of a bag is to be expected."""
-        newest = timeline.segments[-1].latest
-        return max(newest, self._clock.now()) >= _slot(bag, level)[1] + level.length
+        now = self._clock.now()
+        if bag.start > now:  # this clock is behind: else a newest bag that is ahead shows nothing
+            now = timeline.segments[-1].latest
+        return now >= _slot(bag, level)[1] + level.length
 
     def _fitting(self, bags: Sequence[BagFile]) -> list[BagFile]:
         """Returns which of these bags may be stored, the newest first.

@@ -26,6 +26,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import BagReader, Batch
 from ros2_memory.storage.mcap import bulk
 from tests.support.bags import McapLayout, odom, text, write_db3, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.column_worlds import World, check_all, store_file, times
 
 S = NS_PER_S
@@ -70,6 +71,23 @@ def test_bags_that_cannot_be_stored_together_are_stored_alone_but_for_the_faulty
         world.fill()
     assert world.stored() == {f"rec/rec_{number}.mcap" for number in (0, 1, 3)}
     check_all(world)
+
+
+@pytest.mark.parametrize("others", [[], [10**6]])
+def test_bags_have_parts_together_also_beside_one_of_a_clock_that_was_ahead(
+    tmp_path: Path, others: list[int]
+) -> None:
+    for number in others:
+        write_bag(tmp_path, number)
+    clock = SettableClock(T0)
+    world = World.of(tmp_path, clock=clock)
+    for number in range(20):
+        write_bag(tmp_path, number)
+        clock.at = T0 + (number + 1) * 60 * S
+        world.memory.index.refresh()
+        world.fill()
+    tables = 2  # of poses, and of texts
+    assert count(world, "part") == tables * (2 + len(others))
 
 
 # Bags that a crash cut short
