@@ -38,7 +38,7 @@ POSITION_KEYS: Final = ("position", "point", "translation")
 
 # Bounded, since int() refuses texts of thousands of digits.
 _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
-_DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_DECIMAL: Final = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LISTED_PATHS: Final = 16
 _AXES: Final = {"0": "x", "1": "y", "2": "z"}
 """An array of three numbers may be shown as a point."""

@@ -33,8 +33,10 @@ _MAX_BYTES: Final = 64 << 20
 _STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
 _ROOT: Final = "rosbag2_bagfile_information"
 # Patterns, not YAML: parsing the list of a day of splits takes 0.8 s (8640 files).
-_BAG_NAME: Final = re.compile(r"[ \t]*(?:- )?(?:- |path:)[ \t]*['\"]?([^'\"\r\n]+?)['\"]?\s*$")
-_PATH_KEY: Final = re.compile(r"path:[ ]*['\"]?([^'\"\r\n]+?)['\"]?[ \r]*$")
+# Nothing is tried twice: a line may have thousands of spaces.
+_NAME: Final = r"[ \t]*+['\"]?+([^'\"\r\n]++)['\"]?+$"
+_BAG_NAME: Final = re.compile(rf"[ \t]*+(?:- )?(?:- |path:){_NAME}")
+_PATH_KEY: Final = re.compile(rf"path:{_NAME}")
 _COUNT_KEY: Final = re.compile(r"message_count:[ ]*(\d+)")
 _NAMED_POLICY: Final = re.compile(r"reliability:\s*[a-z]")
 _FIRST_OF_FILES: Final = 5
@@ -78,7 +80,7 @@ def parse_listing(text: str) -> Listing:
             path = count = None
             key = key[2:].lstrip(" ")
         if key.startswith("path:"):
-            path_key = _PATH_KEY.match(key)
+            path_key = _PATH_KEY.match(key.rstrip())
             path = path_key[1] if path_key and path is None else path
         elif key.startswith("message_count:") and (count_key := _COUNT_KEY.match(key)):
             number = int(count_key[1])
@@ -86,7 +88,7 @@ def parse_listing(text: str) -> Listing:
             if not is_item:
                 totals.append((len(line) - len(key), number))
         if "." in line:
-            bag_name = _BAG_NAME.match(line)
+            bag_name = _BAG_NAME.match(line.rstrip())
             if bag_name and bag_kind(bag_name[1]):
                 names.append(posixpath.basename(bag_name[1]))
     # That of the whole recording is indented least.

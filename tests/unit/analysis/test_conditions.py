@@ -93,6 +93,8 @@ def test_what_contains_finds(
         *((f"{leaf}", [leaf], True) for leaf in (True, False, 3, -2.5)),
         ("1e3", 1000, True),
         (" 7 ", 7, True),
+        *((text, 5, True) for text in ("5.", "+5.0", "50e-1", "5.e0", ".5e1")),
+        (".", 0, False),
         *((text, {"data": text}, True) for text in ("true", "3", "9" * 5000)),
         *((text, leaf, False) for text, leaf in (("yes", True), ("inf", math.inf))),
         ("Größer", ESCAPED, True),

@@ -38,6 +38,15 @@ def test_a_listing_is_read_in_any_order_of_keys(sort_keys: bool) -> None:
     assert set(listing.names) == {*names}
 
 
+@pytest.mark.parametrize("quote", ["", "'", '"'])
+@pytest.mark.parametrize("end", ["", " ", "\r", " \t\r"])
+def test_a_path_is_read_with_quotes_and_whatever_space_around(quote: str, end: str) -> None:
+    path = f"{quote}a b/r_0.mcap{quote}{end}"
+    text = f"{ROOT}:\n  relative_file_paths:\n  -   {path}\n  files:\n  - path:\t{path}\n"
+    listing = parse_listing(f"{text}    message_count: 5\n")
+    assert listing == Listing(("r_0.mcap", "r_0.mcap"), {"r_0.mcap": 5}, 5)
+
+
 @needs_recorded
 @pytest.mark.parametrize(
     "name", ["session_mcap", "session_sqlite3", "session_zstd", "session_zstd_file"]
