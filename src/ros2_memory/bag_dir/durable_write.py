@@ -57,7 +57,8 @@ def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> 
         for target, beside in temporary.items():
             beside.replace(target)
             flush(target.parent)
-    except OSError:
+    except OSError as error:
+        error.filename = str(target)  # a full disk names none
         for beside in temporary.values():
             with suppress(OSError):
                 beside.unlink(missing_ok=True)

@@ -277,7 +277,7 @@ class Triggers:
         try:
             refused = self.moments.keep_for_rule(request, name, moment.matches, snapshot)
         except OSError as error:
-            self._report(name, record, f"its moments cannot be stored: {error.strerror}")
+            self._report(name, record, f"its moments cannot be stored: {error.strerror or error}")
             return True
         moment.stored = True
         if refused is not None:

@@ -1,5 +1,6 @@
 """Small files that are replaced at once, and closed bags that survive a power cut."""
 
+import errno
 import os
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 from ros2_memory.bag_dir.durable_write import (
     flush_bags,
+    write_durably,
 )
 
 
@@ -42,3 +44,16 @@ def test_what_cannot_be_flushed_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(faults) == 2
     assert faults[0].startswith(str(tmp_path / "a.mcap"))
     assert "power cut" in faults[0]
+
+
+def test_a_full_disk_names_the_file_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as raised:
+        write_durably(tmp_path / "a.yaml", "text")
+    assert raised.value.filename == str(tmp_path / "a.yaml")
+    assert [*tmp_path.iterdir()] == []
