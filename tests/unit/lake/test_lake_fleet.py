@@ -1,6 +1,7 @@
 """A fleet's server with a lake: what was shipped answers, also where no bag is left."""
 
 import importlib.util
+import os
 import shutil
 import threading
 from pathlib import Path
@@ -64,14 +65,14 @@ def test_a_server_starts_though_the_folder_of_a_robot_hangs_and_names_it(
     for name in ("hall", "attic"):
         write_bag(tmp_path / name, 0)
     ship_from(tmp_path)
-    released, is_dir = threading.Event(), Path.is_dir
+    released, stat = threading.Event(), os.stat
 
-    def hanging(path: Path) -> bool:
-        if path == tmp_path / "hall":
+    def hanging(path: str | Path, **options: Any) -> os.stat_result:
+        if path in {tmp_path / "hall", str(tmp_path / "hall")}:
             released.wait()
-        return is_dir(path)
+        return stat(path, **options)
 
-    monkeypatch.setattr(Path, "is_dir", hanging)
+    monkeypatch.setattr(os, "stat", hanging)
     found = reply(served(tmp_path), "find_last_match", CUP, Call(Deadline.after(12.0)))
     released.set()
     assert found["robots_failed"] == {"hall": "timeout"}
