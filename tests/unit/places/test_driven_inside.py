@@ -76,6 +76,21 @@ def test_no_drawn_way_leads_across_a_jump_of_the_map(tmp_path: Path, recalls: bo
     assert note not in own["notes"]
 
 
+@each_way
+def test_what_was_driven_up_to_a_gap_was_not_driven_in_it(tmp_path: Path, recalls: bool) -> None:
+    """Stands for 5 s, then drives straight on at 0.2 m/s; from x 3 to x 6 nothing is recorded."""
+    messages = []
+    for step in (*range(400), *range(700, 1300)):
+        at, x = BEGIN + step * S // 20, 0.2 * max(step / 20 - 5, 0.0)
+        messages += [odom(at, x, 0.0, vx=0.0), tf(at, transform(at, "map", "odom", (0, 0, 0)))]
+    write_splits(tmp_path, messages, 15)
+    memory = memory_of(tmp_path, recalls=recalls)
+    given = {"start": BEGIN / S, "end": BEGIN / S + 65, "where": {"x": [-1, 4], "y": [-1, 1]}}
+    inside = asked(memory, tmp_path, "trajectory_summary", **given)
+    driven = [inside["distance_m"], inside["max_speed"]]
+    assert driven == pytest.approx([3.0, 0.2], abs=0.02)
+
+
 def test_where_the_map_jumped_before_its_time_was_over_is_not_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

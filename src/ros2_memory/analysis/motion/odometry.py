@@ -333,12 +333,14 @@ class MeasuredPath(NamedTuple):
         step_mps: the highest speed from one pose to the next, where these are too few to measure
             a speed.
         parted: which poses a jump or a reset led to.
+        begins: which poses a gap, a jump or a reset led to.
         steps_m: what was driven from each pose to the next.
     """
 
     totals: MotionTotals
     step_mps: float
     parted: tuple[int, ...]
+    begins: tuple[int, ...]
     steps_m: Floats
 
 
@@ -350,7 +352,9 @@ def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> Measur
         positions: x, y and z (m) of each as a row; places.
         fastest_mps: a step that would take a higher speed is a jump.
     """
-    motion, parted, steps_m = Motion(fastest_mps), [], np.zeros(len(times) - 1)
+    motion, steps_m = Motion(fastest_mps), np.zeros(len(times) - 1)
+    parted: list[int] = []
+    begins: list[int] = []
     apart = np.diff(times)
     plain_m = np.sqrt(row_sums(np.diff(positions, axis=0) ** 2))
     begin = 0
@@ -371,10 +375,11 @@ def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> Measur
         )
         motion.count_break(kind, here, there)
         begin = index + 1
+        begins.append(begin)
         if kind != "gap":
             parted.append(begin)
     steps_m[begin:] = motion.add_leg(times[begin:], positions[begin:])
-    return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), steps_m)
+    return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), tuple(begins), steps_m)
 
 
 def _odd_steps(apart: Ints, steps_m: Floats, fastest_mps: float) -> list[int]:

@@ -46,7 +46,7 @@ LEAST_OF_SPEED_S: Final = 0.5
 """Of poses that span less, noise is as large as what was driven: they say no speed."""
 
 _MOST_VERTICES: Final = 400
-"""Vertices that a slice stores of its path, but for the ends of jumps."""
+"""Vertices that a slice stores of its path, but for the ends of jumps and of gaps."""
 _KEPT_WITHIN_M: Final = 0.0175
 """How far a pose may be from the path of a slice. Within 1.25 cm a position's noise of 4 mm keeps
 four times as many vertices."""
@@ -262,11 +262,11 @@ def _line_through(poses: Poses, measured: MeasuredPath) -> tuple[Line, float]:
     """Returns the drawn path of some poses, and how far (m) they may be off it."""
     kept, error_m = np.arange(len(poses)), 0.0
     if len(poses) > _FEW:
-        parted = np.array(measured.parted, np.intp)
+        begins = np.array(measured.begins, np.intp)
         kept, error_m = simplified(
             poses.positions,
             (poses.times - poses.times[0]) / NS_PER_S,
-            np.unique(np.concatenate(([0, len(poses) - 1], parted - 1, parted))),
+            np.unique(np.concatenate(([0, len(poses) - 1], begins - 1, begins))),
             tolerance_m=_KEPT_WITHIN_M,
             at_most=_MOST_VERTICES,
             of_time=_OF_TIME,
