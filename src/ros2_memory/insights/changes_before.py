@@ -34,7 +34,7 @@ from ros2_memory.core.text import Quoted, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import is_latched
+from ros2_memory.history.held_values import held_at, is_latched
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (
     GOAL_WORDS,
@@ -59,7 +59,7 @@ LENGTH_NS: Final = 10 * NS_PER_S
 _LEAD_NS: Final = 30 * NS_PER_S
 """How long before a window messages are read: a change shows by the message before it."""
 _OLDEST_STATE_NS: Final = 3600 * NS_PER_S
-"""How old a state may be that no later message repeats: of a goal, or of a latched boolean."""
+"""How old a state may be that no later message repeats, as of a goal; what is latched holds on."""
 _AROUND_NS: Final = 600 * NS_PER_S
 """A topic with a bag so near is recorded, though it may have nothing to report."""
 _POSE_NS: Final = 2 * NS_PER_S
@@ -247,7 +247,10 @@ def _with_lead(
     if not (LOG in types or events is None or events.known):
         return None
     start = max(window.start - _LEAD_NS, MIN_NS)
-    newest = view.stream.newest(topic, TimeWindow(max(start - _OLDEST_STATE_NS, MIN_NS), start))
+    if is_latched(view, topic) and GOALS not in types:
+        newest = held_at(view, topic, start)
+    else:
+        newest = view.stream.newest(topic, TimeWindow(max(start - _OLDEST_STATE_NS, MIN_NS), start))
     before = None if newest is None else events_of_messages(view, [newest])
     parts = (before, events_in(view, topic, TimeWindow(start, window.start)), events)
     return joined_events([part.without_sights() for part in parts if part is not None])

@@ -148,3 +148,14 @@ def test_of_another_run_only_what_a_latched_topic_said_goes_on(
     went_on = [("/cmd_vel went to zero while a goal was active", 2.0)]
     assert told(reply) == (went_on if listed_again else [])
     assert reply["state"] == {"/docked": True} | ({"/drive goal": "active"} if listed_again else {})
+
+
+def test_what_a_latched_topic_said_is_the_state_also_hours_later_not_a_goal(tmp_path: Path) -> None:
+    said = [boolean(at(t), value, "/docked") for t, value in ((0, True), (7200, False))]
+    said.append(goals(at(0), {1: 2}))
+    beats = [odom(at(t), 0.0, 0.0) for t in range(0, 7300, 10)]
+    layout = McapLayout(latched=frozenset({"/docked", "/drive/_action/status"}))
+    write_splits(tmp_path, [*said, *beats], 1000, layout=layout)
+    memory = memory_of(tmp_path)
+    assert before(memory, 5000.0)["state"] == {"/docked": True}
+    assert told(before(memory, 7203.0)) == [("/docked became false", 3.0)]
