@@ -65,7 +65,7 @@ from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import blocks, in_time, scan
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import held_spans, read_sightings
-from ros2_memory.insights.topic_events import events_back
+from ros2_memory.insights.topic_events import events_back, flags_before
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 from ros2_memory.results import BinColumn, Bins
 from ros2_memory.things.unseen import notes_on_never
@@ -335,6 +335,9 @@ def _flag_spans(
         if len(meant) != 1:
             return None
         [flag] = meant
+        said = flags_before(binned.view, topic, flag.at) if before is None else {}
+        if said.get(flag.name) is (not wanted):
+            states.append((start, False))
         states.append((flag.at, bool(flag.first) is wanted))
         states += [
             (toggle.time, bool(toggle.value) is wanted)

@@ -50,6 +50,7 @@ from ros2_memory.insights.topic_events import (
     FAILURES,
     GoalRun,
     events_in,
+    flags_before,
     goals_in,
     note_limits,
     toggled,
@@ -338,7 +339,7 @@ def _reported_events(
     for topic, topic_events in events_of_topics.items():
         if topic_events is None:
             continue
-        _, toggles = topic_events.of_kind(FLAG)
+        toggles = _toggles(view, topic, topic_events)
         if toggles and is_latched(view, topic):  # what it said holds through gaps
             events += _flip_events(topic, toggles, breaks_of(view, topic))
         elif toggles:
@@ -347,6 +348,18 @@ def _reported_events(
         events += map(_error_event, _errors_in_region(view, topic, topic_events, region_stays))
         note_limits(view, topic, topic_events)
     return events
+
+
+def _toggles(view: View, topic: str, events: TopicEvents) -> list[Change]:
+    """Returns when booleans of a topic toggled, also with the first message of a window."""
+    flags, toggles = events.of_kind(FLAG)
+    before = flags_before(view, topic, events.first) if flags else {}
+    first = [
+        Change(FLAG, flag.name, flag.at, flag.first)
+        for flag in flags
+        if before.get(flag.name) is (not flag.first)
+    ]
+    return [*first, *toggles]
 
 
 class _ThingsInView(NamedTuple):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.facts import GOAL, GOALS, Stated, joined_stated, state_of, stated_by
+from ros2_memory.analysis.facts import FLAG, GOAL, GOALS, Stated, joined_stated, state_of, stated_by
 from ros2_memory.analysis.topic_events import (
     Change,
     KnownState,
@@ -31,8 +31,10 @@ from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
+from ros2_memory.history.held_values import breaks_of, held_at, is_latched
 from ros2_memory.history.scan import (
     blocks,
     joined_back,
@@ -41,6 +43,7 @@ from ros2_memory.history.scan import (
     open_scan,
     remembered,
 )
+from ros2_memory.insights.silences import unrecorded_times
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
@@ -48,7 +51,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -65,6 +67,26 @@ def flag_name(topic: str, flag: KnownState | Change) -> str:
 def toggled(topic: str, toggle: Change) -> str:
     """Returns a sentence for a boolean of a topic that toggled."""
     return f"{flag_name(topic, toggle)} became {'true' if toggle.value else 'false'}"
+
+
+def flags_before(view: View, topic: str, first: Ns) -> dict[str, bool]:
+    """Returns the booleans of the message before one at a log time (ns), by their names.
+
+    Without those that may have toggled in between, since a message there may be missing.
+    """
+    holds_on = is_latched(view, topic)
+    message = held_at(view, topic, first) if holds_on else view.stream.last(topic, first)
+    if message is None or not (holds_on or _lacks_none(view, topic, message.time, first)):
+        return {}
+    flags, _ = (events_of_messages(view, [message]) or TopicEvents(1, 0)).of_kind(FLAG)
+    return {flag.name: bool(flag.last) for flag in flags}
+
+
+def _lacks_none(view: View, topic: str, before: Ns, first: Ns) -> bool:
+    """Returns whether no message of a topic may be missing between two, by their log times (ns)."""
+    between = TimeWindow(before, first)
+    is_broken = any(between.contains(at) for at in breaks_of(view, topic))
+    return not is_broken and not unrecorded_times(view, topic, between)
 
 
 def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
@@ -274,9 +296,12 @@ def goals_in(
         # Which goals it listed before: what a window's first message lists need not be new.
         message_before = view.stream.last(topic, window.start)
         earlier = None if message_before is None else events_of_messages(view, [message_before])
-        listed = [] if earlier is None else earlier.of_kind(GOAL)[0]
-        statuses_before = {goal.name: goal.last for goal in listed}
-        goals = [*_goal_runs(topic, events, statuses_before)]
+        statuses_before, knows_all = dict[str, int](), False
+        if message_before is not None and earlier is not None:
+            statuses_before = {goal.name: goal.last for goal in earlier.of_kind(GOAL)[0]}
+            is_whole = not (earlier.beyond or earlier.undecodable)
+            knows_all = is_whole and _lacks_none(view, topic, message_before.time, events.first)
+        goals = [*_goal_runs(topic, events, statuses_before, knows_all=knows_all)]
         lost = last_listed(view, topic, window, {goal.goal for goal in goals if goal.ended is None})
         for goal in goals:
             last = lost.get(goal.goal)
@@ -350,9 +375,12 @@ def goals_asked(
 
 
 def _goal_runs(
-    topic: str, events: TopicEvents, statuses_before: Mapping[str, int]
+    topic: str, events: TopicEvents, statuses_before: Mapping[str, int], *, knows_all: bool
 ) -> Iterator[GoalRun]:
-    """Yields the goals of an action, given those that were listed before with their statuses."""
+    """Yields the goals of an action, given those that were listed before with their statuses.
+
+    `knows_all`: these are all until the first message, so what else it lists as ended just did.
+    """
     ends: dict[str, tuple[Ns, int]] = {}
     goals, changes = events.of_kind(GOAL)
     for change in changes:
@@ -363,7 +391,7 @@ def _goal_runs(
         if statuses_before.get(goal.name) in _ENDED:
             continue
         if goal.first in _ENDED:
-            if goal.name not in statuses_before and is_listed_first:
+            if goal.name not in statuses_before and is_listed_first and not knows_all:
                 continue  # it may have ended long before
             ends[goal.name] = (goal.at, goal.first)
         ended, status = ends.get(goal.name, (None, goal.last))

@@ -67,6 +67,30 @@ def test_what_ended_before_a_window_is_not_told_and_what_began_before_is(tmp_pat
     ]
 
 
+TORN = Msg(TOPIC, DAY[0].type, BEGIN + 20 * S, b"\x00\x01\x00\x00\xff\xff\xff\x7f")
+
+
+@pytest.mark.parametrize(
+    ("before", "pause", "is_told"),
+    [
+        ([], range(0), False),
+        (history((20, {1: 4})), range(0), True),
+        (history((20, {1: 4})), range(24, 39), False),
+        ([*history((20, {1: 4})), TORN], range(0), False),
+    ],
+)
+def test_what_a_window_first_lists_as_ended_just_did_if_the_message_before_it_is_known(
+    tmp_path: Path, before: list[Msg], pause: range, is_told: bool
+) -> None:
+    beats = [odom(BEGIN + at * S + 1, 0.0, 0.0) for at in range(60) if at not in pause]
+    messages = [*beats, *before, *history((42, {1: 4, 2: 6}))]
+    messages.sort(key=lambda message: message.log_time)
+    found = told(tmp_path, messages, 35, 52, 5, recalls=False)
+    assert [text for _, text, *_ in found] == ["/drive goal aborted after 0 s"] * is_told
+    [*searched] = found_in(memory_of(tmp_path), "equals", "failed", begin=35, end=52)
+    assert [(goal, last) for goal, _, _, last, _ in searched] == [(2, 42)] * is_told
+
+
 Found = tuple[int, str, float, float, bool]
 
 

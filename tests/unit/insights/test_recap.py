@@ -10,6 +10,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.results import Recap
 from tests.support.bags import (
+    McapLayout,
     Msg,
     boolean,
     detections,
@@ -21,7 +22,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
-from tests.support.memories import asked, memory_of
+from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -158,3 +159,25 @@ def test_how_long_a_robot_stood_that_publishes_poses_only_while_it_moves_is_not_
     for memory in (memory_of(tmp_path), memory_of(tmp_path, recalls=True)):
         assert stood(memory, 120) is None
         assert stood(memory, 19) == 0
+
+
+@each_way
+@pytest.mark.parametrize("latched", [frozenset[str](), frozenset({"/docked"})])
+def test_a_boolean_may_toggle_with_the_first_message_of_a_window(
+    tmp_path: Path, latched: frozenset[str], *, recalls: bool
+) -> None:
+    """It is said when it changes; nothing is recorded from 60 to 70 s."""
+    said = ((0, True), (30, False), (75, True), (100, False))
+    messages = [boolean(BEGIN + at * S, value, "/docked") for at, value in said]
+    messages += [odom(BEGIN + at * S, 0.0, 0.0) for at in range(120) if not 60 <= at < 70]
+    write_splits(tmp_path, messages, layout=McapLayout(latched=latched))
+    memory = memory_of(tmp_path, recalls=recalls)
+
+    def flips(begin: float, end: float) -> list[tuple[float, str]]:
+        events = over(memory, begin, end).events
+        return [((each.start - BEGIN) / S, each.text) for each in events if each.kind == "flip"]
+
+    assert flips(0, 50) == flips(20, 50) == [(30, "/docked became false")]
+    assert flips(31, 50) == []
+    assert flips(65, 90) == ([(75, "/docked became true")] if latched else [])
+    assert flips(80, 110) == [(100, "/docked became false")]
