@@ -620,7 +620,11 @@ class ReverseSearch:
             return refusal
         _, _, name = field.rpartition(".")
         constants = _constants_named(newest.record.channel.schema, name, word)
-        return f"{refusal}, such as {listed(constants)}" if constants else refusal
+        if not constants:
+            return refusal
+        # Without a field the number is also found in the bytes of an id.
+        ask = "" if field else ": ask equals on the field of that number"
+        return f"{refusal}, such as {listed(constants)}{ask}"
 
     def matches(self, stored: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it does not say, or is not decoded."""

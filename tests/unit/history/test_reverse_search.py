@@ -30,6 +30,7 @@ from tests.support.bags import (
     battery,
     boolean,
     detections,
+    goals,
     make,
     odom,
     text,
@@ -152,6 +153,15 @@ def test_never_of_a_word_names_the_constant_that_has_it(
             queries.find_last_match(
                 memory_of(tmp_path), Call(), "/winch", kind, word, field="state"
             )
+
+
+def test_a_constant_is_refused_without_the_field_of_its_number(tmp_path: Path) -> None:
+    """Its number may also be a byte of an id."""
+    write_mcap(tmp_path / "bag.mcap", [goals(T0, {6: 4})])
+    question = (memory_of(tmp_path), Call(), "/drive/_action/status", "equals", "STATUS_ABORTED")
+    advice = r"such as STATUS_ABORTED = 6: ask equals on the field of that number$"
+    with pytest.raises(InvalidArgumentsError, match=advice):
+        queries.find_last_match(*question)
 
 
 @pytest.mark.parametrize("value", [5, True])
