@@ -69,6 +69,8 @@ _MOST_TRIED: Final = 1000
 _BODIES: Final = ("base_footprint", "base_link")
 _READ_NS: Final = 3600 * NS_PER_S
 """Transforms are read an hour (log time) at once."""
+_LONGEST_H: Final = 64
+"""Where a bag spans more hours a clock was set in it: decades may lie between two messages."""
 _STEP_NS: Final = NS_PER_S // 20
 """Poses by transforms are no closer than this."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
@@ -464,14 +466,19 @@ def rows_of_body(view: View, window: TimeWindow) -> Iterator[PoseRows]:
     """Yields the poses of the robot's body by transforms, the newest first; none without a body.
 
     In the frame of its odometry, at most twenty a second. They are read as they are asked for, an
-    hour at a time, and each may then raise QueryTimeoutError.
+    hour at a time, and each may then raise QueryTimeoutError, as may the first step.
     """
     body = robot_body(view)
     hours: set[int] = set()
     for topic in () if body is None else view.moving_topics:
-        firsts, lasts = ((times // _READ_NS).tolist() for times in view.bounds(topic, window))
-        for first, last in zip(firsts, lasts, strict=True):
+        firsts, lasts = (times // _READ_NS for times in view.bounds(topic, window))
+        is_short = lasts - firsts <= _LONGEST_H
+        for first, last in zip(firsts[is_short].tolist(), lasts[is_short].tolist(), strict=True):
             hours.update(range(first, last + 1))
+        for bag, start, end in () if is_short.all() else view.timeline.extents(topic, window):
+            if end // _READ_NS - start // _READ_NS > _LONGEST_H:
+                for table in view.bags.tables(bag, topic, window, columns=False):
+                    hours.update(np.unique(table.log_times // _READ_NS).tolist())
     for hour in sorted(hours, reverse=True):
         piece = TimeWindow(hour * _READ_NS, (hour + 1) * _READ_NS).intersect(window)
         if body is not None and not piece.empty:

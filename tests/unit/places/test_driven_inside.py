@@ -1,6 +1,8 @@
 """What the robot drove while it was in a place, waypoints in another frame, the farthest pose."""
 
 import math
+from functools import partial
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -189,3 +191,19 @@ def test_what_is_no_point_is_named(
     span = {"start": ROOMS_BEGIN, "end": ROOMS_BEGIN + 60}
     reply = asked(memory, tmp_path, "trajectory_summary", **span, **given)
     assert said in reply["detail"]
+
+
+@each_way
+def test_a_path_by_transforms_is_whole_where_a_bag_reaches_from_1970_to_now(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The clock was set while it was recorded: of half a million hours two have messages."""
+    times = [20 * S, *(BEGIN + n * S // 10 for n in range(300))]
+    poses = [tf(at, transform(at, "odom", "base_link", (1.0, 0, 0))) for at in times]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    memory = memory_of(tmp_path, recalls=recalls)
+    # Each look at the clock takes 10 ms.
+    call = Call(Deadline.after(20.0, partial(next, count(0.0, 0.01))))
+    found = trajectory_summary(memory, call, TimeRange(0.0, BEGIN / S + 30))
+    assert found.trajectory.poses == 301
+    assert not any("out of time" in note for note in found.notes)
