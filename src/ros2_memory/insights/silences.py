@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import defaultdict
+from functools import cache, partial
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import Silence
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import united, without
+from ros2_memory.core.spans import Spans, overlaps_any, united, without
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -28,7 +30,7 @@ from ros2_memory.history.coverage import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
@@ -41,56 +43,54 @@ _ALIKE_NS: Final[Ns] = 30 * NS_PER_S
 
 def silences_of(
     memory: Memory, snapshot: Snapshot, first: Ns = MIN_NS, last: Ns = MAX_NS
-) -> Iterator[Silence]:
-    """Yields all silences that reach into a time (inclusive), in order of time.
+) -> list[Silence]:
+    """Returns all silences that reach into a time (inclusive), in order of time.
 
     A latched topic holds, and is never silent. Nor was one silent where its messages were deleted.
     """
-    latching, bag_dir = memory.limits.latching, memory.index.bag_dir
-    is_latched: dict[str, bool] = {}
+    bag_dir, everything = memory.index.bag_dir, TimeWindow.everything()
+    is_latched = cache(partial(memory.limits.latching.is_latched, snapshot))
+    excluded = excluded_spans(bag_dir)
+    deleted = cache(lambda topic: cut_spans(bag_dir, topic, everything))
+    found: list[Silence] = []
     for silence in _all_silences(bag_dir, snapshot):
-        if silence.within(first, last) is None:
-            continue
-        if silence.topic not in is_latched:
-            is_latched[silence.topic] = latching.is_latched(snapshot, silence.topic)
-        if not is_latched[silence.topic]:
-            yield from _outside_deleted(bag_dir, snapshot, silence)
+        if silence.within(first, last) is not None and not is_latched(silence.topic):
+            found += _outside_deleted(snapshot, silence, excluded, deleted(silence.topic))
+    return sorted(found, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
 def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
-    """Returns those that bags show, and those that deleted bags showed, in order of time."""
-    shown: defaultdict[str, list[Silence]] = defaultdict(list)
+    """Returns those that bags show, and those that deleted bags showed."""
+    shown: defaultdict[str, Spans] = defaultdict(list)
     for kept in snapshot.silences:
-        shown[kept.topic].append(kept)
+        shown[kept.topic].append((kept.start, kept.end))
     # Until its bags are deleted, they show it as well.
     deleted = [
         silence
         for silence in map(snapshot.prolonged, map(Silence._make, read_thinned(bag_dir).silences))
-        if not any(silence.within(kept.start, kept.end) for kept in shown[silence.topic])
+        if not overlaps_any(shown[silence.topic], silence.start, silence.end - 1)
     ]
-    return sorted(
-        [*snapshot.silences, *deleted],
-        key=lambda silence: (silence.start, silence.end, silence.topic),
-    )
+    return [*snapshot.silences, *deleted]
 
 
-def _outside_deleted(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:
+def _outside_deleted(
+    snapshot: Snapshot, silence: Silence, excluded: Spans, deleted: Sequence[Span]
+) -> Iterator[Silence]:
     """Yields a silence, or the parts of it before and after messages that were deleted.
 
     None that lasts long enough only with times that were excluded.
     """
     shortest = snapshot.shortest_silence(silence.topic)
-    excluded = excluded_spans(bag_dir, TimeWindow(silence.start, silence.end))
-    outside = without([(silence.start, silence.end)], excluded)
-    if excluded and all(end - start < shortest for start, end in outside):
+    whole = [(silence.start, silence.end)]
+    outside = without(whole, excluded)
+    if outside != whole and all(end - start < shortest for start, end in outside):
         return
-    deleted = cut_spans(bag_dir, silence.topic, TimeWindow(silence.start + 1, silence.end))
-    if not deleted:
+    if not overlaps_any(deleted, silence.start + 1, silence.end - 1):
         yield silence
         return
     if silence.length < silence.end - silence.start:
         return  # the robot was off for a while, and which part that was in is not known
-    for start, end in without([(silence.start, silence.end)], deleted):
+    for start, end in without(whole, deleted):
         if end - start >= shortest:
             goes_on = silence.goes_on and end == silence.end
             yield Silence(silence.topic, start, end, end - start, goes_on)
@@ -138,12 +138,8 @@ def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:
     groups: list[list[Silence]] = []
     for silence in silences:
         # They fell silent together, and returned together.
-        alike = [
-            group
-            for group in groups
-            if silence.start - group[0].start <= _ALIKE_NS
-            and abs(silence.end - group[0].end) <= _ALIKE_NS
-        ]
+        nth = bisect_left(groups, silence.start - _ALIKE_NS, key=lambda group: group[0].start)
+        alike = [group for group in groups[nth:] if abs(silence.end - group[0].end) <= _ALIKE_NS]
         if alike:
             alike[-1].append(silence)
         else:

@@ -1,5 +1,6 @@
 """A detector that was blind for a while, as each tool reports it."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -97,3 +98,32 @@ def test_compare_counts_how_long_a_topic_was_silent_while_the_robot_was_on(tmp_p
     other = {"with_start": BEGIN + morning + 1200, "with_end": BEGIN + morning + 2399}
     reply = asked(memory_of(tmp_path), tmp_path, "compare", **first, **other)
     assert reply["silent_s"] == {"/camera": {"this": 1200.0, "with": 0.0}}
+
+
+def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was deleted of a topic is read once, however often it was silent."""
+    silent = {"/early": [(60, 160), (320, 420)], "/late": [(80, 170), (330, 430)]}
+    messages = [odom((BEGIN + at) * S, 0.0, 0.0, 0.0) for at in range(600)]
+    for nth, (topic, spans) in enumerate(silent.items()):
+        heard = (at for at in range(600) if not any(start <= at < end for start, end in spans))
+        messages += [boolean((BEGIN + at) * S + nth, data=True, topic=topic) for at in heard]
+    write_splits(tmp_path, messages)
+    append_losses(tmp_path, [Loss("/early", (BEGIN + 90) * S, (BEGIN + 95) * S, 9, "forgotten")])
+    cut = Counter[str]()
+
+    def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
+        cut[topic] += 1
+        return coverage.cut_spans(bag_dir, topic, window)
+
+    monkeypatch.setattr("ros2_memory.insights.silences.cut_spans", cut_spans)
+    found = asked(memory_of(tmp_path), tmp_path, "memory_status")["silences"]
+    assert [(each["topic"], each["start"] - BEGIN) for each in found] == [
+        ("/late", pytest.approx(329)),
+        ("/early", pytest.approx(319)),
+        ("/early", pytest.approx(95)),
+        ("/late", pytest.approx(79)),
+        ("/early", pytest.approx(59)),
+    ]
+    assert cut == {"/early": 1, "/late": 1}
