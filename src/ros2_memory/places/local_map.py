@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -23,6 +23,8 @@ MOST_FIXES: Final = 4000
 """Fixes of a path, evenly spaced."""
 _MOST_TRIED: Final = 1000
 """A receiver that has no satellites yet sends fixes without a place."""
+_MOST_BAGS: Final = 200
+"""Of so many the last message is tried, too."""
 _RADIUS_M: Final = 6_378_137.0
 _ECCENTRICITY_SQUARED: Final = 6.694_379_990_14e-3
 """Of the ellipsoid of WGS 84."""
@@ -56,12 +58,16 @@ def fixes_in(view: View, topic: str, window: TimeWindow) -> list[tuple[Ns, Geode
 def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotTrack] | None:
     """Returns the path of a receiver in a window around its first recorded fix, and that frame.
 
-    None where the topic has no fix at all.
+    Where its first messages have none, around the first of its bags' last messages that is one.
+    None where none of these is.
     """
     if topic not in view.timeline.topics():
         return None
-    messages = view.stream.messages([topic], TimeWindow.everything())
-    _, origin = next(_fixes(view, islice(messages, _MOST_TRIED)), (0, None))
+    everything = TimeWindow.everything()
+    first = islice(view.stream.messages([topic], everything), _MOST_TRIED)
+    ends = np.unique(view.bounds(topic, everything)[1])[:_MOST_BAGS].tolist()
+    lasts = filter(None, (view.stream.last(topic, end + 1) for end in ends))
+    _, origin = next(_fixes(view, chain(first, lasts)), (0, None))
     if origin is None:
         return None
     fixes = fixes_in(view, topic, window)

@@ -46,7 +46,7 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.bags import detections, odom, tf, transform, write_mcap, write_splits
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
 
@@ -410,6 +410,17 @@ def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_
     assert topics(plain, f"start={BEGIN_S}&end={BEGIN_S + 20}")["places_robot"] == [
         {"topic": "/fix", "kind": "fixes"}
     ]
+
+
+def test_a_receiver_that_began_without_satellites_has_a_path(tmp_path: Path) -> None:
+    inside = [fix(BEGIN + n * S // 10, 0.0, 0.0, -1) for n in range(1100)]
+    outside = [fix(BEGIN + n * S // 10, n * 1e-6, 0.0) for n in range(1100, 1400)]
+    write_splits(tmp_path, [*inside, *outside])
+    plain = memory_of(tmp_path)
+    memory = replace(plain, limits=replace(plain.limits, pose_topic="/fix"))
+    window = TimeWindow(BEGIN, BEGIN + 140 * S)
+    found: Any = path_in_box(memory, Call(), window, Box(-100, -100, 100, 100, 0.5))
+    assert (found["t"][0], found["t"][-1]) == (BEGIN_S + 110, BEGIN_S + 139.9)
 
 
 def test_a_label_has_all_its_sightings_also_one_that_is_seen_throughout(memory: Memory) -> None:
