@@ -819,7 +819,9 @@ def _split_around_others(stays: Sequence[PlacedStay], observed: _Observations) -
         whole = stay.stay._replace(firm_first=-1, firm_last=-1)
         sizes = np.diff([0, *sorted(cuts), len(rows)])
         split = [(stay.place, whole)] * len(sizes)
-        parts += _placed(observed, split, rows, sizes) if cuts else [stay]
+        placed = _placed(observed, split, rows, sizes) if cuts else [stay]
+        placed[0].also = stay.also
+        parts += placed
     return parts
 
 

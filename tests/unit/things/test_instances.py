@@ -1,6 +1,7 @@
 """When a thing is missed, and which name it has, by its sights alone."""
 
 import tracemalloc
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -90,6 +91,20 @@ def test_what_is_seen_upstairs_while_localisation_is_poor_is_no_sighting_of_what
     vague = fixes_of(times, np.zeros((2, 3)), np.array([2.0, 2.0]))
     [mug] = estimate(whole([below, upstairs, vague]), LABELS).instances
     assert mug.stays[-1].last == 19 * 10**9
+
+
+def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place() -> None:
+    first, other, back = (2.0, 0.0, 0.7), (-6.0, 8.0, 0.7), (1.0, 9.0, 0.7)
+    before, away, beside = (0.0, 9.0, 0.0), (0.0, 0.0, 3.14), (-6.0, 6.0, 1.57)
+    called = ["bowl" if nth % 8 == 3 else "mug" for nth in range(120)]
+    seen = [(HERE, [PlacedDetection(label, first)]) for label in called]
+    elsewhere = [(beside, [PlacedDetection("mug", other)])] * 120
+    gone = [(before, [PlacedDetection("mug", back)])] * 120 + [(before, [])] * 120
+    nothing: list[tuple[tuple[float, float, float], list[PlacedDetection]]] = [(away, [])] * 30
+    bag = bag_of(*gone, *seen, *nothing, *elsewhere, *nothing, *seen)
+    [mug] = estimate(whole([bag]), LABELS).instances
+    assert len(mug.stays) == 4
+    assert sum((stay.also for stay in mug.stays), Counter()) == {"bowl": 27}
 
 
 @pytest.mark.parametrize("name", ["{} box", "box{}"])
