@@ -71,7 +71,7 @@ from ros2_memory.history.transforms import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -230,15 +230,20 @@ class TrackReader:
         around = whole.widened(TF_CACHE_NS).aligned(PART_NS)
         topics = () if self._is_own else self._view.moving_topics
         moving = [open_scan(self._view, topic, around, copies=True) for topic in topics]
-        for topic in self._topics:
-            opened = open_scan(self._view, topic, whole, stored=self._view.call.stored)
-            yield from joined_back(
+        scans = [
+            open_scan(self._view, topic, whole, stored=self._view.call.stored)
+            for topic in self._topics
+        ]
+        yield from _together(
+            joined_back(
                 self._view,
                 opened,
                 TRACKS,
                 partial(self._tracks_in, opened, moving, window),
                 partial(self._stretch_key, opened, moving, window),
             )
+            for opened in scans
+        )
 
     def _tracks_in(
         self,
@@ -528,6 +533,28 @@ def _tracks_by_robot(
             beside[here] |= (piece >= 0) & (whole.times[here] <= stops[piece])
     own = np.flatnonzero(~repeats)
     return whole.some(own), numbers[own], is_beside[own]
+
+
+def _together(
+    sources: Iterable[Iterator[tuple[Ns, PartialTrack]]],
+) -> Iterator[tuple[Ns, PartialTrack]]:
+    """Yields what all of several yield, the newest first, each with a time that all have reached.
+
+    The one that is behind goes on.
+    """
+    reached, held = dict.fromkeys(sources, MAX_NS), list[PartialTrack]()
+    while reached:
+        behind = max(reached, key=reached.__getitem__)
+        found = next(behind, None)
+        if found is None:
+            del reached[behind]
+        else:
+            reached[behind], track = found
+            held.append(track)
+        since = max(reached.values(), default=MIN_NS)
+        if since < MAX_NS:
+            yield from ((since, each) for each in held)
+            held.clear()
 
 
 def _without_jumps(parts: ClippedSteps, are_jumps: Mask) -> ClippedSteps:

@@ -1,15 +1,22 @@
 """Visits to places of any shape, in a map that moves under odometry."""
 
+import math
 from dataclasses import replace
+from functools import partial
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.view import View
+from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.places.visits import visits
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap, write_splits
 from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.tables import table
@@ -111,3 +118,27 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         [found] = asked(memory, tmp_path, "find_matches", where=name, **hello)["sightings"]
         assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
         assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
+
+
+def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot was elsewhere in the middle of two minutes, by the second topic."""
+    messages = []
+    for nth in range(1200):
+        at, x = BEGIN + nth * S // 10, 5.0 if 550 <= nth < 650 else 0.0
+        messages.append(tf(at, transform(at, "base_link", "arm", (0, 0, nth % 5))))
+        messages.append(tf(at + 5, transform(at, "odom", "base_link", (x, 0, 0)), topic="/own/tf"))
+    write_splits(tmp_path, messages)
+    memory = memory_of(tmp_path, limits=QuerySettings(tf_topics=("/tf", "/own/tf")))
+    known_since: set[int | None] = set()
+    for looks in range(60):
+        clock = chain([0.0] * (looks + 1), repeat(math.inf))
+        deadline = Deadline.after(1.0, partial(next, clock))
+        monkeypatch.setattr(Call, "partial_after", lambda *_, deadline=deadline: deadline)
+        known = TrackReader(View(memory, Call()), "odom").over(TimeWindow(BEGIN, BEGIN + 120 * S))
+        known_since.add(known.since)
+        if known.since is None or known.since < BEGIN + 50 * S:
+            assert known.track.x.max() == 5.0
+    assert len(known_since) > 10
+    assert None in known_since
