@@ -50,7 +50,7 @@ import zstandard
 from ros2_memory.columns.steps import EXACT, MOST_RELATIVE, Step
 from ros2_memory.columns.table import IN_PART, Column, Numbers, Texts, Zone, letters_of
 from ros2_memory.core.large_reads import LARGE_BYTES
-from ros2_memory.core.text import caseless
+from ros2_memory.core.text import caseless, encodable
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -402,7 +402,8 @@ def folded(words: Collection[str]) -> str | None:
     """
     if sum(map(len, words)) + len(words) <= MOST_WORDS_BYTES:
         whole = "\n".join(dict.fromkeys(caseless(word) for word in words))
-        if _is_small(whole):
+        # SQLite takes no text with lone surrogates.
+        if _is_small(whole) and encodable(whole) == whole:
             return whole
     names = {name for word in words for name in letters_of(caseless(word))}
     in_part = "\n".join([IN_PART, *sorted(names)])
