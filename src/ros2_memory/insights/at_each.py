@@ -147,7 +147,9 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
     bounds = ((datetime.combine(day, begins), datetime.combine(day + over, ends)) for day in days)
     times = chain.from_iterable(starmap(_times_between, bounds))
     hours = (window.intersect(TimeWindow(*span)) for span in times)
-    return [part for part in hours if not part.empty]
+    # All hours of a day that begin in an hour that clocks repeat are in two parts, and so are those
+    # of the day before: one of these lies between them.
+    return sorted((part for part in hours if not part.empty), key=lambda part: part.start)
 
 
 def _times_between(begin: datetime, end: datetime) -> list[Span]:

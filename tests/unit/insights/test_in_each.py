@@ -202,10 +202,21 @@ def test_hours_are_local_and_those_that_clocks_skip_are_left_out(
     assert local_hours(3, days, hours) == expected
 
 
-def local_hours(month: int, days: tuple[int, int], hours: str) -> list[str]:
-    """What lies between two times in Berlin, from the begin of one day to that of another one."""
+def test_all_hours_of_days_that_begin_in_an_hour_that_clocks_repeat_are_in_order() -> None:
+    assert local_hours(10, (25, 26), "00:30-00:30", "Atlantic/Azores") == [
+        "00:00-00:30",
+        "00:30-00:00",
+        "00:00-00:30",
+        "00:30-00:00",
+    ]
+
+
+def local_hours(
+    month: int, days: tuple[int, int], hours: str, zone: str = "Europe/Berlin"
+) -> list[str]:
+    """What lies between two local times, from the begin of one day to that of another one."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("TZ", "Europe/Berlin")
+        patched.setenv("TZ", zone)
         time.tzset()
         begin, end = (int(datetime(2026, month, at).timestamp()) for at in days)  # noqa: DTZ001
         found = hours_of_days(TimeWindow(begin * S, end * S), *_as_hours(hours))  # type: ignore[misc]
