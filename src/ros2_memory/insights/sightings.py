@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -281,7 +281,7 @@ def read_sightings(
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
     if goals is not None:
-        spans = held_spans((goal.first, _goes_on_until(view, goal, scope), True) for goal in goals)
+        spans = held_spans(chain.from_iterable(_goal_spans(view, goal, scope) for goal in goals))
         return spans, None, ""
     if says_episodes(view, topics):
         found, _, since = find_episodes(
@@ -315,6 +315,13 @@ def read_sightings(
         for first, last in scope.parts_of(start, held_until(view, topic, start, end))
     ]
     return np.concatenate((spans, held_spans(earlier))), None, ""
+
+
+def _goal_spans(view: View, goal: GoalRun, scope: Scope) -> Iterator[tuple[Ns, Ns, bool]]:
+    """Yields when a goal was active; one of before the window counts where it ended, if it did."""
+    yield goal.first, _goes_on_until(view, goal, scope), goal.accepted is not None
+    if goal.accepted is None and goal.ended is not None:
+        yield goal.ended, goal.ended, True
 
 
 def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:
@@ -439,7 +446,7 @@ def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None
         begun=goal.accepted is not None,
         robot=None
         if message is None
-        else robot_at(view, message.time, message.bag.recording, frame_id),
+        else robot_at(view, goal.last, message.bag.recording, frame_id),
         thing=None,
         value={"goal": goal.goal, "status": goal.status_word},
     )

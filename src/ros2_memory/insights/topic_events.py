@@ -361,9 +361,21 @@ def goals_asked(
     for topic, events in events_of_topics.items():
         if events is not None:
             note_limits(view, topic, events)
-    goals = [
-        goal for goal in goals_in(view, scope.window, events_of_topics) if goal.status in wanted
+    start, _ = scope.window.asked()
+    active = {topic: _active_at(view, topic, start) for topic in topics}
+    known = [
+        goal._replace(first=start)
+        if goal.accepted is None and goal.goal in active[goal.topic]
+        else goal
+        for goal in goals_in(view, scope.window, events_of_topics)
     ]
+    known += [
+        GoalRun(topic, goal, None, None, status, start, start)
+        for topic, events in events_of_topics.items()
+        if events is None
+        for goal, status in active[topic].items()
+    ]
+    goals = [goal for goal in known if goal.status in wanted]
     goals.sort(key=lambda goal: (goal.last, goal.first, goal.goal), reverse=True)
     goals = [goal for goal in goals if scope.holds_at(goal.last)]
     if lost := sum(goal.is_lost for goal in goals):
@@ -372,6 +384,19 @@ def goals_asked(
             "listed no more: last is when it did"
         )
     return goals
+
+
+def _active_at(view: View, topic: str, moment: Ns) -> dict[str, int]:
+    """Returns the goals that a latched topic listed last before a moment as active, by statuses.
+
+    Empty where another run of the recorder has begun since.
+    """
+    held = held_at(view, topic, moment)
+    if held is None or any(held.time <= start < moment for start, _ in view.snapshot.breaks):
+        return {}
+    events = events_of_messages(view, [held])
+    listed = [] if events is None else events.of_kind(GOAL)[0]
+    return {goal.name: goal.last for goal in listed if goal.last not in _ENDED}
 
 
 def _goal_runs(

@@ -15,7 +15,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
-from tests.support.bags import Msg, goals, odom, write_mcap
+from tests.support.bags import McapLayout, Msg, goals, odom, write_mcap, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.support.tables import table
@@ -190,3 +190,30 @@ def test_a_goal_that_goes_on_lasts_as_far_as_something_is_recorded(tmp_path: Pat
             assert [row["duration_s"] for row in reply["sightings"]] == [lasted]
             reply = asked(memory, tmp_path, "find_matches", **given, by="day")
             assert table(reply)["all"]["seconds"] == lasted
+
+
+def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_status(
+    tmp_path: Path,
+) -> None:
+    """Active from 10 to 40 s (34:00), another from 60 s on, which a restart at 99 s cuts short."""
+    beats = [odom(BEGIN + at * S, at / 10, 0.0) for at in range(100)]
+    told = history((10, {1: 2}), (40, {1: 4}), (60, {1: 4, 2: 2}))
+    layout = McapLayout(latched=frozenset({TOPIC}))
+    write_splits(tmp_path, sorted([*beats, *told], key=lambda one: one.log_time), layout=layout)
+    beats = [odom(BEGIN + at * S, 0.0, 0.0) for at in range(900, 950)]
+    write_splits(tmp_path, beats, name="next")
+    memory = memory_of(tmp_path)
+
+    def held(word: str, begin: int, end: int) -> object:
+        given = {"topic": TOPIC, "condition_type": "equals", "value": word}
+        window = {"start": BEGIN / S + begin, "end": BEGIN / S + end}
+        rows = asked(memory, tmp_path, "find_matches", **given, **window)["sightings"]
+        by_hour = asked(memory, tmp_path, "find_matches", **given, **window, by="hour")
+        whole = table(by_hour)["all"]
+        shown = [(row["duration_s"], row["began_earlier"], row["robot"]["x"]) for row in rows]
+        return shown, whole["count"], whole["seconds"], str(whole["first"])[-5:]
+
+    assert held("executing", 20, 30) == ([(10, True, 2.0)], 0, 10, "None")
+    assert held("succeeded", 20, 50) == ([(20, True, 4.0)], 1, 20, "34:00")
+    assert held("succeeded", 45, 55) == ([], 0, 0, "None")
+    assert held("executing", 900, 940) == ([], 0, 0, "None")
