@@ -144,7 +144,8 @@ def count_visits(
     binned.count_since(joined.since)
     placed_spans = placed_times(joined.track, mixed_spans)
     binned.add_lengths("placed_s", "duration", placed_spans)
-    binned.add_unknown(unknown_times(view, binned.counted, placed_spans, WHEREABOUTS))
+    unknown = unknown_times(view, binned.counted, placed_spans, WHEREABOUTS, mixed=mixed_spans)
+    binned.add_unknown(unknown)
     if place is not None and by != "place":
         stayed = _stays(view, placement.frame_id, place.region, window)
         if not stayed and asked_frame is None:

@@ -640,17 +640,23 @@ def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Spa
         yield max(start, asked.start), min(end, asked.stop)
 
 
-def unknown_times(view: View, window: TimeWindow, known: Spans, what: str) -> Spans:
+def unknown_times(
+    view: View, window: TimeWindow, known: Spans, what: str, *, mixed: Spans
+) -> Spans:
     """Returns the recorded times of a window in which something is not known, in order.
 
     `known` are the times in which it is: between these, and at the ends of recordings, up to
-    `SILENCE_NS` may pass. A note says if `what` is not known at any time.
+    `SILENCE_NS` may pass. It is not at any of the `mixed` times, of which there are two accounts.
+    A note says if `what` is not known at any time.
     """
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (0, 0)
     around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
-    left = without([around], united([*known, *recording_gaps(view)]))
-    cut = [(max(begin, start), min(stop, end)) for begin, stop in left if stop - begin > SILENCE_NS]
+    gaps = united(recording_gaps(view))
+    left = without([around], united([*known, *mixed, *gaps]))
+    long = [(begin, stop) for begin, stop in left if stop - begin > SILENCE_NS]
+    uncut = united([*long, *without(mixed, gaps)])
+    cut = [(max(begin, start, first), min(stop, end, last)) for begin, stop in uncut]
     unknown = [(begin, stop) for begin, stop in cut if begin < stop]
     if unknown and not any(begin <= end and start <= stop for begin, stop in known):
         view.notes.add(f"{what} is not known at any time of the window")

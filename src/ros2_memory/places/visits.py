@@ -198,7 +198,8 @@ def asked_place(
 def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans) -> Ns:
     """Returns for how long it is not known where the robot was, by a track for each frame."""
     spans = (
-        unknown_times(view, window, placed_times(track, mixed), WHEREABOUTS) for track in tracks
+        unknown_times(view, window, placed_times(track, mixed), WHEREABOUTS, mixed=mixed)
+        for track in tracks
     )
     return elapsed_in(view, window).among(united(chain.from_iterable(spans)))
 

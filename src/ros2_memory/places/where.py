@@ -297,13 +297,15 @@ class Scope:
             self._inside = united((stay.start, stay.stop + 1) for stay in inside)
             mixed = note_robots(view, resolve_path_topic(view), window)
             known = placed_times(joined.track, mixed)
-            self.unknown = unknown_times(view, window, known, WHEREABOUTS)
+            self.unknown = unknown_times(view, window, known, WHEREABOUTS, mixed=mixed)
         self._states = [_ConditionStates(view, condition) for condition in during]
         for state, condition in zip(self._states, during, strict=True):
             state.search.require_met(window.stop)
             state.search.note_untested(window)
-            known = state.known_in(window)
-            unknown = unknown_times(view, window, known, f"what {condition.topic} said")
+            mixed = note_robots_on(view, state.search.topics, window)
+            known = without(state.known_in(window), mixed)
+            said = f"what {condition.topic} said"
+            unknown = unknown_times(view, window, known, said, mixed=mixed)
             self.unknown = united([*self.unknown, *unknown])
 
     @property
@@ -395,10 +397,8 @@ class _ConditionStates:
         if self._holds_on:
             spans = (span for topic in topics for span in timeline.recordings(topic).values())
             known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
-            known = without(known, self._after_breaks(window))
-        else:
-            known = _heard(self._view, topics, window.widened(SILENCE_NS))
-        return without(known, note_robots_on(self._view, topics, window))
+            return without(known, self._after_breaks(window))
+        return _heard(self._view, topics, window.widened(SILENCE_NS))
 
     def _after_breaks(self, window: TimeWindow) -> Spans:
         """Returns from each break to the next message, as far as they reach into a window."""

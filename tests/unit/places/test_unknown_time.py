@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_splits
+from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.support.tables import table
@@ -68,6 +68,22 @@ def test_what_a_seldom_topic_said_holds_in_another_run_only_if_it_is_latched(
     begins = [row["first_seen"] - T0 for row in answer["sightings"]]
     assert begins == [600 if latched else 630, 0]
     assert answer.get("unknown_s") == (None if latched else 30)
+
+
+def test_a_time_that_a_recording_has_twice_is_unknown_however_short_it_is(tmp_path: Path) -> None:
+    """After 30 s the clock is set back by 5 s."""
+    messages = life(60)
+    later = [replace(one, log_time=one.log_time - 5 * S) for one in messages[len(messages) // 2 :]]
+    write_mcap(tmp_path / "run" / "run_0.mcap", messages[: len(messages) // 2])
+    write_mcap(tmp_path / "run" / "run_1.mcap", later)
+    memory = memory_of(tmp_path)
+    for scope in ({"where": HERE}, {"while": PRESSED}):
+        found = asked(memory, tmp_path, "find_matches", **PRESSED, **scope)
+        assert found["unknown_s"] == pytest.approx(4.8, abs=0.05)
+    assert asked(memory, tmp_path, "visits", **HERE)["unknown_s"] == pytest.approx(4.8, abs=0.05)
+    whole = table(asked(memory, tmp_path, "visits", **HERE, by="hour"))["all"]
+    assert whole["unknown_s"] == pytest.approx(4.8, abs=0.05)
+    assert whole["placed_s"] + whole["unknown_s"] == pytest.approx(whole["recorded_s"], abs=0.1)
 
 
 def brute(times: Sequence[int], first: int, last: int, start: int, end: int) -> int:
