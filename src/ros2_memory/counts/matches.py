@@ -3,7 +3,8 @@
 What counts as once:
 
 - A boolean that is asked for holds from the message in which it toggles to it until it toggles
-  back, or until nothing is recorded. It counts where it is seen to toggle.
+  back, or until nothing is recorded, and not through silences of more than `SILENCE_NS` on a topic
+  that is neither latched nor rare. It counts where it is seen to toggle.
 - A text on a topic of detections is a label. A thing is in view as in a recap: it may be missed
   for `FLICKER_NS`, since detectors miss things now and then, and it is gone after `SILENCE_NS`
   without a message. These and booleans are counted by the topic's events; labels in a scope, or of
@@ -31,6 +32,7 @@ from ros2_memory.analysis.conditions import Condition, Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_errors, has_events
 from ros2_memory.analysis.intervals import (
     FLICKER_NS,
+    SILENCE_NS,
     IntervalPart,
     IntervalTable,
     VisibleInterval,
@@ -58,7 +60,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
-from ros2_memory.history.held_values import Held, HeldValues, held_at, held_until, is_text
+from ros2_memory.history.held_values import Held, HeldValues, held_at, held_until, holds_on, is_text
 from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
@@ -66,7 +68,7 @@ from ros2_memory.history.scan import blocks, in_time, scan
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back, flags_before
-from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
+from ros2_memory.places.where import Scope, Where, WhileCondition, heard_times, parse_where
 from ros2_memory.results import BinColumn, Bins
 from ros2_memory.things.unseen import notes_on_never
 
@@ -347,12 +349,13 @@ def _flag_spans(
         end = held_until(binned.view, topic, events.last, max(events.last, end))
     changed = [next(same) for _, same in groupby(states, lambda state: state[1])]
     gaps = _gaps_for_topic(binned, topic)
-    return [
+    spans = [
         part
         for nth, ((since, held), (stop, _)) in enumerate(pairwise([*changed, (end, False)]))
         if held
         for part in _without_gaps(since, stop, nth > 0, gaps)
     ]
+    return _without_silences(binned, topic, spans)
 
 
 def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool | None:
@@ -389,6 +392,26 @@ def _without_gaps(start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[Span]) -> 
             parts.append((start, begin, is_begun))
         start, is_begun = end, False
     return [*parts, (start, stop, is_begun)] if start < stop or not parts else parts
+
+
+def _without_silences(binned: BinnedWindow, topic: str, spans: _TrueSpans) -> _TrueSpans:
+    """Returns times, in order, without a topic's silences, unless what it says holds through them.
+
+    What toggles in the message after a silence begins there.
+    """
+    long = [(start, stop) for start, stop, _ in spans if stop - start > SILENCE_NS]
+    if not long or holds_on(binned.view, (topic,)):
+        return spans
+    window = TimeWindow(long[0][0], long[-1][1] + 1)
+    heard = heard_times(binned.view, (topic,), window)
+    between = ((last - 1, first) for (_, last), (first, _) in pairwise(heard))
+    # An old thinned day has one message a minute of measurements.
+    silences = without(between, binned.view.timeline.thinned_times)
+    return [
+        (first, last, is_begun and first == start)
+        for start, stop, is_begun in spans
+        for first, last, _ in _without_gaps(start, stop, True, silences)
+    ]
 
 
 def count_labels(

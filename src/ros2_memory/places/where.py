@@ -398,7 +398,7 @@ class _ConditionStates:
             spans = (span for topic in topics for span in timeline.recordings(topic).values())
             known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
             return without(known, self._after_breaks(window))
-        return _heard(self._view, topics, window.widened(SILENCE_NS))
+        return heard_times(self._view, topics, window.widened(SILENCE_NS))
 
     def _after_breaks(self, window: TimeWindow) -> Spans:
         """Returns from each break to the next message, as far as they reach into a window."""
@@ -485,7 +485,7 @@ class _ConditionStates:
         self._known = TimeWindow(start, stop)
 
 
-def _heard(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
+def heard_times(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
     """Returns when topics had messages, without silences of more than `SILENCE_NS`.
 
     Of a bag that holds a topic for no longer, its first and its last message say enough.

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.bags import McapLayout, battery, boolean, odom, text, write_splits
+from tests.support.bags import McapLayout, battery, boolean, odom, text, write_mcap, write_splits
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
 
@@ -153,3 +153,37 @@ def test_by_counts_a_boolean_that_is_said_when_it_changes_from_its_first_message
     write_splits(tmp_path, messages)
     counted = matches(tmp_path, BUMPER, first, 120, by="hour", recalls=recalls)
     assert table(counted)["all"]["count"] == began
+
+
+@each_way
+@pytest.mark.parametrize("split_s", [10, 30, 600])
+def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
+    tmp_path: Path, split_s: int, *, recalls: bool
+) -> None:
+    """Once a second, but not from 30, 80, 140 and 161 s on: false, true, true, true, then false."""
+    times = [*range(30), *range(45, 80), *range(100, 140), 160, 161, *range(175, 300)]
+    bumped = [45 <= at < 130 or 160 <= at < 162 for at in times]
+    messages = [boolean(T0 + at * S, *said) for at, *said in zip(times, bumped, strict=True)]
+    messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(300)]
+    write_splits(tmp_path, messages, split_s)
+
+    def whole(first: int, last: int, by: str = "hour") -> list[float]:
+        answer = table(matches(tmp_path, BUMPER, first, last, by=by, recalls=recalls))["all"]
+        return [answer["count"], answer["seconds"]]
+
+    rows = matches(tmp_path, BUMPER, 0, 300, recalls=recalls)["sightings"]
+    assert [row["duration_s"] for row in rows] == [1, 30, 34]
+    assert whole(0, 300) == [2, 65]
+    assert whole(0, 300, "value")[1] == 65
+    assert whole(50, 110) == [0, 29 + 10]
+    assert whole(79, 95) == whole(85, 95) == [0, 0]
+
+
+def test_a_boolean_holds_on_in_a_day_of_which_a_message_a_minute_stayed(tmp_path: Path) -> None:
+    day = [battery(T0 + at * S, 0.5) for at in range(0, 3601, 60)]
+    write_mcap(tmp_path / "memory" / "20260921.thinned.mcap", day)
+    write_splits(tmp_path, [battery(T0 + at * S, 0.5) for at in range(90_000, 90_060)])
+    present = {"condition_type": "equals", "value": True, "field": "present", "by": "day"}
+    asks = {"topic": "/battery_state", **present, "start": T0 / S, "end": T0 / S + 3600}
+    answer = asked(memory_of(tmp_path), tmp_path, "find_matches", **asks)
+    assert table(answer)["all"]["seconds"] == 3600
