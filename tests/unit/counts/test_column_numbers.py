@@ -2,7 +2,7 @@
 
 import math
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -67,15 +67,21 @@ def test_what_there_is_no_time_to_count_is_no_number_and_no_row(
     assert not any(note.startswith("no rows") for note in part.notes)
 
 
+@dataclass(frozen=True, slots=True)
 class Limited(Deadline):
-    """A deadline that is over after so many looks at it."""
+    """A deadline that is over after so many looks at it, also at what is made of it."""
 
-    def __init__(self, looks: int) -> None:
-        super().__init__(600.0, 600.0)
-        object.__setattr__(self, "looks", iter([False] * looks))
+    looks: list[bool] = field(default_factory=list)
 
     def expired(self) -> bool:
-        return next(self.looks, True)  # type: ignore[attr-defined]
+        return self.looks.pop() if self.looks else True
+
+    def left_s(self) -> float:
+        return 600.0 if self.looks else 0.0
+
+
+def limited(looks: int) -> Deadline:
+    return Limited(600.0, 600.0, looks=[False] * looks)
 
 
 def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
@@ -87,7 +93,7 @@ def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
     rows = set()
     for looks in range(1, 60, 3):
         with suppress(QueryTimeoutError):
-            call = Call(deadline=Limited(looks))
+            call = Call(deadline=limited(looks))
             answer = count_visits(memory, call, 0.0, 0.0, by="hour", radius_m=1.0)
             rows.add(len(answer.rows))
             assert not any("only what is after" in note for note in answer.notes) or (
@@ -116,7 +122,7 @@ def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched
     sinces = set()
     for looks in range(1, 60, 3):
         with suppress(QueryTimeoutError):
-            answer = count(Call(deadline=Limited(looks)))
+            answer = count(Call(deadline=limited(looks)))
             since = last - (cells(answer, "recorded_s")[-1] or 0)
             counted = [at for at in begins if at >= since]
             by_hour = {
