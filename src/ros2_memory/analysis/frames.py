@@ -408,8 +408,8 @@ class FrameTree:
         """Returns why there is no transform at a time, though both frames are known."""
         tree = connected_with(self.target, self._pairs)
         if name in tree:
-            for frame in (name, self.target):
-                lacking = self._missing_link(frame, time)
+            for frame, other in ((name, self.target), (self.target, name)):
+                lacking = self._missing_link(frame, other, time)
                 if lacking is not None:
                     return lacking
         # A root is, in a loop, the frame where it closes.
@@ -432,10 +432,11 @@ class FrameTree:
             )
         return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 
-    def _missing_link(self, frame: str, time: Ns) -> NoDataError | None:
-        """Returns why a walk from a frame up to its root ends at a time; None if it does not."""
+    def _missing_link(self, frame: str, other: str, time: Ns) -> NoDataError | None:
+        """Returns why one frame's part of the way to another is broken at a time, if it is."""
         at = np.array(time, np.int64)
-        for above in self._chain(frame, at):
+        beyond = self._chain(other, at)
+        for above in takewhile(lambda name: name not in beyond, self._chain(frame, at)):
             history = self._history(above)
             if history is not None and not history.at(at).valid:
                 return history.nothing_at(time)

@@ -308,14 +308,16 @@ class Group:
     def pass_on(self, following: Group) -> None:
         """Leaves the messages of each topic's last log time to the next group of the bag.
 
-        Unless they are many: messages of one log time are numbered within a table.
+        As messages of one log time are numbered within a table. Where they are many they stay. The
+        next group is empty.
         """
         self._decode()
         room = GROUP_BYTES // 4
         for key, parts in self._tables.items():
-            [table] = parts[:] = _joined_alike(parts)
+            [table] = _joined_alike(parts)  # of one bag
             begin = int(np.searchsorted(table.log_times, table.log_times[-1]))
             last = table.rows(np.arange(begin, len(table)))
+            parts[:] = [table]
             if last.memory_bytes <= room:
                 room -= last.memory_bytes
                 following._tables[key] = [last]

@@ -133,10 +133,11 @@ class BagAccess:
 
     def decode(
         self, stored: StoredMessage, failures: list[UndecodableError] | None = None
-    ) -> object | None:
+    ) -> object:
         """Returns the decoded message; None where its type or its bytes are not understood.
 
-        Why is added to `failures`.
+        Why is added to `failures`, if they are given: who gives them reports them, and such an
+        answer is not remembered.
         """
         try:
             return self.memory.reader.decode(stored.record)

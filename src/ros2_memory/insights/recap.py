@@ -245,17 +245,17 @@ def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
 
 
 class _RegionStays:
-    """The times at which the robot was in a region, in order."""
+    """The stays of robots in a region, and the times of all together (half-open), in order."""
 
     def __init__(self, spans: Sequence[Stay], elapsed: Elapsed) -> None:
         self.spans = spans
-        self._inside = united_spans((stay.start, stay.stop + 1) for stay in spans)
+        self.times = united_spans((stay.start, stay.stop + 1) for stay in spans)
         self._elapsed = elapsed
 
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
         """Returns whether some of a time, or a moment, is among them."""
         last = start if end is None else end
-        return overlaps_any(self._inside, start, last)
+        return overlaps_any(self.times, start, last)
 
     def has(self, event: Event) -> bool:
         """Returns whether an event happened then; how long a boolean held is of no matter."""
@@ -462,14 +462,15 @@ def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[
 def _errors_in_region(
     view: View, topic: str, events: TopicEvents, region_stays: _RegionStays | None
 ) -> tuple[Report, ...]:
-    """Returns the errors of a window; in a region only their reports there count."""
+    """Returns the errors of a window: of those that reach into a region the reports there.
+
+    Others may be among them.
+    """
     if region_stays is None or all(
         region_stays.covers(error.first, error.last) for error in events.errors
     ):
         return events.errors
-    parts = [
-        events_in(view, topic, TimeWindow(stay.start, stay.stop + 1)) for stay in region_stays.spans
-    ]
+    parts = [events_in(view, topic, TimeWindow(*time)) for time in region_stays.times]
     inside = joined_events([part for part in parts if part is not None])
     return () if inside is None else inside.errors
 

@@ -435,8 +435,11 @@ def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
 
 
 def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None) -> Sighting:
-    """Returns a goal of an action as a sighting, with where the robot was when it ended."""
+    """Returns a goal as a sighting, with where the robot was when it ended or was last listed."""
     message = view.stream.last(goal.topic, goal.last + 1)
+    robot = None
+    if message is not None:
+        robot = robot_at(view, goal.last, message.bag.recording, frame_id)
     return Sighting(
         topic=goal.topic,
         first=goal.first,
@@ -444,9 +447,7 @@ def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None
         until=_goes_on_until(view, goal, scope),
         messages=0,
         begun=goal.accepted is not None,
-        robot=None
-        if message is None
-        else robot_at(view, goal.last, message.bag.recording, frame_id),
+        robot=robot,
         thing=None,
         value={"goal": goal.goal, "status": goal.status_word},
     )

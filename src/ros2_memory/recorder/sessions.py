@@ -635,12 +635,13 @@ class RecordingSessions:
     def settle_handovers(self) -> None:
         """Completes handovers whose recordings have ended, and compares the two where they can be.
 
-        What fails, as on a full disk, is reported and tried again with the next call.
+        Those of recordings that run wait. What fails, as on a full disk, is reported and tried
+        again with the next call.
         """
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
-            name = old.name
-            with self.events.lasting_if_refused("handover_not_settled", name, recording=name):
+            pair, name = f"{old.name}/{new.name}", old.name
+            with self.events.lasting_if_refused("handover_not_settled", pair, recording=name):
                 if settle_handover(old, new, self.orders.reader, running):
                     self._unsettled.remove((old, new))
 

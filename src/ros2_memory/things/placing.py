@@ -115,7 +115,7 @@ class Placer:
             sights.append(self._fixes(session, poses.frames.words[0], frames, times))
         return target, sights, detectors
 
-    def spots_by_bag(
+    def sights_by_bag(
         self,
         window: TimeWindow,
         session: Session,

@@ -290,9 +290,9 @@ class Watching:
         return tuple(sorted(numbers))
 
     def by_bag(self, bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, str, Sights]]:
-        """Yields the spots of the messages of each of some bags that count, in each stretch.
+        """Yields the sights of the messages of each of some bags that count, in each stretch.
 
-        With the frame of their places. Robot poses are not looked for.
+        With the frame of their places, which the robot's poses decide; these are not in the sights.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -308,8 +308,8 @@ class Watching:
                     lender = self._transforms_of(session, bag, window)
                     of_bags = by_lender.setdefault((session, lender), {})
                     of_bags.setdefault(bag, []).append(rows.some(positions))
-            for lending, of_bags in by_lender.items():
-                yield from self._placer.spots_by_bag(window, *lending, of_bags)
+            for (session, lender), of_bags in by_lender.items():
+                yield from self._placer.sights_by_bag(window, session, lender, of_bags)
 
     def _around(self, window: TimeWindow) -> _Surroundings:
         self._view.bags.check_deadline()

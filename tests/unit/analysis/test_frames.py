@@ -201,6 +201,13 @@ TWO_TREES = Tree([*moving(), edge("map", "goal", 5), edge("goal", "tip", 5)])
 IN_MAP = Tree([*moving(), edge("map", "odom", 0, static=True)])
 GAP = Tree([edge("odom", "base", 100 * S, 1.0), edge("odom", "base", 111 * S, 2.0)])
 HANDED = Tree([edge("a", "cup", 0), edge("b", "cup", 20 * S), edge("c", "cup", 21 * S)])
+MAST = Tree(
+    [
+        *(edge("odom", "base", at * S) for at in (10, 12)),
+        *(edge("base", "camera", at * S) for at in range(20)),
+        *(edge("base", "laser", at * S) for at in (60, 61)),
+    ]
+)
 UNKNOWN, OUTSIDE = NoDataReason.FRAME_UNKNOWN, NoDataReason.OUTSIDE_RANGE
 RANGE = "100.000000 to 105.000000 (Unix seconds)"
 
@@ -241,6 +248,8 @@ RANGE = "100.000000 to 105.000000 (Unix seconds)"
         (picked_up(), ("map", "cup"), 9 * S, OUTSIDE, "of 'cup' in 'table' at 9.0"),
         (picked_up(), ("map", "cup"), 17 * S, OUTSIDE, "of 'cup' in 'gripper' at 17.0"),
         (HANDED, ("a", "cup"), 5 * S, NoDataReason.GAP, "of 'cup' in 'a' at 5.0"),
+        # What is above both frames is not asked for.
+        (MAST, ("camera", "laser"), 61 * S, OUTSIDE, "of 'camera' in 'base' at 61.0"),
     ],
     ids=count(),
 )
