@@ -404,7 +404,11 @@ def _without_silences(binned: BinnedWindow, topic: str, spans: _TrueSpans) -> _T
         return spans
     window = TimeWindow(long[0][0], long[-1][1] + 1)
     heard = heard_times(binned.view, (topic,), window)
-    between = ((last - 1, first) for (_, last), (first, _) in pairwise(heard))
+    between = (
+        (last - 1, min(first, window.stop))
+        for (_, last), (first, _) in pairwise(heard)
+        if window.contains(last - 1)  # of other times not all is heard
+    )
     # An old thinned day has one message a minute of measurements.
     silences = without(between, binned.view.timeline.thinned_times)
     return [
