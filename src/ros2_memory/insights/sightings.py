@@ -65,7 +65,7 @@ _SightingOrEpisode = TypeVar("_SightingOrEpisode", Sighting, Episode)
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
 _LEFT_TO_SAY_S: Final = 2.0
-"""How long before the end of its time a search ends, to read the messages of what was found."""
+"""A search ends so long before the call's time does: then the messages of matches are read."""
 
 
 def find_matches(
@@ -267,11 +267,11 @@ def _runs_as_sightings(
 def read_sightings(
     view: View, pattern: str, condition: Condition, scope: Scope
 ) -> tuple[Ints, Ns | None, str]:
-    """Returns the times (inclusive) of all sightings in a scope, N x 3.
+    """Returns all sightings in a scope, since when they are known, and what there are too many of.
 
-    And whether each is known to begin then: what a latched topic had said before may hold on. With
-    them since when they are known, where not all is searched: since there is too much of what the
-    text says, or, where that is empty, since the call's time is over.
+    Of each sighting, as a row, its first and last log time (ns), and whether it is known to begin
+    then: what a latched topic reported before may have begun earlier. The second is None where all
+    was searched; the third is empty where the call's time was over.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
