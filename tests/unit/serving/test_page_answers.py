@@ -80,7 +80,8 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """However busy the machine is, no part is left out for later."""
-    monkeypatch.setattr(span, "_QUICK_S", 60.0)
+    for part in ("span", "drawn_path", "topics"):
+        monkeypatch.setattr(f"ros2_memory.serving.page.{part}._QUICK_S", 60.0)
 
 
 @pytest.fixture(scope="module", params=["plain", "store"])
