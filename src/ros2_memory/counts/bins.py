@@ -434,13 +434,23 @@ class BinnedWindow:
         if self.bins.day_of is None:
             return set()
         edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
-        recorded_days, cut_days = set(), set()
+        recorded_days, cut_days = set(), set(days[:1] if self._begins_after_others() else ())
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
             if length_in(self.gaps, start, stop) < stop - start:
                 recorded_days.add(day)
             if self._since is not None and start < self._since:
                 cut_days.add(day)
         return recorded_days - cut_days
+
+    def _begins_after_others(self) -> bool:
+        """Returns whether something was recorded in the first local day before the window."""
+        start = self.window.start
+        start_s = start // NS_PER_S
+        midnight_s = start_s - (start_s + local_offset(start_s)) % _DAY_S
+        before = TimeWindow(midnight_s * NS_PER_S, start)
+        first, last = shown_span(self.view.snapshot, before)
+        unrecorded = length_in([*recording_gaps(self.view, before)], first, last)
+        return last - first - unrecorded > NS_PER_S  # a start that is the memory's own is rounded
 
     def _time_in_pieces(self, spans: Sequence[Span]) -> Ints:
         """Returns how much time (ns) of half-open spans passed in each piece."""

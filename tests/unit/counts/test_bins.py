@@ -52,3 +52,23 @@ def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> N
         # Twice it was off the dock from the beginning on: nobody saw it leave.
         assert (off["count"], off["seconds"], off["recorded_s"]) == (0, 2 * 50, 2 * 99)
         assert "usual_first" not in reply
+
+
+def test_the_first_of_a_day_is_not_known_where_the_window_begins_after_others(
+    tmp_path: Path,
+) -> None:
+    midnight = round(datetime(2026, 3, 2).astimezone().timestamp())
+    for day, hour in ((0, 8), (0, 17), (1, 9), (2, 8)):
+        begin = midnight + day * 86_400 + hour * 3600
+        messages = [boolean((begin + at) * S, at >= 10, topic="/is_driving") for at in range(20)]
+        write_mcap(tmp_path / f"{begin}.mcap", messages)
+    memory = memory_of(tmp_path)
+    asks = {"topic": "/is_driving", "condition_type": "equals", "value": True, "by": "day"}
+
+    def usual_first(start_h: float) -> tuple[str, str, int]:
+        span = {"start": midnight + start_h * 3600, "end": midnight + 3 * 86_400}
+        usual = asked(memory, tmp_path, "find_matches", **asks, **span)["usual_first"]
+        return usual["earliest"], usual["latest"], usual["days"]
+
+    assert usual_first(0) == usual_first(7) == usual_first(8) == ("08:00:10", "09:00:10", 3)
+    assert usual_first(15) == ("08:00:10", "09:00:10", 2)
