@@ -6,8 +6,9 @@ import struct
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from itertools import count
 from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -97,21 +98,35 @@ def bag(folder: Path, *records: Piece, name: str = "run/run_0.mcap") -> Path:
     return path
 
 
-@pytest.mark.parametrize("stated", [10, 1 << 40])
 @pytest.mark.parametrize(
-    ("compression", "packed"),
-    [("zstd", rle_frame(300 * MB)), ("lz4", lz4.frame.compress(bytes(300 * MB)))],
+    ("records", "said"),
+    [
+        *(
+            (
+                [string_chunk(), chunk_of(b"", how, packed=packed, size=stated, crc=0)],
+                "larger than the 1 MiB allowed; if that is right, raise reader.max_chunk_mb",
+            )
+            for how, packed in (
+                ("zstd", rle_frame(300 * MB)),
+                ("lz4", lz4.frame.compress(bytes(300 * MB))),
+            )
+            for stated in (10, 1 << 40)
+        ),
+        # Outside of chunks.
+        ([*STRINGS, string_message("x" * 2 * MB), string_message()], "a message is larger"),
+        ([string_chunk(), *[chunk_of(b"")] * 20], "more than 20 chunks"),
+    ],
+    ids=count(),
 )
-def test_a_chunk_larger_than_allowed_is_left_out_and_named(
-    tmp_path: Path, compression: str, packed: bytes, stated: int
+def test_what_is_larger_or_more_than_allowed_is_left_out_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, records: list[Piece], said: str
 ) -> None:
-    large = chunk_of(b"", compression, packed=packed, size=stated, crc=0)
-    path = bag(tmp_path, string_chunk(), large)
+    monkeypatch.setattr("ros2_memory.storage.mcap.chunk.MAX_CHUNKS", 20)
+    path, reader = bag(tmp_path, *records), McapReader(max_chunk_mb=1)
     with little_memory(10 * MB):
-        summary = McapReader(max_chunk_mb=1).summarize(path)
-    assert summary.count == 1
-    assert "larger than the 1 MiB allowed" in summary.notes[0]
-    assert "reader.max_chunk_mb" in summary.notes[0]
+        summary = reader.summarize(path)
+        assert len([*reader.records(path, ["/chatter"], EVERYTHING)]) == summary.count == 1
+    assert said in summary.notes[0]
 
 
 def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
@@ -129,17 +144,6 @@ def test_a_chunk_of_more_messages_than_are_kept_in_mind_is_refused() -> None:
     assert walk_chunk(one * 10).messages == 10
     with pytest.raises(UnreadableError, match=f"more than {MAX_CHUNK_MESSAGES} messages"):
         walk_chunk(one * (MAX_CHUNK_MESSAGES + 40_000))
-
-
-def test_a_message_outside_of_chunks_that_is_larger_than_allowed_is_left_out(
-    tmp_path: Path,
-) -> None:
-    path = bag(tmp_path, *STRINGS, string_message("x" * 2 * MB), string_message("y", 9))
-    reader = McapReader(max_chunk_mb=1)
-    summary = reader.summarize(path)
-    assert (summary.count, summary.start) == (1, 9)
-    assert "a message is larger" in summary.notes[0]
-    assert [each.log_time for each in reader.records(path, ["/chatter"], EVERYTHING)] == [9]
 
 
 def test_repairing_a_bag_of_bombs_counts_them_as_lost(tmp_path: Path) -> None:
@@ -166,22 +170,27 @@ def test_large_chunks_that_overlap_in_time_are_not_all_in_memory_at_once(tmp_pat
     assert times == [*range(count), *range(100, 100 + count)]
 
 
-def test_a_bag_of_more_topics_than_any_robot_has_is_not_read(tmp_path: Path) -> None:
-    many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_TOPICS + 2)]
-    with pytest.raises(BagError, match="may be whole, but has more than the 5000 topics"):
-        McapReader().summarize(bag(tmp_path, STRINGS[0], *many, string_message()))
-    known = bag(tmp_path, STRINGS[0], *many[:-1], string_message())
-    assert McapReader().summarize(known).count == 1
+MANY = [channel(n, 1, f"/t{n}") for n in range(1, MAX_TOPICS + 2)]
 
 
-def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("declared", "said"),
+    [
+        ([STRINGS[0], *MANY], "may be whole, but has more than the 5000 topics"),
+        ([STRINGS[0], channel(1, 1, f"/{TOO_LONG}")], "longer names"),
+        ([schema(1, TOO_LONG, "ros2msg", b"uint8 data"), STRINGS[1]], "longer names"),
+    ],
+    ids=["topics", "a topic", "a type"],
+)
+def test_more_topics_or_longer_names_than_any_robot_has_are_refused(
+    tmp_path: Path, declared: list[Piece], said: str
 ) -> None:
-    monkeypatch.setattr("ros2_memory.storage.mcap.chunk.MAX_CHUNKS", 20)
-    each = chunk_of(string_message().data)
-    summary = McapReader().summarize(bag(tmp_path, string_chunk(), *[each] * 21))
-    assert summary.count == 20
-    assert "more than 20 chunks" in summary.notes[0]
+    """They stay in memory as long as a bag exists."""
+    packed = chunk_of(b"".join(each.data for each in (*declared, string_message())), "zstd")
+    with pytest.raises(BagError, match=said):
+        McapReader().summarize(bag(tmp_path, packed))
+    known = bag(tmp_path, STRINGS[0], *MANY[:-1], string_message())
+    assert McapReader().summarize(known).count == 1
 
 
 def test_a_compressed_message_larger_than_allowed_cannot_be_decoded_and_the_next_can(
@@ -196,38 +205,37 @@ def test_a_compressed_message_larger_than_allowed_cannot_be_decoded_and_the_next
     assert getattr(reader.decode(second), "data", None) == "y"
 
 
-def test_a_message_of_more_messages_than_there_is_room_for_is_not_decoded() -> None:
-    definition = b"std_msgs/Bool[] data\n" + b"=" * 80 + b"\nMSG: std_msgs/Bool\nbool data\n"
-    known = Channel("/t", "cdr", Schema("pkg/msg/Many", "ros2msg", definition))
-
-    def record(count: int) -> Record:
-        return Record(known, 1, 1, b"\0\1\0\0" + struct.pack("<I", count) + bytes(count))
-
-    few = McapReader().decode(record(1000))
-    assert len(getattr(few, "data", ())) == 1000
-    with pytest.raises(UndecodableError, match="more than 200000 texts or messages"):
-        McapReader().decode(record(300_000))
-
-
-def test_json_longer_than_is_read_is_refused() -> None:
-    known = Channel("/t", "json", Schema("Thing", "jsonschema", b"{}"))
-    payload = b"[" + b"0," * (2 * MB) + b"0]"
-    with pytest.raises(UndecodableError, match="longer than the 4 MiB"):
-        McapReader().decode(Record(known, 1, 1, payload))
-
-
-# They stay in memory as long as a bag exists.
+MANY_BOOLS = b"std_msgs/Bool[] data\n" + b"=" * 80 + b"\nMSG: std_msgs/Bool\nbool data\n"
 
 
 @pytest.mark.parametrize(
-    ("topic", "kind"), [("/" + TOO_LONG, "a/msg/B"), ("/a", TOO_LONG)], ids=["topic", "type"]
+    ("encoding", "kind", "payload_of", "most", "said"),
+    [
+        (
+            "cdr",
+            Schema("pkg/msg/Many", "ros2msg", MANY_BOOLS),
+            lambda number: b"\0\1\0\0" + struct.pack("<I", number) + bytes(number),
+            199_000,
+            "more than 200000 texts or messages",
+        ),
+        (
+            "json",
+            Schema("Thing", "jsonschema", b"{}"),
+            lambda number: b"[" + b"0," * number + b"0]",
+            2 * MB - 2,
+            "longer than the 4 MiB",
+        ),
+    ],
 )
-def test_names_longer_than_any_are_refused(tmp_path: Path, topic: str, kind: str) -> None:
-    declared = schema(1, kind, "ros2msg", b"uint8 data").data + channel(1, 1, topic).data
-    path = bag(tmp_path, chunk_of(declared + string_message().data, "zstd"))
-    assert path.stat().st_size < 10_000
-    with pytest.raises(BagError, match="longer names"):
-        McapReader().summarize(path)
+def test_a_message_of_more_than_there_is_room_for_is_not_decoded(
+    encoding: str, kind: Schema, payload_of: Callable[[int], bytes], most: int, said: str
+) -> None:
+    def decoded(number: int) -> object:
+        return McapReader().decode(Record(Channel("/t", encoding, kind), 1, 1, payload_of(number)))
+
+    assert decoded(most)
+    with pytest.raises(UndecodableError, match=said):
+        decoded(2 * most)
 
 
 def test_of_a_definition_larger_than_any_no_more_is_kept_than_shows_it(tmp_path: Path) -> None:
@@ -276,89 +284,62 @@ def edited(folder: Path, *statements: str) -> Path:
     return path
 
 
+LONG = "char(0) || hex(zeroblob(17000000))"
+
+
 @pytest.mark.parametrize(
-    ("statements", "reason"),
+    ("statements", "said"),
     [
-        pytest.param(
-            "ALTER TABLE messages RENAME TO m;"
-            "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1"
-            " FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n",
+        (
+            (
+                "ALTER TABLE messages RENAME TO m;"
+                "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1"
+                " FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
+            ),
             "its messages is not a plain table",
-            id="an endless view",
         ),
-        pytest.param(
+        (
             "ALTER TABLE messages ADD COLUMN more AS (zeroblob(900000000))",
             "its messages is not a plain table",
-            id="a computed column",
         ),
-        pytest.param(
+        (
             "ALTER TABLE messages RENAME COLUMN data TO other",
             "lacks the tables topics and messages",
-            id="a column that is not there",
-        ),
-    ],
-)
-def test_a_table_that_is_not_what_it_is_called_is_refused(
-    tmp_path: Path, statements: str, reason: str
-) -> None:
-    path = edited(tmp_path, statements)
-    with pytest.raises(BagError, match=reason):
-        Rosbag2Reader().summarize(path)
-
-
-@pytest.mark.parametrize(
-    ("statement", "rows", "said"),
-    [
-        (
-            "message_definitions VALUES (?, 'a/msg/B', 'ros2msg', ?, '')",
-            [(n, "x" * 1_000_000) for n in range(10, 80)],
-            "texts of its table message_definitions are longer",
         ),
         (
-            "topics VALUES (?, ?, 'a/msg/B', 'cdr', '', '')",
-            [(n, f"/t{n}") for n in range(10, 5010)],
+            (
+                "WITH RECURSIVE n(i) AS (SELECT 9 UNION ALL SELECT i + 1 FROM n LIMIT 5000)"
+                "INSERT INTO topics SELECT i, '/t' || i, 'a/msg/B', 'cdr', '', '' FROM n"
+            ),
             "more than the 5000 topics",
         ),
-    ],
-)
-def test_more_topics_than_any_robot_has_and_enormous_definitions_are_refused(
-    tmp_path: Path, statement: str, rows: list[tuple[int, str]], said: str
-) -> None:
-    path = edited(tmp_path)
-    with closing(sqlite3.connect(path)) as base:
-        base.executemany(f"INSERT INTO {statement}", rows)
-        base.commit()
-    with pytest.raises(BagError, match=said):
-        Rosbag2Reader().summarize(path)
-
-
-@pytest.mark.parametrize(
-    ("change", "table"),
-    [
-        ("UPDATE topics SET offered_qos_profiles = ?", "topics"),
-        ("UPDATE topics SET name = ?", "topics"),
         (
-            "UPDATE message_definitions SET encoded_message_definition = ?",
-            "message_definitions",
+            (
+                "WITH RECURSIVE n(i) AS (SELECT 9 UNION ALL SELECT i + 1 FROM n LIMIT 70)"
+                "INSERT INTO message_definitions"
+                " SELECT i, 'a/msg/B', 'ros2msg', hex(zeroblob(500000)), '' FROM n"
+            ),
+            "texts of its table message_definitions are longer than",
         ),
-        ("UPDATE message_definitions SET topic_type = ?", "message_definitions"),
+        *(
+            (f"UPDATE {table} SET {column} = {LONG}", f"its table {table} are longer than")  # noqa: S608
+            for table, column in (
+                ("topics", "offered_qos_profiles"),
+                ("topics", "name"),
+                ("message_definitions", "encoded_message_definition"),
+                ("message_definitions", "topic_type"),
+            )
+        ),
     ],
+    ids=count(),
 )
-def test_texts_longer_than_any_robot_has_are_refused_before_they_are_read(
-    tmp_path: Path, change: str, table: str
+def test_a_database_that_is_not_what_it_seems_is_refused_before_it_is_read(
+    tmp_path: Path, statements: str, said: str
 ) -> None:
-    path = edited(
-        tmp_path,
-        "INSERT INTO topics SELECT 9, '/t', 'a/msg/B', 'cdr', '', ''",
-        "INSERT INTO message_definitions SELECT 9, 'a/msg/B', 'ros2msg', '', ''",
-    )
+    path = write_db3(tmp_path / "bag.db3", [text(n, "x") for n in range(5)])
     with closing(sqlite3.connect(path)) as base:
-        base.execute(change, ("\0" + "x" * 33 * MB,))
-        base.commit()
-    with (
-        little_memory(MB),
-        pytest.raises(BagError, match=f"texts of its table {table} are longer than"),
-    ):
+        base.executescript(statements)
+    with little_memory(4 * MB), pytest.raises(BagError, match=said):
         Rosbag2Reader().summarize(path)
 
 
