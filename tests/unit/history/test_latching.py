@@ -1,20 +1,16 @@
-"""Latched is what holds until the next message, and not all that is transient local."""
+"""Latched is what holds until the next message, unless messages of it may have been deleted."""
 
-import json
+from collections.abc import Collection
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ros2_memory.core.errors import NoDataError
+from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call, Latching, Memory, QuerySettings
-from ros2_memory.history.view import AtTime
-from ros2_memory.queries import position, topic_value, value_when
+from ros2_memory.history.context import Latching, Memory, QuerySettings
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -22,14 +18,15 @@ from tests.support.bags import (
     log_entry,
     odom,
     text,
+    write_mcap,
     write_splits,
 )
-from tests.support.housekeepers import keeper_of
-from tests.support.memories import memory_of
+from tests.support.clocks import SettableClock
+from tests.support.housekeepers import NOW, T0, A, B, S, house_of, keeper_of, kept
+from tests.support.memories import asked, each_way, memory_of
 
-S = 10**9
-T0 = 1_790_000_000 * S
 MAP, TELEMETRY, ROSOUT = "/map_name", "/fmu/out/vehicle_status", "/rosout"
+
 TRANSIENT = McapLayout(latched=frozenset({MAP, TELEMETRY, ROSOUT, "/tf_static"}))
 
 
@@ -50,14 +47,10 @@ def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
     return memory_of(root, limits=QuerySettings(**limits), recalls=recalls)
 
 
-def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
-    """The reply to a question for a moment, or the reason why there is none."""
-    try:
-        answer = topic_value(memory, Call(), topic, AtTime(unix_from_ns(at)))
-    except NoDataError as error:
-        return {"error": error.reason}
-    shown: dict[str, Any] = json.loads(Replies(memory.index.bag_dir, 24_000).answer(answer).text)
-    return shown
+def at(memory: Memory, topic: str, when: int) -> Any:
+    """The reply to a question for a moment."""
+    asks = {"topic": topic, "timestamp": when / S}
+    return asked(memory, memory.index.bag_dir, "get_topic_at_time", **asks)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +72,7 @@ def test_what_is_published_every_five_seconds_or_less_often_holds(
     latched = [text(T0 + round(at * S), "office", MAP) for at in latched_s]
     record(tmp_path, [*latched, *drive(T0, T0 + drive_s * S)])
     for recalls in (False, True):
-        found = reply(remembered(tmp_path, recalls=recalls), MAP, latched[-1].log_time + 3 * S)
+        found = at(remembered(tmp_path, recalls=recalls), MAP, latched[-1].log_time + 3 * S)
         assert ("error" not in found) is holds
         if holds:
             assert (found["latched"], found["age_s"]) == (True, 3.0)
@@ -90,26 +83,21 @@ def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) 
     record(tmp_path, [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
     latching = Latching(include=("/fmu/*",), exclude=(MAP,))
     memory = remembered(tmp_path, latching=latching)
-    assert reply(memory, TELEMETRY, T0 + 59 * S)["latched"] is True
-    assert set(reply(memory, MAP, T0 + 59 * S)) == {"error"}
+    assert at(memory, TELEMETRY, T0 + 59 * S)["latched"] is True
+    assert "error" in at(memory, MAP, T0 + 59 * S)
     both = remembered(tmp_path, latching=Latching(include=("/odom",), exclude=("/odom",)))
-    assert set(reply(both, "/odom", T0 + 99 * S)) == {"error"}
+    assert "error" in at(both, "/odom", T0 + 99 * S)
 
 
-def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None:
+def test_a_value_of_another_time_and_a_pose_say_that_they_are_latched(tmp_path: Path) -> None:
     bump = boolean(T0 + 20 * S, True)
-    record(tmp_path, [text(T0, "office", MAP), bump, *drive(T0, T0 + 60 * S)])
-    memory = remembered(tmp_path)
-    found = value_when(memory, Call(), MAP, "/bumper", condition_type="equals", value=True)
-    shown = json.loads(Replies(tmp_path, 24_000).answer(found).text)
-    assert (shown["value_latched"], shown["value_age_s"]) == (True, 20.0)
-
-
-def test_a_pose_that_is_latched_says_so(tmp_path: Path) -> None:
-    record(tmp_path, [odom(T0, 1.0, 2.0), text(T0 + 60 * S, "later", "/words")])
+    record(tmp_path, [text(T0, "office", MAP), bump, *drive(T0, T0 + S), text(T0 + 60 * S, "")])
     memory = remembered(tmp_path, latching=Latching(include=("/odom",)))
-    found = position(memory, Call(), AtTime(unix_from_ns(T0 + 30 * S)))
-    assert [note for note in found.notes if "/odom is latched" in note and "30" in note]
+    bumped = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
+    shown = asked(memory, tmp_path, "get_value_when", value_topic=MAP, **bumped)
+    assert (shown["value_latched"], shown["value_age_s"]) == (True, 20.0)
+    pose = asked(memory, tmp_path, "get_position_at", timestamp=T0 / S + 30)
+    assert [note for note in pose["notes"] if "/odom is latched" in note and "30" in note]
 
 
 def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
@@ -133,6 +121,115 @@ def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
     }
     assert found == {TELEMETRY: telemetry[-1].log_time, MAP: T0}
     memory = remembered(tmp_path)
-    assert set(reply(memory, TELEMETRY, T0 + 29 * S)) == {"error"}
-    assert reply(memory, TELEMETRY, telemetry[-1].log_time)["value"] == {"value": "699"}
-    assert reply(memory, MAP, T0 + 29 * S)["age_s"] == 29.0
+    assert "error" in at(memory, TELEMETRY, T0 + 29 * S)
+    assert at(memory, TELEMETRY, telemetry[-1].log_time)["value"] == {"value": "699"}
+    assert at(memory, MAP, T0 + 29 * S)["age_s"] == 29.0
+
+
+T0_S = T0 // S
+
+DOCKED = "/docked"
+
+LAYOUT = McapLayout(latched=frozenset({DOCKED, "/map_ready"}))
+
+
+def docked(second: float, value: bool, topic: str = DOCKED) -> Msg:
+    return boolean(T0 + round(second * S), value, topic)
+
+
+def record_splits(
+    bag_dir: Path, name: str, start: int, splits: int, latched: Collection[Msg]
+) -> None:
+    """Splits of ten seconds, in which the robot moves."""
+    for number in range(splits):
+        first = T0 + (start + 10 * number) * S
+        own = [message for message in latched if first <= message.log_time < first + 10 * S]
+        driven = [odom(first + n * S, 1.0, 2.0) for n in range(10)]
+        messages = sorted([*driven, *own], key=lambda message: message.log_time)
+        write_mcap(bag_dir / name / f"{name}_{number}.mcap", messages, LAYOUT)
+    (bag_dir / name / "handover.json").write_text('{"format": 1}')
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    """Of two minutes 10 to 30 s are a moment that was saved, 30 to 110 s were deleted."""
+    said = [docked(5.5, True), docked(15.5, False), docked(40.5, True), docked(60.5, False)]
+    said += [docked(80.5, True), docked(115.5, False), docked(2.5, True, "/map_ready")]
+    record_splits(tmp_path, A, 0, 6, said)
+    record_splits(tmp_path, B, 60, 6, said)
+    kept(house_of(tmp_path), tmp_path, 12, 28)
+    house_of(tmp_path, max_bytes=1).apply()
+    left = sorted(path.stem for path in tmp_path.glob("rec*/*.mcap"))
+    assert left == [f"{A}_1", f"{A}_2", f"{B}_5"]
+    return tmp_path
+
+
+def memory(bag_dir: Path, *, recalls: bool = False) -> Memory:
+    return memory_of(bag_dir, clock=SettableClock(NOW), recalls=recalls)
+
+
+def value_at(memory: Memory, second: float, topic: str = DOCKED) -> Any:
+    reply = at(memory, topic, T0 + round(second * S))
+    return reply["value"]["value"] if "value" in reply else reply["reason"]
+
+
+@each_way
+def test_a_latched_value_is_not_held_into_a_time_that_was_deleted(
+    bag_dir: Path, recalls: bool
+) -> None:
+    asking = memory(bag_dir, recalls=recalls)
+    seconds = (12, 25, 45, 65, 75, 90, 112, 119)
+    known = [value_at(asking, second) for second in seconds]
+    # What it said newest before something is kept again was carried on.
+    assert known == [True, False, "deleted", "deleted", "deleted", True, True, False]
+    # A topic that said nothing there holds.
+    assert {value_at(asking, second, "/map_ready") for second in seconds} == {True}
+    refused = at(asking, DOCKED, T0 + 65 * S)
+    assert any("recorded, and deleted since" in note for note in refused["notes"])
+    assert "to accept the older one, ask with tolerance_s of at least" in refused["detail"]
+
+
+@each_way
+def test_how_long_a_value_held_ends_where_a_time_was_deleted(bag_dir: Path, recalls: bool) -> None:
+    asking = memory(bag_dir, recalls=recalls)
+    window = {"topic": DOCKED, "start": T0_S + 10, "end": T0_S + 130}
+    changes = asked(asking, bag_dir, "get_topic_in_range", changes=True, **window)["changes"]
+    assert [spell_of(spell) for spell in changes] == [
+        (True, 5.5, 10, True),
+        (False, 15.5, 13.5, False),
+        (True, 80.5, 35, True),
+        (False, 115.5, 3.5, False),
+    ]
+    undocked = {"condition_type": "equals", "value": False}
+    found = asked(asking, bag_dir, "find_matches", **window, **undocked)["sightings"]
+    spans = [(row["first_seen"] - T0_S, row["duration_s"]) for row in found]
+    assert spans == [(115.5, 3.5), (15.5, 13.5)]
+    events = asked(asking, bag_dir, "recap", start=T0_S, end=T0_S + 130)["events"]
+    flips = [event for event in events if event["text"] == "/docked became false"]
+    assert [flip.get("duration_s") for flip in flips] == [13.5, None]
+
+
+def spell_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["value"], row["start"] - T0_S, row["seconds"], row.get("ended", True)
+
+
+def test_a_value_is_not_held_on_across_messages_that_were_deleted_by_request(
+    tmp_path: Path,
+) -> None:
+    record_splits(tmp_path, A, 0, 6, [docked(5.5, True), docked(55.5, False)])
+    append_losses(tmp_path, [Loss(DOCKED, T0 + 20 * S, T0 + 30 * S, 2, "forgotten")])
+    asking = memory(tmp_path)
+    assert [value_at(asking, second) for second in (15, 25, 50, 57)] == [
+        True,
+        "deleted",
+        "deleted",
+        False,
+    ]
+    odometry = {"topic": "/odom", "condition_type": "above", "value": 0, "field": "position.x"}
+    docked_then = {"topic": DOCKED, "condition_type": "equals", "value": True}
+    for end, last in ((12, 12), (50, 20)):
+        span = {"start": T0_S, "end": T0_S + end, "while": docked_then}
+        answer = asked(asking, tmp_path, "find_matches", **odometry, **span)
+        [found] = answer["sightings"]
+        assert (found["first_seen"] - T0_S, found["last_seen"] - T0_S) == (6, last)
+    assert answer["unknown_s"] == 30

@@ -1,40 +1,49 @@
 """What an answer says must hold: of which time it speaks, how far off, and what would help.
 
-A window in which nothing was recorded has no answer: "never" and "none" would be false.
-"""
+A window in which nothing was recorded has no answer: "never" and "none" would be false. What was
+excluded was recorded, an interruption explains what it cost and no more, and time 0 is a moment
+like any other."""
 
+import json
+import random
 import re
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
-from ros2_memory import queries
-from ros2_memory.core.errors import NoDataError, NoDataReason
-from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.view import AtTime, TimeRange
-from tests.support.bags import boolean, detections, log_entry, odom, text, tf, transform, write_mcap
-from tests.support.clocks import FixedClock
-from tests.support.memories import asked, memory_of, with_store
+from ros2_memory.bag_dir.state_files import (
+    EVERY_TOPIC,
+    SCREENED,
+    Excluded,
+    Loss,
+    ScreenState,
+    append_losses,
+)
+from ros2_memory.core.errors import NoDataReason
+from ros2_memory.history.context import Memory, QuerySettings
+from tests.support.bags import (
+    McapLayout,
+    boolean,
+    detections,
+    log_entry,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
+from tests.support.clocks import FixedClock, SettableClock
+from tests.support.memories import asked, memory_of, replied, with_store
+from tests.unit.history.test_any_cut import questions
 
 S = 10**9
+
 T0_S = 1_784_023_200
+
 T0 = T0_S * S
-
-
-def after(seconds_later: float) -> AtTime:
-    return AtTime(at_s=T0_S + seconds_later)
-
-
-def frames_that_part(bag_dir: Path) -> None:
-    """`map` is known for ten seconds, `odom` for a minute."""
-    messages = [
-        tf(T0 + tick * S // 2, transform(T0 + tick * S // 2, *pair, (tick, 0.0, 0.0)))
-        for tick in range(120)
-        for pair in [("map", "odom"), ("odom", "base_link")]
-        if tick <= 20 or pair[0] == "odom"
-    ]
-    write_mcap(bag_dir / "run" / "run_0.mcap", messages)
 
 
 @pytest.mark.parametrize(
@@ -48,30 +57,30 @@ def frames_that_part(bag_dir: Path) -> None:
 def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
     tmp_path: Path, parent: str, child: str, later: float, reason: NoDataReason
 ) -> None:
-    frames_that_part(tmp_path)
-    at = T0 + 3 * 3600 * S + 50 * S
-    moved = [tf(at, transform(at, "odom", "base_link", (0.0, 0.0, 0.0)))]
-    write_mcap(tmp_path / "late" / "late_0.mcap", moved)
+    """`map` is known for ten seconds, `odom` for a minute, and again three hours later."""
+    for name, start, stop, pair in (
+        ("run/run_0", 0, 11, ("map", "odom")),
+        ("run/run_1", 0, 60, ("odom", "base_link")),
+        ("late/late_0", 10_850, 10_851, ("odom", "base_link")),
+    ):
+        ticks = range(T0 + start * S, T0 + stop * S, S // 2)
+        moved = [tf(at, transform(at, *pair, (0.0, 0.0, 0.0))) for at in ticks]
+        write_mcap(tmp_path / f"{name}.mcap", moved)
     plain = memory_of(tmp_path)
+    asks = {"parent": parent, "child": child, "timestamp": T0_S + later}
     for memory in (plain, with_store(plain, tmp_path)):
-        with pytest.raises(NoDataError) as caught:
-            queries.transform(memory, Call(), parent, child, after(later))
-        assert caught.value.reason is reason
+        assert asked(memory, tmp_path, "get_transform_at", **asks)["reason"] == reason
 
 
 @pytest.mark.parametrize("older_s", [12.631, 59.891])
 def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s: float) -> None:
     messages = [boolean(T0, True), text(T0 + round(older_s * S), "late")]
     write_mcap(tmp_path / "run" / "run_0.mcap", messages)
-    memory = memory_of(tmp_path)
-    with pytest.raises(NoDataError) as caught:
-        queries.topic_value(memory, Call(), "/bumper", after(older_s))
-    advised = re.search(r"tolerance_s of at least ([\d.]+)", caught.value.detail)
+    ask = partial(asked, memory_of(tmp_path), tmp_path, "get_topic_at_time", topic="/bumper")
+    detail = ask(timestamp=T0_S + older_s)["detail"]
+    advised = re.search(r"tolerance_s of at least ([\d.]+)", detail)
     assert advised
-    reply = queries.topic_value(
-        memory, Call(), "/bumper", after(older_s), tolerance_s=float(advised[1])
-    )
-    assert reply.sample.time == T0
+    assert ask(timestamp=T0_S + older_s, tolerance_s=float(advised[1]))["timestamp"] == T0_S
 
 
 @pytest.mark.parametrize("loose", [False, True])
@@ -84,21 +93,20 @@ def test_of_several_robots_in_one_folder_the_nearest_message_is_not_another_robo
     own = [odom(T0 + n * S, 0.0, 0.0, topic="/base/odometry") for n in range(10)]
     write_mcap(tmp_path / f"{names[0]}.mcap", [*own, text(T0, "one")])
     write_mcap(tmp_path / f"{names[1]}.mcap", [odom(T0 + year * S, 0.0, 0.0)])
-    memory = memory_of(tmp_path)
-    with pytest.raises(NoDataError) as caught:
-        queries.position(memory, Call(), after(5))
-    detail = caught.value.detail
+    ask = partial(asked, memory_of(tmp_path), tmp_path)
+    detail = ask("get_position_at", timestamp=T0_S + 5)["detail"]
     assert "robin" in detail
     assert "has no such topic; similar there: /base/odometry; give topic" in detail
     assert "nearest" not in detail
-    with pytest.raises(NoDataError, match="similar there: /base/odometry"):
-        queries.topic_range(memory, Call(), "/odom", TimeRange(T0_S + 1, T0_S + 3))
+    ranged = ask("get_topic_in_range", topic="/odom", start=T0_S + 1, end=T0_S + 3)
+    assert "similar there: /base/odometry" in ranged["detail"]
     # Between the two there is nothing to tell them apart by.
-    with pytest.raises(NoDataError, match="nearest newer one is 364 days after"):
-        queries.position(memory, Call(), after(86_400))
+    between = ask("get_position_at", timestamp=T0_S + 86_400)
+    assert "nearest newer one is 364 days after" in between["detail"]
 
 
 TRUE = {"topic": "/bumper", "condition_type": "equals", "value": True}
+
 WINDOWED: dict[str, dict[str, Any]] = {
     "find_matches": TRUE,
     "find_things": {},
@@ -106,6 +114,7 @@ WINDOWED: dict[str, dict[str, Any]] = {
     "trajectory_summary": {},
     "get_topic_in_range": {"topic": "/odom"},
 }
+
 BEFORE: dict[str, dict[str, Any]] = {
     "find_last_match": TRUE,
     "get_value_when": {
@@ -115,7 +124,9 @@ BEFORE: dict[str, dict[str, Any]] = {
         "value": True,
     },
 }
+
 NOTHING = [((-50, -20), "outside_range"), ((70, 90), "gap"), ((160, 190), "outside_range")]
+
 """Seconds after the begin; recorded are 0 to 39 and 140 to 149."""
 
 
@@ -169,3 +180,199 @@ def test_a_window_that_is_recorded_in_part_says_how_much(
     assert not any("recorded" in note for note in whole.get("notes", ()))
     almost = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39.01)
     assert not any("recorded only" in note for note in almost.get("notes", ()))
+
+
+BEGIN = 1_784_000_000
+MODE = "/privacy_mode"
+DIED = "because ros2 bag record died"
+UNCLEAN = "because the recorder ended without a shutdown"
+
+
+@pytest.fixture
+def apart(tmp_path: Path) -> Path:
+    """Two recordings, with 80 s between them; a mode holds from the begin of each."""
+    layout = McapLayout(latched=frozenset({MODE}))
+    for name, start, stop in (("a", 0, 21), ("b", 100, 120)):
+        messages = [odom((BEGIN + second) * S, 1.0, 2.0) for second in range(start, stop)]
+        messages.append(boolean((BEGIN + start) * S, False, MODE))
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages, layout)
+    return tmp_path
+
+
+def interrupted(apart: Path, start: int, stop: int, by: Any = "died") -> None:
+    append_losses(apart, [Loss(EVERY_TOPIC, (BEGIN + start) * S, (BEGIN + stop) * S, 0, by)])
+
+
+def exclude(apart: Path, start: int, stop: int) -> None:
+    excluded = Excluded((BEGIN + start) * S + 1, (BEGIN + stop) * S)
+    SCREENED.write(apart, ScreenState(excluded=[excluded]))
+
+
+def ask(apart: Path, tool: str, **given: object) -> Any:
+    return asked(memory_of(apart), apart, tool, **given)
+
+
+def causes(apart: Path) -> list[str]:
+    found = ask(apart, "trajectory_summary", start=BEGIN + 10, end=BEGIN + 110)["notes"]
+    told = [note for note in found if note.startswith("nothing ")]
+    return [note.replace(str(BEGIN // 1000), "") for note in told]
+
+
+def test_a_cause_is_said_of_the_interruption_and_not_of_the_whole_gap(apart: Path) -> None:
+    interrupted(apart, 22, 30)
+    assert causes(apart) == [
+        f"nothing was recorded from 020.000000 to 040.000000 (20 s), {DIED}",
+        "nothing was recorded from 040.000000 to 100.000000 (60 s)",
+    ]
+    doubts = ask(apart, "memory_status")["doubts"]
+    assert "(20 s), because ros2 bag record died" in doubts
+    assert "60 s" not in doubts
+
+
+def test_what_was_excluded_was_recorded(apart: Path) -> None:
+    exclude(apart, 20, 100)
+    interrupted(apart, 98, 102, "unclean")
+    assert causes(apart) == []
+    exclude(apart, 20, 90)
+    assert f"nothing was recorded from 090.000000 to 100.000000 (10 s), {UNCLEAN}" in causes(apart)
+
+
+@pytest.mark.parametrize("stop", [90, 100])
+def test_what_was_excluded_is_no_gap_and_no_event_and_has_no_value_not_even_an_older_one(
+    apart: Path, stop: int
+) -> None:
+    exclude(apart, 20, stop)
+    for tool in ("data_time_range", "memory_status"):
+        gaps = [(gap["start"] - BEGIN, gap["end"] - BEGIN) for gap in ask(apart, tool)["gaps"]]
+        assert gaps == [(90, 100)] * (stop == 90)
+    recap = ask(apart, "recap", start=BEGIN, end=BEGIN + 120)
+    told = [event["text"] for event in recap["events"]]
+    assert [each for each in told if "recorded" in each or "silent" in each] == [
+        "nothing was recorded"
+    ] * (stop == 90)
+    assert "excluded by the rules" in str(recap["notes"])
+    at = {"timestamp": BEGIN + 60}
+    for tool, given in (
+        ("get_position_at", at),
+        ("get_topic_in_range", {"topic": "/odom", "start": BEGIN + 40, "end": BEGIN + 60}),
+        ("get_topic_at_time", {"topic": MODE, **at}),
+    ):
+        reply = ask(apart, tool, **given)
+        assert reply["reason"] == "deleted"
+        assert "excluded by the rules" in str(reply["notes"])
+
+
+def test_what_may_be_in_a_file_that_cannot_be_read_is_not_said_to_be_unrecorded(
+    apart: Path,
+) -> None:
+    interrupted(apart, 22, 30)
+    (apart / "a" / "a_1.mcap").write_bytes(b"no bag at all" * 100)
+    assert causes(apart) == [
+        f"nothing was recorded from 022.000000 to 030.000000 (8 s), {DIED}",
+        "nothing could be read from 030.000000 to 100.000000 (70 s)",
+    ]
+
+
+Now = Literal["wall", "latest"]
+
+SEARCH = {"condition_type": "equals", "value": True}
+
+NEVER = {"condition_type": "contains", "value": "never recorded"}
+
+PLACE = {"condition_type": "near_position", "value": {"x": 0.0, "y": 0.0}}
+
+each_pair = pytest.mark.parametrize(("recalls", "now"), [(False, "wall"), (True, "latest")])
+
+
+def zero_questions(topics: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    yield from questions(random.Random(7), topics, [0, 1000, S, 5 * S, 9 * S], most=60)
+    yield "list_frames", {}
+    for timestamp in (-5.0, 0.0, 1e-6):
+        for more in ({}, {"tolerance_s": 1e12}):
+            yield "get_topic_at_time", {"topic": "/odom", "timestamp": timestamp, **more}
+    for ago in (0.0, 1.0, 1e12):
+        yield "get_topic_seconds_ago", {"topic": "/odom", "seconds_ago": ago}
+    for start, end in ((-1e300, 1e-6), (-5.0, -1.0), (-10.0, 1e9), (0.0, 0.0)):
+        window = {"start": start, "end": end}
+        yield "trajectory_summary", window
+        yield "recap", window
+        for condition in (SEARCH, NEVER, PLACE):
+            yield "find_matches", {"topic": "/*", **condition, **window}
+    for seconds in (1e-6, 1e12, 1e300):
+        yield "recap", {"last_s": seconds}
+        yield "find_matches", {"topic": "/*", **SEARCH, "seconds": seconds}
+    for condition in (SEARCH, NEVER, PLACE):
+        yield "find_last_match", {"topic": "/*", **condition, "before": -1.0}
+
+
+def times(value: Any) -> Iterator[float]:
+    """All numbers of a reply."""
+    if isinstance(value, dict):
+        value = [*value.values()]
+    if isinstance(value, list):
+        for each in value:
+            yield from times(each)
+    elif isinstance(value, int | float):
+        yield value
+
+
+@pytest.fixture
+def from_zero(tmp_path: Path) -> Path:
+    for split in range(2):
+        messages = [odom((split * 5 + n) * S, n * 0.1, 0.0) for n in range(5)]
+        messages.append(boolean(split * 5 * S, True))
+        messages.append(detections(split * 5 * S, ["cup"]))
+        write_mcap(tmp_path / "rec" / f"rec_{split}.mcap", messages)
+    return tmp_path
+
+
+@each_pair
+def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
+    from_zero: Path, recalls: bool, now: Now
+) -> None:
+    """Asks much, and finds neither a refusal nor the least or greatest 64-bit time."""
+    memory = memory_of(
+        from_zero, clock=SettableClock(9 * S), limits=QuerySettings(now=now), recalls=recalls
+    )
+    for name, given in zero_questions(memory.index.snapshot().timeline.topics()):
+        reply = replied(memory, from_zero, name, given)
+        told = f"{name}({given}): {reply.text[:2000]}"
+        assert "92233720" not in reply.text, told
+        value = json.loads(reply.text)
+        if reply.is_error:
+            assert "carries no" in reply.text or "no position" in reply.text, told
+        assert all(abs(each) < 9e9 or each == 1e300 for each in times(value)), told
+
+
+@pytest.mark.parametrize("begin_s", [0, 1_784_000_000])
+@pytest.mark.parametrize(("start", "end"), [(-1e300, -1e-6), (-5, -5), (-1, 0)])
+def test_a_window_below_zero_is_clamped_at_both_ends(
+    tmp_path: Path, begin_s: int, start: float, end: float
+) -> None:
+    messages = [odom((begin_s + 1 + n) * S, n * 0.1, 0.0) for n in range(5)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
+    memory = memory_of(tmp_path, clock=SettableClock((begin_s + 9) * S))
+    window = {"start": start, "end": end}
+    told = asked(memory, tmp_path, "recap", **window)
+    assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
+    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    assert (told["error"], told["reason"]) == ("no_data", "outside_range")
+    for tool in ("get_topic_in_range", "trajectory_summary"):
+        told = asked(memory, tmp_path, tool, topic="/odom", **window)
+        assert "no message of /odom between 0.000000 and 0.000000" in told["detail"]
+
+
+@pytest.mark.parametrize(("start", "end"), [(1.0, 2.0), (1e9, 1e9), (1.9e9, 2e9), (0.0, 2e9)])
+def test_no_span_that_was_searched_ends_before_it_begins(
+    tmp_path: Path, start: float, end: float
+) -> None:
+    begin = 1_784_000_000 * S
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
+    memory = memory_of(tmp_path)
+    window = {"start": start, "end": end}
+    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    if not end > begin / S > start:
+        assert (told["error"], told["reason"]) == ("no_data", "outside_range")
+        return
+    assert start <= told["searched_from"] <= told["searched_to"] <= end
+    assert told["total"] > 0
