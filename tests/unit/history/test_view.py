@@ -3,7 +3,7 @@
 import os
 import random
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +24,6 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import View
-from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -38,48 +37,27 @@ from tests.support.bags import (
     text,
     write_mcap,
 )
+from tests.support.column_worlds import EVERYTHING
 from tests.support.examples import LONG, examples
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
+from tests.support.noting_reader import fail_reading
 from tests.support.random_histories import MS, S
 
-T0 = 1_700_000_000 * 10**9
-
-S = 10**9
-
-MS = 10**6
-
-
-def view_of(bag_dir: Path) -> View:
-    return View(memory_of(bag_dir), Call())
-
-
-def recorded(
-    bag_dir: Path, name: str, messages: list[Msg], *, latched: Collection[str] = ()
-) -> Path:
-    layout = McapLayout(latched=frozenset(latched))
-    return write_mcap(bag_dir / name / f"{name}_0.mcap", messages, layout)
-
-
-def times(view: View, topic: str, *, newest_first: bool = False) -> list[int]:
-    found = view.stream.messages([topic], TimeWindow.everything(), newest_first=newest_first)
-    return [each.time for each in found]
+T0: Final = 1_700_006_400 * S
 
 
 def test_a_bag_that_fails_is_named_and_the_others_still_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    broken = recorded(tmp_path, "a", [odom(T0, 0, 0)])
-    recorded(tmp_path, "b", [odom(T0 + 60 * S, 1, 0)])
-    records = McapReader.records
-
-    def failing(reader: McapReader, path: Path, *given: Any, **named: Any) -> Iterator[Record]:
-        if path == broken:
-            raise BagError(str(path), "the disk returned an error")
-        return records(reader, path, *given, **named)
-
-    monkeypatch.setattr(McapReader, "records", failing)
-    view = view_of(tmp_path)
-    assert times(view, "/odom") == [T0 + 60 * S]
+    for name, at in (("a", T0), ("b", T0 + 60 * S)):
+        write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(at, 0, 0)])
+    failure = BagError("a_0.mcap", "the disk returned an error")
+    fail_reading(
+        monkeypatch, "records", lambda path: failure if path.name == failure.path else None
+    )
+    view = View(memory_of(tmp_path), Call())
+    found = view.stream.messages(["/odom"], EVERYTHING)
+    assert [message.time for message in found] == [T0 + 60 * S]
     assert view.notes.sentences() == (
         "a/a_0.mcap could not be read to its end: the disk returned an error",
     )
@@ -182,7 +160,7 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         counted = once(stored)
         memory = with_store(memory_of(root, reader=McapReader()), root, part=part)
         edges = sorted(draw.choice(stored)[0] + draw.choice([0, 1]) for _ in range(2))
-        for window in (TimeWindow.everything(), TimeWindow(edges[0], edges[1] + 1)):
+        for window in (EVERYTHING, TimeWindow(edges[0], edges[1] + 1)):
             inside = [each for each in counted if window.contains(each[0])]
             said = texts(memory, window)
             assert said == [each[:2] for each in inside]
@@ -191,7 +169,7 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         [census] = View(memory, Call()).census(TOPIC).values()
         ends = counted[0][0], counted[-1][0]
         assert (census.first, census.last, census.messages) == (*ends, len(counted))
-        last = View(memory, Call()).stream.newest(TOPIC, TimeWindow.everything())
+        last = View(memory, Call()).stream.newest(TOPIC, EVERYTHING)
         assert last is not None
         assert last.time == counted[-1][0]
 
@@ -204,9 +182,7 @@ def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(
     memory = memory_of(tmp_path)
 
     def scanned(view: View) -> list[int]:
-        return [
-            int(at) for rows in scan(view, "/bumper", TimeWindow.everything()) for at in rows.times
-        ]
+        return [int(at) for rows in scan(view, "/bumper", EVERYTHING) for at in rows.times]
 
     assert len(scanned(View(memory, Call()))) == 60
     shorter, deleted = View(memory, Call()), View(memory, Call())
@@ -219,9 +195,7 @@ def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(
     assert "a/a_0.mcap was deleted before it could be read" in deleted.notes.sentences()[0]
 
 
-EVEN: Final = 1_700_006_400 * S
-
-SPAN: Final = {"start": EVEN / S - 5, "end": EVEN / S + 200}
+SPAN: Final = {"start": T0 / S - 5, "end": T0 / S + 200}
 
 CUP: Final = {"topic": "/chatter", "condition_type": "contains", "value": "cup"}
 
@@ -257,7 +231,7 @@ def draw_recordings(draw: Random) -> dict[str, list[Msg]]:
     found = {first: _published(draw, 0, seconds)}
     found[second] = _published(draw, begin, begin + draw.choice([3, 20, 40]))
     if draw.random() < 0.5:
-        late = [each for each in found[first] if each.log_time >= EVEN + begin * S]
+        late = [each for each in found[first] if each.log_time >= T0 + begin * S]
         found[second] += [
             replace(each, log_time=each.log_time + draw.choice([0, 1, 500]) * MS) for each in late
         ]
@@ -270,10 +244,10 @@ def _published(draw: Random, start: int, stop: int) -> list[Msg]:
     """Text, booleans, detections and poses at whole tenths of seconds, now and then none."""
     found: list[Msg] = []
     for kind in range(5):
-        at = EVEN + start * S
-        while (at := at + draw.choice([1, 2, 5, 5, 10, 30, 110]) * 100 * MS) < EVEN + stop * S:
+        at = T0 + start * S
+        while (at := at + draw.choice([1, 2, 5, 5, 10, 30, 110]) * 100 * MS) < T0 + stop * S:
             found.append(replace(_message(draw, kind, at), publish_time=at))
-    return found or [odom(EVEN + start * S, 0, 0)]
+    return found or [odom(T0 + start * S, 0, 0)]
 
 
 def _message(draw: Random, kind: int, at: int) -> Msg:
@@ -377,7 +351,7 @@ def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
     kind = "std_msgs/msg/Float32MultiArray"
     messages = [
-        Msg("/numbers", kind, EVEN + nth // 5 * S, make(kind, layout=layout, data=held))
+        Msg("/numbers", kind, T0 + nth // 5 * S, make(kind, layout=layout, data=held))
         # Too long for columns, which have their least and greatest number alone.
         for nth, held in enumerate(np.arange(200_000, dtype=np.float32).reshape(50, 4_000))
     ]
@@ -387,4 +361,4 @@ def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     wanted = {"topic": "/numbers", "condition_type": "equals", "field": "data.700"}
     for nth in range(0, 50, 6):
         found = asked(memory, tmp_path, "find_matches", **wanted, value=4_000 * nth + 700)
-        assert [row["first_seen"] for row in found["sightings"]] == [EVEN / S + nth // 5]
+        assert [row["first_seen"] for row in found["sightings"]] == [T0 / S + nth // 5]
