@@ -1,3 +1,5 @@
+"""Times: as floats of seconds, as local times, as texts, and windows of them."""
+
 import math
 import time
 from collections.abc import Iterator
@@ -7,7 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
     NS_PER_S,
     NS_PER_US,
     hours_from_text,
@@ -23,7 +28,9 @@ from ros2_memory.core.timebase import (
 from tests.support.strategies import moments
 
 ZONES = ["UTC", "CET-1CEST,M3.5.0,M10.5.0/3", "EST5EDT,M3.2.0,M11.1.0", "<+0545>-5:45"]
+
 """Written out, so that they do not depend on the machine's time zone files."""
+
 OFFSETS = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(minutes=minutes)))
 
 
@@ -154,3 +161,29 @@ def test_hours_are_read_as_people_write_them(
 def test_what_is_not_two_hours_is_refused(text: str, why: str) -> None:
     with pytest.raises(ValueError, match=why):
         hours_from_text(text)
+
+
+@given(moments, st.integers(0, 10**15))
+def test_both_ends_of_a_question_are_inclusive_with_the_slack_of_a_float(
+    first: int, span: int
+) -> None:
+    start_s, end_s = unix_from_ns(first), unix_from_ns(first + span)
+    window = TimeWindow.from_unix(start_s, end_s)
+    start, end = ns_from_unix(start_s), ns_from_unix(end_s)
+    assert window.contains(end)
+    assert window.contains(start - 2 * AT_OR_BEFORE_SLACK_NS)
+    assert not window.contains(start - 2 * AT_OR_BEFORE_SLACK_NS - 1)
+    assert window.contains(end + AT_OR_BEFORE_SLACK_NS)
+    assert not window.contains(end + AT_OR_BEFORE_SLACK_NS + 1)
+    assert not window.contains(window.start - 1)
+
+
+def test_a_window_whose_start_is_after_its_end_is_refused_with_both_bounds() -> None:
+    with pytest.raises(InvalidArgumentsError, match=r"start \(2.0\) is after end \(1.0\)"):
+        TimeWindow.from_unix(2.0, 1.0)
+
+
+@pytest.mark.parametrize("bounds", [(math.nan, 1.0), (1.0, math.nan), (-math.inf, 1.0)])
+def test_a_bound_that_is_no_number_is_refused(bounds: tuple[float, float]) -> None:
+    with pytest.raises(InvalidArgumentsError, match="Unix seconds"):
+        TimeWindow.from_unix(*bounds)

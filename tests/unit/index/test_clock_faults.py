@@ -1,24 +1,38 @@
-"""Bags that a wrong clock dated, and the span that is reported without them."""
+"""Dates of bags: a clock that was wrong or set back, the order of splits, and what has none."""
 
-from hypothesis import given
+import struct
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import pytest
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import IndexType
 
-from ros2_memory.core.model import BagFile
-from ros2_memory.core.timebase import FUTURE_NS, MAX_NS
-from ros2_memory.index.clock_faults import (
-    FIRST_BAGS_NS,
-    Dating,
-    check_dates,
-    max_plausible,
-)
+from ros2_memory.bag_dir.layout import named_start
+from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS, check_dates, max_plausible
 from ros2_memory.index.segment import Segment
-from ros2_memory.index.split_order import StepBack
-from ros2_memory.index.timeline import Timeline
+from ros2_memory.index.snapshot import unreadable_bounds, unreadable_span
+from ros2_memory.index.split_order import Neighbours, StepBack, steps_of
+from ros2_memory.index.timeline import MAX_FILE_NS, Timeline
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
+from tests.support.examples import examples
 from tests.support.listed_bags import odom_bag
+from tests.support.mcap_surgery import chunks_of
+from tests.support.memories import asked, memory_of
 
 S = 10**9
+
 HOUR = 3600 * S
+
 DAY = 24 * HOUR
+
 NOW = 1_790_000_000 * S
 
 
@@ -27,32 +41,29 @@ def bag(name: str, start: int, end: int | None = None, *, written: int = NOW) ->
     return odom_bag(f"/bags/rec/{name}", start, end, written=written)
 
 
-def dating(
-    *bags: BagFile, now: int = NOW, steps: tuple[StepBack, ...] = (), size: int = 256
-) -> Dating:
+def parted(bags: Sequence[BagFile], size: int = 256) -> Timeline:
+    """A history in segments of so many bags."""
     ordered = sorted(bags, key=lambda each: (each.start, each.end, each.file))
     groups = [ordered[at : at + size] for at in range(0, len(ordered), size)]
-    return check_dates(Timeline([Segment(group) for group in groups]), steps, now)
+    return Timeline([Segment(group) for group in groups])
 
 
 GOOD = [bag(f"good{n}", NOW - HOUR + n * 10 * S) for n in range(4)]
+
 SPAN = (GOOD[0].start, GOOD[-1].end)
-
-
-def span(found: Dating) -> tuple[int | None, int | None]:
-    return found.earliest, found.latest
 
 
 def test_a_clock_that_falls_back_by_years_in_a_recording_leaves_its_last_splits_out() -> None:
     strays = [bag(f"stray{n}", NOW - 900 * DAY + n * 10 * S) for n in range(2)]
     step = StepBack(GOOD[-1], strays[0], 900 * DAY)
-    found = dating(*GOOD, *strays, steps=(step,))
-    assert span(found) == SPAN
+    found = check_dates(parted([*GOOD, *strays]), (step,), NOW)
+    assert (found.earliest, found.latest) == SPAN
     assert found.misdated == {each.file for each in strays}
 
 
 def test_the_files_own_date_tells_whether_a_clock_may_have_been_simulated() -> None:
-    found = dating(*GOOD, bag("sim", 5 * S), bag("boot", 6 * S, written=20 * S))
+    odd = [bag("sim", 5 * S), bag("boot", 6 * S, written=20 * S)]
+    found = check_dates(parted([*GOOD, *odd]), (), NOW)
     assert [fault.reason for fault in found.faults] == [
         (
             "its messages are dated from 5 on, its file 1790000000: the clock was not set, or was"
@@ -65,6 +76,7 @@ def test_the_files_own_date_tells_whether_a_clock_may_have_been_simulated() -> N
 MOMENTS = st.sampled_from(
     [0, 5 * S, FIRST_BAGS_NS - 1, FIRST_BAGS_NS, NOW - DAY, NOW, NOW + FUTURE_NS, NOW + DAY, MAX_NS]
 ) | st.integers(0, MAX_NS)
+
 SPANS = st.lists(st.tuples(MOMENTS, MOMENTS), min_size=1, max_size=12)
 
 
@@ -74,8 +86,162 @@ def test_one_sound_bag_keeps_all_others_from_spoiling_the_span(
 ) -> None:
     start = data.draw(st.integers(FIRST_BAGS_NS, NOW))
     sound = bag("sound", start, data.draw(st.integers(start, NOW)))
-    found = dating(sound, *(bag(f"{n}", *sorted(each)) for n, each in enumerate(spans)), size=size)
+    others = (bag(f"{n}", *sorted(each)) for n, each in enumerate(spans))
+    found = check_dates(parted([sound, *others], size), (), NOW)
     assert found.earliest is not None
     assert found.latest is not None
     assert FIRST_BAGS_NS <= found.earliest <= sound.start
     assert sound.end <= found.latest <= max_plausible(NOW)
+
+
+def split(number: int, start_s: int, end_s: int) -> BagFile:
+    return bag(f"rec_{number}.mcap", start_s * S, end_s * S)
+
+
+def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
+    found = steps_of(parted(bags, size))
+    return [(step.before.path.name, step.after.path.name, step.by) for step in found]
+
+
+@given(
+    st.lists(st.integers(0, 40), min_size=2, max_size=20),
+    st.integers(1, 6),
+)
+def test_steps_are_those_between_neighbours_however_the_history_is_parted(
+    starts: list[int], size: int
+) -> None:
+    bags = [split(n, start, start + 3) for n, start in enumerate(starts)]
+    expected = [
+        (a.path.name, b.path.name, a.end - b.start)
+        for a, b in pairwise(bags)
+        if a.end - b.start > S
+    ]
+    assert sorted(steps(bags, size)) == sorted(expected)
+
+
+def test_dates_with_microseconds_are_numbers_of_splits() -> None:
+    days = [20261128025306000000 + day * 10**12 for day in range(4)]
+    bags = [split(number, 10 * nth, 10 * nth + 9) for nth, number in enumerate(days)]
+    late = split(days[-1] + 1, 12, 15)
+    expected = [(bags[-1].path.name, late.path.name, 39 * S - 12 * S)]
+    assert steps([*bags, late]) == steps([*bags, late], 2) == expected
+
+
+OWN = "rec_20260921T130000Z"
+
+"""Begun 4400 s before NOW."""
+
+
+def test_a_recording_tells_when_it_began_only_in_the_names_that_the_recorder_gives() -> None:
+    assert named_start(OWN) == 1_789_995_600 * S
+    assert named_start(f"{OWN}_2") == 1_789_995_600 * S
+    assert named_start("rec_20269921T130000Z") is None
+    assert named_start("rosbag2_2025_09_10-13_03_56") is None
+
+
+TIMES = st.integers(MIN_NS, MAX_NS)
+NEIGHBOURS = st.builds(Neighbours, st.none() | TIMES, st.none() | TIMES)
+
+
+@given(st.sampled_from([OWN, "someones"]), NEIGHBOURS, st.none() | TIMES, TIMES, st.booleans())
+def test_messages_of_a_file_that_cannot_be_read_lie_between_its_neighbours_and_fit_64_bits(
+    recording: str, near: Neighbours, written: int | None, now: int, growing: bool
+) -> None:
+    """What may be there includes all that is likely, up to the last write."""
+    likely = unreadable_span(recording, near, written, now, growing=growing)
+    possible = unreadable_bounds(recording, near, written, now)
+    before, after = near
+    if likely is None:
+        assert before is after is None
+    else:
+        assert MIN_NS <= likely.start <= likely.stop <= MAX_NS
+        if before is not None and after is not None:
+            assert likely.start == min(before, after)
+            assert likely.stop == min(max(before, after) + 1, MAX_NS)
+        elif not growing:
+            assert likely.stop - likely.start <= MAX_FILE_NS + 1 or recording == OWN
+    if possible is not None and not growing:
+        assert likely is not None
+        assert MIN_NS <= possible.start <= likely.start
+        assert likely.stop <= possible.stop <= MAX_NS
+
+
+def test_a_copy_of_yesterday_may_hold_anything_from_before_it_was_made() -> None:
+    assert unreadable_bounds("someones", Neighbours(), NOW - HOUR, NOW) == TimeWindow(
+        MIN_NS, NOW - HOUR + 60 * S
+    )
+    assert unreadable_bounds("someones", Neighbours(), None, NOW) is None
+    assert unreadable_bounds("someones", Neighbours(), 5 * S, NOW) is None
+
+
+def test_times_that_contradict_each_other_bound_nothing() -> None:
+    assert unreadable_bounds("rec", Neighbours(200 * S, 100 * S), NOW, NOW) is None
+    assert unreadable_bounds("rec", Neighbours(NOW), NOW - HOUR, NOW) is None
+
+
+BEGIN: Final = 1_784_000_000 * S
+CRC_AT: Final = 9 + 3 * 8
+"""Of a chunk's checksum, behind its length, two times and a size."""
+LAYOUTS: Final = {
+    "indexed": McapLayout(chunk_size=200),
+    "without indexes": McapLayout(chunk_size=200, index_types=IndexType.NONE),
+    "cut off": McapLayout(chunk_size=200, finish=False),
+    "without chunks": McapLayout(chunk_size=None),
+}
+
+
+def message(seconds: float) -> Msg:
+    return text(BEGIN + round(seconds * S), "x" * 100)
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    times=st.lists(st.integers(0, 100), min_size=1, max_size=30),
+    name=st.sampled_from(list(LAYOUTS)),
+)
+def test_it_is_never_more_than_the_times_of_a_topic_go_back(times: list[int], name: str) -> None:
+    most = max(max(times[: at + 1]) - time for at, time in enumerate(times))
+    with TemporaryDirectory() as folder:
+        path = write_mcap(Path(folder) / "a.mcap", map(message, times), LAYOUTS[name])
+        found, _ = McapReader().summarize(path).schema.set_back or (0, 0)
+    assert found <= most * S
+    assert found == 0 or found > S
+    if name == "without chunks":
+        assert found == (most * S if most > 1 else 0)
+
+
+def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Path) -> None:
+    messages = [message(n) for n in range(20)] + [message(n - 30) for n in range(20, 50)]
+    write_mcap(tmp_path / "a.mcap", messages, LAYOUTS["indexed"])
+    memory = memory_of(tmp_path)
+    reply = asked(memory, tmp_path, "data_time_range")
+    [fault] = reply["clock_faults"]
+    assert "set back by 29 s or more while it was being written" in fault["reason"]
+    assert reply["earliest"] == BEGIN / S - 10
+    window = {"topic": messages[0].topic, "start": BEGIN / S, "end": BEGIN / S + 10}
+    assert "set back" in str(asked(memory, tmp_path, "get_topic_in_range", **window)["notes"])
+
+
+def test_a_time_that_damage_made_is_no_clock_that_was_set_back(tmp_path: Path) -> None:
+    times = [BEGIN + n * S // 10 for n in range(100)]
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(at, at / S, 0.0) for at in times])
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(times[-1] + n, 0.0, 0.0) for n in range(9)])
+    damage_time(path, times[50], times[20])
+    damage_time(path, times[99], times[99] + 5 * S)
+    memory = memory_of(tmp_path)
+    reply = asked(memory, tmp_path, "data_time_range")
+    assert "is not where its index says" in str(reply["notes"])
+    for said in (reply, asked(memory, tmp_path, "memory_status")):
+        assert "clock was set" not in str(said)
+        assert "clock_steps" not in said or not said["clock_steps"]
+    way = asked(memory, tmp_path, "trajectory_summary", start=BEGIN / S, end=times[98] / S)
+    assert way["distance_m"] == pytest.approx(9.8, abs=0.2)
+
+
+def damage_time(path: Path, was: int, becomes: int) -> None:
+    """Changes the log time of a message in a chunk without a checksum."""
+    content = bytearray(path.read_bytes())
+    [chunk] = chunks_of(path)
+    struct.pack_into("<I", content, chunk.chunk_start_offset + CRC_AT, 0)
+    struct.pack_into("<Q", content, content.index(struct.pack("<QQ", was, was)), becomes)
+    path.write_bytes(content)

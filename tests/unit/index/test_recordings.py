@@ -1,18 +1,29 @@
-"""One recording of a bag directory: the index of it alone finds what a scan of it does."""
+"""Recordings of a bag directory: one alone, those that overlap or are one, and what is listed."""
 
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index.recordings import name_of, recordings_of
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.core.spans import overlap_spans
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.index import listed_splits, recordings, timeline
+from ros2_memory.index.listed_splits import Absent
+from ros2_memory.index.recordings import Overlapping, name_of, overlapping_recordings, recordings_of
 from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import odom, write_mcap
+from tests.support.bags import odom, text, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import LAST_WRITTEN
+from tests.support.listed_bags import odom_bag
+from tests.support.memories import LAST_WRITTEN, memory_of, with_store
 
 T0 = 1_700_000_000
 
@@ -79,3 +90,127 @@ def test_every_recording_is_found_by_its_name(tmp_path: Path) -> None:
     for path, bags in recordings_of(index.refresh()).items():
         part = index.alone(name_of(path, bags, str(tmp_path))).refresh()
         assert list(part.bags) == bags
+
+
+def robot(folder: Path, spans: Mapping[str, Sequence[tuple[float, float]]]) -> Memory:
+    """Bags of odometry at 10 Hz, by recording, from and until so many seconds."""
+    for recording, times in spans.items():
+        for number, (first, last) in enumerate(times):
+            tenths = range(round(first * 10), round(last * 10) + 1)
+            messages = [odom((T0 * 10 + n) * NS_PER_S // 10, 0.0, 0.0) for n in tenths]
+            write_mcap(folder / recording / f"{number}.mcap", messages)
+    return memory_of(folder)
+
+
+def overlapping(memory: Memory) -> tuple[Overlapping, ...]:
+    index = memory.index
+    return overlapping_recordings(index.refresh(), index.joined_with)
+
+
+def pairs(found: tuple[Overlapping, ...]) -> list[tuple[str, str, float, float]]:
+    return [
+        (one.first.name, one.second.name, one.start / NS_PER_S - T0, one.end / NS_PER_S - T0)
+        for one in found
+    ]
+
+
+@pytest.mark.parametrize("side", ["previous", "next"])
+def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, side: str) -> None:
+    taken = robot(tmp_path, {"a": [(0, 60)], "b": [(5, 60)]})
+    assert len(overlapping(taken)) == 1
+    if side == "next":
+        write_handover(tmp_path / "a", Handover(next="b"))
+    else:
+        write_handover(tmp_path / "b", Handover(previous="a"))
+    assert overlapping(taken) == ()
+
+
+def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
+    spans = {"a": [(0, 10)], "moments/20261120T080000Z-cup/a": [(5, 15)], "b": [(8, 20)]}
+    taken = robot(tmp_path, spans)
+    assert pairs(overlapping(taken)) == [("a", "b", 8.0, 15.0)]
+    write_handover(tmp_path / "b", Handover(previous="a"))
+    assert overlapping(taken) == ()
+
+
+def test_two_robots_are_found_behind_however_many_handovers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recordings, "_MAX_READ", 3)
+    joined = {f"a{number}": [(number * 10, number * 10 + 20)] for number in range(5)}
+    taken = robot(tmp_path, {**joined, "b": [(100, 150)], "c": [(100, 150)]})
+    for number in range(1, 5):
+        write_handover(tmp_path / f"a{number}", Handover(previous=f"a{number - 1}"))
+    assert pairs(overlapping(taken)) == [("b", "c", 100.0, 150.0)]
+
+
+halves_of_seconds = st.integers(0, 120).map(lambda number: number * NS_PER_S // 2)
+
+drawn_bags = st.lists(
+    st.tuples(st.integers(0, 3), st.just(MIN_NS) | halves_of_seconds, halves_of_seconds)
+)
+
+
+@given(drawn_bags, st.integers(1, 8))
+def test_times_that_recordings_share_are_those_of_all_their_bags(
+    drawn: Sequence[tuple[int, int, int]], size: int
+) -> None:
+    bags = [
+        odom_bag(f"/bags/r{recording}/{number}.mcap", start, start + length)
+        for number, (recording, start, length) in enumerate(drawn)
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timeline, "SEGMENT_BAGS", size)
+        shared = timeline.Timeline.of(bags).shared_times
+    assert shared == overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
+
+
+def test_recordings_may_overlap_where_the_range_of_times_ends(tmp_path: Path) -> None:
+    for name, before in (("a", NS_PER_S), ("b", NS_PER_S // 2)):
+        said = [text(MAX_NS - 1 - before, name), text(MAX_NS - 1, name)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", said)
+    [topic] = list_recorded_topics(memory_of(tmp_path), Call())
+    assert topic.count == 4
+
+
+LISTED = 1_700_000_000 * 10**9
+
+LONG_AGO = (LISTED / 1e9, LISTED / 1e9)
+
+
+def listed_recording(bag_dir: Path, name: str = "r", *, messages: int = 1) -> Memory:
+    """A listed_recording of five splits, of which two are missing, as another program left it."""
+    for n in (0, 2, 4):
+        write_mcap(bag_dir / name / f"r_{n}.mcap", [text(LISTED + n, "a")])
+    files = "".join(f"  - path: r_{n}.mcap\n    message_count: {messages}\n" for n in range(5))
+    listing = bag_dir / name / "metadata.yaml"
+    listing.write_text(f"rosbag2_bagfile_information:\n  files:\n{files}")
+    for each in (listing, listing.parent):
+        os.utime(each, LONG_AGO)
+    return memory_of(bag_dir)
+
+
+def absent_of(memory: Memory) -> Sequence[Absent]:
+    return memory.absent_splits(memory.index.snapshot())
+
+
+def test_what_changed_since_is_read_again(tmp_path: Path) -> None:
+    memory = listed_recording(tmp_path)
+    assert [each.files for each in absent_of(memory)] == [("r_1.mcap", "r_3.mcap")]
+    write_mcap(tmp_path / "r" / "r_1.mcap", [text(LISTED + 1, "a")])
+    assert [each.files for each in absent_of(memory)] == [("r_3.mcap",)]
+    (tmp_path / "r" / "metadata.yaml").unlink()
+    assert absent_of(memory) == []
+
+
+def test_what_was_stored_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = with_store(listed_recording(tmp_path, messages=7), tmp_path)
+    [absent] = absent_of(memory)
+    memory.store_listings(memory.index.snapshot())
+    monkeypatch.setattr(listed_splits, "read_listing", None)
+    later = with_store(memory_of(tmp_path), tmp_path)
+    assert absent_of(later) == [absent]
+    (tmp_path / "r" / "metadata.yaml").unlink()
+    later.store_listings(later.index.refresh())
+    assert later.scanner.store is not None
+    assert later.scanner.store.listings() == {}
