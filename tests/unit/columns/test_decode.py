@@ -1,22 +1,239 @@
-"""Decoding whole bags as columns, compared with rosbags leaf by leaf."""
+"""Decoding whole bags as columns, compared with rosbags leaf by leaf; also what is odd or bulky."""
 
 import random
 import struct
 import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
+from typing import Final, TypeVar
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
+from rosbags.typesys import get_types_from_msg
+from rosbags.typesys.store import Typestore
 
+from ros2_memory.columns import decode
+from ros2_memory.columns.decode import Group, undecoded
+from ros2_memory.columns.plan import Plan
+from ros2_memory.columns.table import Table, joined
+from ros2_memory.columns.walk import LevelColumns, NotWalkedError, walked
+from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.storage.base import BagReader, Batch, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.bags import McapLayout, Msg, text, write_mcap
+from tests.support.column_worlds import EVERYTHING
 from tests.support.examples import LONG, examples
 from tests.support.leaves import Comparison
+from tests.support.mcap_surgery import SMALL, chatter, raw_mcap, spoil_chunk
 from tests.support.shared_bags import REAL, needs_real
-from tests.unit.columns.decoded_bags import bag_of, decoded_alike, tables_of
-from tests.unit.columns.drawn_tables import message_in
-from tests.unit.columns.drawn_types import DrawnTypes, drawn_types
+from tests.unit.columns.drawn_tables import message, message_in
+
+T = TypeVar("T")
+NUMBERS: Final = frozenset(
+    (
+        *("bool", "byte", "char", "int8", "uint8", "int16", "uint16", "int32", "uint32"),
+        *("int64", "uint64", "float32", "float64"),
+    )
+)
+
+TIME: Final = "builtin_interfaces/Time"
+
+DURATION: Final = "builtin_interfaces/Duration"
+
+_IDL: Final = {
+    "bool": "boolean",
+    "byte": "octet",
+    "char": "uint8",
+    "float32": "float",
+    "float64": "double",
+    TIME: "builtin_interfaces::msg::Time",
+    DURATION: "builtin_interfaces::msg::Duration",
+}
+
+_TIME_TEXT: Final = "int32 sec\nuint32 nanosec\n"
+
+
+@dataclass(frozen=True)
+class DrawnField:
+    """`length`: None for one value, a number of a fixed array, -1 of a sequence."""
+
+    name: str
+    kind: str
+    length: int | None = None
+
+
+@dataclass(frozen=True)
+class DrawnTypes:
+    """Types by name, each of those before it and of primitives; the last one is the root."""
+
+    types: tuple[tuple[str, tuple[DrawnField, ...]], ...]
+
+    @property
+    def root(self) -> str:
+        return f"drawn_msgs/msg/{self.types[-1][0]}"
+
+    def msg(self) -> str:
+        """The definition as ros2msg, nested types behind it."""
+        parts = [_msg(fields) for _, fields in self.types]
+        nested = [
+            f"{'=' * 80}\nMSG: drawn_msgs/{name}\n{part}"
+            for (name, _), part in zip(self.types[:-1], parts[:-1], strict=True)
+        ]
+        times = [f"{'=' * 80}\nMSG: {name}\n{_TIME_TEXT}" for name in (TIME, DURATION)]
+        return "".join([parts[-1], *nested, *times])
+
+    def idl(self) -> str:
+        """The definition as ros2idl."""
+        parts = [
+            f"{'=' * 80}\nIDL: drawn_msgs/msg/{name}\n"
+            f"module drawn_msgs {{ module msg {{ {_idl(name, fields)} }}; }};\n"
+            for name, fields in reversed(self.types)
+        ]
+        parts += [
+            f"{'=' * 80}\nIDL: builtin_interfaces/msg/{name}\nmodule builtin_interfaces {{ module "
+            f"msg {{ struct {name} {{ int32 sec; uint32 nanosec; }}; }}; }};\n"
+            for name in ("Time", "Duration")
+        ]
+        return "".join(parts)
+
+    def store(self) -> Typestore:
+        """A typestore of them; bytes are unsigned, as in ROS, which rosbags has signed."""
+        store = Typestore()
+        for name in ("Time", "Duration"):
+            store.register(get_types_from_msg(_TIME_TEXT, f"builtin_interfaces/msg/{name}"))
+        for name, fields in self.types:
+            unsigned = [
+                replace(each, kind="uint8") if each.kind == "byte" else each for each in fields
+            ]
+            store.register(get_types_from_msg(_msg(unsigned), f"drawn_msgs/msg/{name}"))
+        return store
+
+
+def _msg(fields: Sequence[DrawnField]) -> str:
+    return "".join(f"{each.kind}{_array(each)} {each.name}\n" for each in fields)
+
+
+def _array(drawn: DrawnField) -> str:
+    if drawn.length is None:
+        return ""
+    return "[]" if drawn.length < 0 else f"[{drawn.length}]"
+
+
+def _idl(name: str, fields: Sequence[DrawnField]) -> str:
+    lines = []
+    for each in fields:
+        kind = _IDL.get(each.kind, each.kind)
+        if each.kind not in {*NUMBERS, "string", TIME, DURATION}:
+            kind = f"drawn_msgs::msg::{each.kind}"
+        if each.length is not None and each.length < 0:
+            lines.append(f"sequence<{kind}> {each.name};")
+        elif each.length is not None:
+            lines.append(f"{kind} {each.name}[{each.length}];")
+        else:
+            lines.append(f"{kind} {each.name};")
+    if not fields:
+        lines.append("uint8 structure_needs_at_least_one_member;")
+    return f"struct {name} {{ {' '.join(lines)} }};"
+
+
+_PRIMITIVES: Final = st.sampled_from([*sorted(NUMBERS), "string", "string", TIME, DURATION])
+
+_LENGTHS: Final = st.one_of(
+    st.none(), st.none(), st.just(-1), st.just(-1), st.sampled_from((1, 3, 9, 12, 600))
+)
+
+
+@st.composite
+def drawn_types(draw: st.DrawFn) -> DrawnTypes:
+    """Up to four types, each of the ones before it; few fields, of every kind."""
+    types: list[tuple[str, tuple[DrawnField, ...]]] = []
+    count = draw(st.integers(1, 4))
+    for nth in range(count):
+        nested = [name for name, _ in types]
+        kinds = st.one_of(_PRIMITIVES, st.sampled_from(nested)) if nested else _PRIMITIVES
+        fields = []
+        names = ("from", "data", "length", "x", "y", "z", "stamp")
+        for name in names[: draw(st.integers(0 if nth < count - 1 else 1, 6))]:
+            kind, length = draw(kinds), draw(_LENGTHS)
+            if length is not None and length > 12 and kind not in NUMBERS:
+                length = 2
+            fields.append(DrawnField(name, kind, length))
+        types.append((f"Type{nth}", tuple(fields)))
+    return DrawnTypes(tuple(types))
+
+
+def all_of(items: Iterator[T]) -> tuple[list[T], list[BagError]]:
+    """What an iterator yields, and what it raises meanwhile."""
+    found: list[T] = []
+    errors: list[BagError] = []
+    while True:
+        try:
+            found += items
+        except BagError as error:
+            errors.append(error)
+        else:
+            return found, errors
+
+
+def tables_of(reader: BagReader, path: Path) -> list[Table]:
+    """All tables of a bag, those of several groups joined; errors of lost messages are passed.
+
+    Without the messages that cannot be decoded.
+    """
+    parts: dict[object, list[Table]] = {}
+    groups, _ = all_of(map(Group.tables, undecoded(reader, path, skip_undecodable=True)))
+    for table in chain.from_iterable(groups):
+        parts.setdefault((table.channel.topic, table.channel.schema), []).append(table)
+    return [joined(tables) for tables in parts.values()]
+
+
+def decoded_alike(reader: BagReader, path: Path) -> None:
+    """Checks the tables of a bag by its records, decoded one by one."""
+    tables = tables_of(reader, path)
+    records: dict[object, list[Record]] = {}
+    topics = {table.channel.topic for table in tables}
+    read, _ = all_of(reader.records(path, topics, EVERYTHING))
+    for record in read:
+        records.setdefault((record.channel.topic, record.channel.schema), []).append(record)
+    assert records.keys() == {(table.channel.topic, table.channel.schema) for table in tables}
+    for table in tables:
+        kept = records[table.channel.topic, table.channel.schema]
+        if "" not in table.left_out:
+            comparison, decoded = Comparison(), {}
+            for nth, record in enumerate(kept):
+                with suppress(UndecodableError):
+                    decoded[nth] = reader.decode(record)
+            comparison.table(table, [*decoded.values()])
+            assert comparison.wrong == []
+            kept = [kept[nth] for nth in decoded]
+            assert table.publish_times.tolist() == [record.publish_time for record in kept]
+        assert table.log_times.tolist() == [record.log_time for record in kept]
+
+
+def bag_of(
+    path: Path,
+    types: DrawnTypes,
+    payloads: Sequence[bytes],
+    *,
+    is_idl: bool = False,
+) -> Path:
+    """A bag of one topic."""
+
+    def fill(writer: Writer) -> None:
+        encoding, definition = ("ros2idl", types.idl()) if is_idl else ("ros2msg", types.msg())
+        schema = writer.register_schema(types.root, encoding, definition.encode())
+        channel = writer.register_channel("/drawn", "cdr", schema)
+        for nth, payload in enumerate(payloads):
+            writer.add_message(channel, 10 + nth, payload, 5 + nth)
+
+    return raw_mcap(path, fill, profile="ros2", chunk_size=4096)
 
 
 def bags_below(folder: Path) -> list[Path]:
@@ -27,6 +244,22 @@ def bags_below(folder: Path) -> list[Path]:
         return files
     first = {file.parent: file for file in reversed(files)}
     return sorted(file for file in first.values() if file.stat().st_size < 120_000)
+
+
+@pytest.fixture
+def fallbacks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The topics of batches that were decoded message by message."""
+    topics: list[str] = []
+
+    def noting(plan: Plan, batch: Batch) -> LevelColumns:
+        try:
+            return walked(plan, batch)
+        except NotWalkedError:
+            topics.append(batch.channel.topic)
+            raise
+
+    monkeypatch.setattr(decode, "walked", noting)
+    return topics
 
 
 @needs_real
@@ -101,3 +334,111 @@ def test_damaged_payloads_are_decoded_or_left_out_as_rosbags_decides(
     with tempfile.TemporaryDirectory() as folder:
         path = bag_of(Path(folder) / "damaged.mcap", types, payloads)
         decoded_alike(McapReader(), path)
+
+
+def groups_of(path: Path) -> Iterator[list[Table]]:
+    return map(Group.tables, undecoded(McapReader(), path))
+
+
+def numbers(table: Table, path: str) -> list[object]:
+    column = table.columns[path]
+    assert isinstance(column, np.ndarray)
+    return list(column.tolist())
+
+
+LONG_TYPES: Final = DrawnTypes(
+    (
+        ("Point", (DrawnField("x", "float64"), DrawnField("kind", "uint8"))),
+        ("Named", (DrawnField("label", "string"), DrawnField("points", "Point", -1))),
+        (
+            "Long",
+            (
+                DrawnField("points", "Point", -1),
+                DrawnField("named", "Named", -1),
+                DrawnField("scan", "float32", -1),
+                DrawnField("answer", "int32"),
+            ),
+        ),
+    )
+)
+
+
+@pytest.mark.parametrize("rows", [1, 40])
+def test_what_follows_long_sequences_is_read_where_it_is(
+    tmp_path: Path, rows: int, fallbacks: list[str]
+) -> None:
+    store = LONG_TYPES.store()
+    named, part, long = (
+        store.types[f"drawn_msgs/msg/{name}"] for name in ("Named", "Point", "Long")
+    )
+    messages = [
+        long(
+            [part(float(nth), nth % 200) for nth in range(700 + row)],
+            [named("n" * (nth % 7), [part(0.5, 1)] * (nth % 4)) for nth in range(30)],
+            np.arange(2000 - row, dtype=np.float32),
+            42,
+        )
+        for row in range(rows)
+    ]
+    payloads = [bytes(store.serialize_cdr(each, LONG_TYPES.root)) for each in messages]
+    path = bag_of(tmp_path / "long.mcap", LONG_TYPES, payloads)
+    reader = McapReader()
+    [table] = tables_of(reader, path)
+    comparison = Comparison()
+    comparison.table(table, messages)
+    assert comparison.wrong == []
+    assert numbers(table, "answer") == [42] * rows
+    assert len(table.elements["named"].elements["points"]) == rows * 43
+    assert numbers(table, "scan.length")[0] == 2000
+    assert fallbacks == []
+
+
+def test_images_have_times_alone_and_their_chunks_are_not_read(tmp_path: Path) -> None:
+    kind = "sensor_msgs/msg/Image"
+    images = [Msg("/camera", kind, time, message(kind, random.Random(1))) for time in range(10)]
+    messages = [*images, *(text(time, "x") for time in range(10, 20))]
+    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=1000))
+    spoil_chunk(path, 0)
+    [tables] = groups_of(path)
+    by_topic = {table.channel.topic: table for table in tables}
+    assert by_topic["/camera"].log_times.tolist() == list(range(10))
+    assert by_topic["/camera"].columns == {}
+    assert "" in by_topic["/camera"].left_out
+    assert len(by_topic["/chatter"]) == 10
+
+
+def test_large_messages_of_large_files_have_times_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = [text(1, "x" * 100_000, "/long"), text(2, "x", "/short")]
+    path = write_mcap(tmp_path / "a.mcap", messages)
+    [tables] = groups_of(path)
+    assert all(table.columns for table in tables)
+    monkeypatch.setattr(decode, "LARGE_FILE_BYTES", 1000)
+    [tables] = groups_of(path)
+    assert {table.channel.topic: bool(table.columns) for table in tables} == {
+        "/long": False,
+        "/short": True,
+    }
+
+
+def test_an_array_longer_than_any_message_has_no_columns(tmp_path: Path) -> None:
+    endless = DrawnTypes((("Endless", (DrawnField("numbers", "float64", 10**18),)),))
+    [[table]] = groups_of(bag_of(tmp_path / "a.mcap", endless, [b"\0\1\0\0\7"]))
+    assert table.log_times.tolist() == [10]
+    assert f"numbers is an array of {10**18} elements" in table.left_out[""]
+
+
+@pytest.mark.parametrize("broken", [[], [b"\x00\x01\x00\x00\xff\xff\xff\x7f"]])
+def test_what_a_damaged_chunk_loses_is_raised_and_all_the_rest_follows(
+    tmp_path: Path, broken: list[bytes]
+) -> None:
+    """Also where a drawn_message of it cannot be decoded."""
+    messages = [*chatter(20), *(Msg("/chatter", "std_msgs/msg/String", 20, b) for b in broken)]
+    path = write_mcap(tmp_path / "a.mcap", messages, SMALL)
+    spoil_chunk(path, 1)
+    [[table]], [error] = all_of(groups_of(path))
+    assert error.lost is not None
+    first, last = error.lost
+    assert ("cannot be decoded" in table.left_out.get("", "")) is bool(broken)
+    assert set(table.log_times.tolist()) == {*range(len(messages))} - {*range(first, last + 1)}

@@ -1,8 +1,10 @@
-"""What follows from parts: stored once, found by other processes, and gone with its parts."""
+"""What follows from parts: stored once, by stretches of the clock, found by other processes."""
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -13,17 +15,25 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
+from ros2_memory.columns import scan
 from ros2_memory.columns.fragments import FragmentKind, from_bytes, to_bytes
 from ros2_memory.columns.pack import compressed
+from ros2_memory.columns.scan import Stretch
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
+from ros2_memory.history.scan import joined_back, open_scan
 from ros2_memory.history.view import View
-from tests.support.bags import odom, write_mcap
+from ros2_memory.insights.topic_events import events_in
+from ros2_memory.serving import backfill
+from tests.support.bags import McapLayout, Msg, boolean, odom, tf, transform, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.support.examples import examples
 
 S = NS_PER_S
+
 T0 = 1_700_000_400 * S
 
 
@@ -76,14 +86,18 @@ arrays = st.sampled_from(["int64", "uint64", "uint32", "float64", "float32", "bo
         fill=st.sampled_from([0, 1]) if name != "bool" else st.booleans(),
     )
 )
+
 values = st.integers() | st.floats(allow_nan=False) | st.text() | st.none()
+
 words = st.none() | st.builds(Words, st.text())
+
 rows = st.one_of(
     [
         st.lists(row).map(tuple)
         for row in (values, words, words | values, st.tuples(words, values), st.just(()))
     ]
 )
+
 wholes = st.builds(
     Whole,
     words,
@@ -133,3 +147,120 @@ def test_a_damaged_fragment_is_made_again_and_takes_its_place(world: World, tmp_
         again.store.close()
         assert counted(tmp_path, damaged, data) == 0
         assert counted(tmp_path, "1") == before
+
+
+LENGTH = 1200 * S
+
+"""Of a stretch in these tests: one begins at T0."""
+
+WINDOW = TimeWindow(T0 - LENGTH, T0 + 6 * LENGTH)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def length_of_stretches() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (scan, backfill):
+            patch.setattr(module, "STRETCH_NS", LENGTH)
+        yield
+
+
+def driven(number: int) -> list[Msg]:
+    """Odometry of 300 s."""
+    start = T0 + number * 300 * S
+    return [odom(start + n * 5 * S, number + n / 300, 0.1) for n in range(60)]
+
+
+def docked(number: int) -> list[Msg]:
+    return [boolean(pose.log_time, n % 7 > 3, "/docked") for n, pose in enumerate(driven(number))]
+
+
+@pytest.fixture(scope="module")
+def driven_world(length_of_stretches: None, tmp_path_factory: pytest.TempPathFactory) -> World:
+    """Four stretches and a half in bags of 300 s, of three recordings."""
+    folder = tmp_path_factory.mktemp("bags")
+    for number in range(18):
+        poses = driven(number)
+        write_mcap(folder / f"rec_{number // 6}" / f"{number}.mcap", poses)
+    driven_world = World.of(folder)
+    driven_world.fill()
+    return driven_world
+
+
+@pytest.fixture
+def latched(tmp_path: Path) -> World:
+    """Three recordings of two stretches each; each begins with what was said 5 s before."""
+    layout = McapLayout(latched=frozenset({"/docked"}))
+    for number in range(24):
+        messages = [*driven(number), *docked(number)]
+        if number and not number % 8:
+            last = docked(number - 1)[-1]
+            again = replace(last, log_time=last.log_time + 5 * S + 1, publish_time=last.log_time)
+            messages.insert(1, again)
+        write_mcap(tmp_path / f"rec_{number // 8}" / f"{number:02}.mcap", messages, layout)
+    driven_world = World.of(tmp_path)
+    driven_world.fill()
+    return driven_world
+
+
+def latched_stretches(driven_world: World) -> dict[int, tuple[int, ...] | None]:
+    opened = open_scan(View(driven_world.memory, Call()), "/docked", WINDOW)
+    return {one.window.start: one.parts for one in opened.stretches()}
+
+
+def test_what_was_received_again_is_of_the_parts_that_had_it_before_and_counts_without_them(
+    latched: World, tmp_path: Path
+) -> None:
+    parts = latched_stretches(latched)
+    own = [parts[T0 + n * LENGTH] or () for n in range(5)]
+    assert all(own)
+    # The third stretch begins a recording, with what the second ends with.
+    assert [len({*one} & {*other}) for one, other in pairwise(own)] == [0, 1, 0, 1]
+
+    def rows(driven_world: World) -> list[int]:
+        opened = open_scan(View(driven_world.memory, Call()), "/docked", WINDOW)
+        return [len(one) for one in opened.rows(among=TimeWindow(T0 + 2 * LENGTH, WINDOW.stop))]
+
+    def events(driven_world: World) -> object:
+        return events_in(View(driven_world.memory, Call()), "/docked", WINDOW)
+
+    before = rows(latched)
+    assert latched_stretches(latched)[T0 + 2 * LENGTH]
+    assert events(latched) == events(latched.unstored())
+    (tmp_path / "rec_0" / "07.mcap").unlink()
+    again = World.of(tmp_path)
+    assert (rows(again)[0], rows(again)[1:]) == (before[0] + 1, before[1:])
+    assert latched_stretches(again).get(T0 + 2 * LENGTH) is None
+    assert events(again) == events(again.unstored())
+
+
+def test_what_was_made_in_time_is_told_before_the_time_is_over(driven_world: World) -> None:
+    view = View(driven_world.memory, Call())
+    opened = open_scan(view, "/odom", WINDOW)
+
+    def made(stretch: Stretch) -> Iterator[tuple[int, Words]]:
+        yield stretch.window.start, Words("one")
+        if stretch.parts is not None:
+            raise QueryTimeoutError("no time")
+
+    found: list[int] = []
+    with pytest.raises(QueryTimeoutError):
+        found += (start for start, _ in joined_back(view, opened, WORDS, made))
+    newest = next(one for one in opened.stretches() if one.parts is not None)
+    assert found[-1] == newest.window.start
+
+
+def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Path) -> None:
+    for number in range(14):
+        start = T0 + number * 300 * S
+        fixed = tf(start, transform(start, "map", "odom", (1, 0, 0)), topic="/tf_static")
+        torn = Msg("/tf_static", "tf2_msgs/msg/TFMessage", start + S, b"\0\1\0\0\xff\xff\xff\x7f")
+        messages = [fixed, *[torn] * (number == 2), *driven(number)]
+        write_mcap(tmp_path / "rec" / f"{number}.mcap", messages)
+    driven_world = World.of(tmp_path)
+    driven_world.fill()
+    for memory in (driven_world.unstored().memory, driven_world.memory, World.of(tmp_path).memory):
+        view = View(memory, Call())
+        assert view.sessions.static(view.sessions.of(tmp_path / "rec"))
+        assert not view.notes.complete
+        [said] = [one for one in view.notes.sentences() if "could not be decoded" in one]
+        assert said.startswith("messages of /tf_static could not be decoded: ")

@@ -1,9 +1,11 @@
-"""Columns and tables as bytes, and back."""
+"""Columns and tables as bytes, and back; what is known of them unread; how exact they are."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import re
+import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -13,25 +15,22 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ros2_memory.columns.pack import (
-    FORMAT,
-    Packed,
-    compressed,
-    decompressed,
-    pack,
-    unpack,
-)
+from ros2_memory.columns.pack import FORMAT, Packed, compressed, decompressed, pack, unpack
 from ros2_memory.columns.steps import (
     DEGREES,
     EXACT,
     METRES,
     MOST_RELATIVE,
     QUATERNION,
+    RADIANS,
     RELATIVE,
+    VELOCITY,
     Step,
+    step_of,
 )
-from ros2_memory.columns.table import Texts, column_bytes
+from ros2_memory.columns.table import Texts, Zone, column_bytes, letters_of
 from ros2_memory.columns.zones import Zones
+from ros2_memory.storage.base import SEQUENCE, Definition, Field
 from tests.support.examples import examples
 
 if TYPE_CHECKING:
@@ -40,7 +39,9 @@ if TYPE_CHECKING:
     Values = NDArray[Any]
 
 INTEGERS = ("bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
+
 FLOATS = ("float32", "float64")
+
 STEPS = (EXACT, RELATIVE, METRES, QUATERNION, DEGREES)
 
 
@@ -51,7 +52,9 @@ def unpacked(packed: Packed) -> Any:
 integers = st.sampled_from(INTEGERS).flatmap(
     lambda name: hnp.arrays(name, st.integers(0, 40), elements=hnp.from_dtype(np.dtype(name)))
 )
+
 """Columns of any integer type: near each other, far apart, the least and the greatest."""
+
 _NUMBERS = {
     "anything": st.floats(width=32),
     "anything wide": st.floats(),
@@ -59,10 +62,12 @@ _NUMBERS = {
     "decimals": st.integers(-5000, 5000).map(lambda number: number / 100),
     "zeros": st.sampled_from([0.0, -0.0]),
 }
+
 floats = st.tuples(
     st.sampled_from(FLOATS),
     st.sampled_from(sorted(_NUMBERS)).flatmap(lambda name: st.lists(_NUMBERS[name], max_size=40)),
 ).map(lambda drawn: of_type(*drawn))
+
 """Columns of floats: anything, or what robots say."""
 
 
@@ -211,3 +216,113 @@ def test_a_signalling_nan_is_one_without_a_warning(size: int) -> None:
     signalling = {4: 0x7FA0_0000, 8: 0x7FF4 << 48}[size]
     column = np.array([signalling, 1], f"u{size}").view(f"f{size}")
     assert pack(column, METRES).zone.nulls == 1
+
+
+T0 = 1_700_000_000 * 10**9
+
+BOUNDS = st.one_of(
+    st.integers(-(2**63), 2**64 - 1),
+    st.sampled_from([2**53, 2**53 + 1, -(2**53) - 1, 0, 1]),
+    st.floats(allow_nan=False),
+    st.booleans(),
+)
+
+LIMITS = st.one_of(BOUNDS, st.just(10**400), st.just(-(10**400)))
+
+WORDS = st.one_of(st.none(), st.text("ab[{\n", max_size=6))
+
+
+@st.composite
+def zones(draw: st.DrawFn) -> Zone:
+    if draw(st.booleans()):
+        return Zone(words=draw(WORDS))
+    if draw(st.integers(0, 5)) == 0:
+        return Zone()
+    low, high = sorted((draw(BOUNDS), draw(BOUNDS)))
+    return Zone(low, high)
+
+
+def is_exact(*numbers: float) -> bool:
+    return all(not math.isfinite(number) or abs(number) < 2**53 for number in numbers)
+
+
+@given(st.lists(zones(), min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
+@example([Zone(0, sys.float_info.max)], 1, "")
+@example([Zone(0, math.inf)], 10**400, "")
+@example([Zone(-math.inf, 0)], -(10**400), "")
+def test_zones_rule_out_what_the_zone_of_each_part_does(
+    given_zones: list[Zone], limit: float, text: str
+) -> None:
+    together = Zones.of(range(1, len(given_zones) + 1), given_zones)
+    for nth, zone in enumerate(given_zones):
+        pairs = [
+            (zone.spans(limit), together.spans(limit)[nth]),
+            (zone.reaches(limit, above=True), together.reaches(limit, above=True)[nth]),
+            (zone.reaches(limit, above=False), together.reaches(limit, above=False)[nth]),
+        ]
+        for alone, among_others in pairs:
+            assert among_others or not alone
+            if is_exact(zone.low, zone.high) and abs(limit) < 2**53:
+                assert among_others == alone
+        assert together.may_have(text)[nth] == zone.may_have(text)
+        assert together.may_be_json[nth] == zone.may_be_json
+
+
+@given(st.text(st.characters(codec="ascii")) | st.text())
+@example("".join(map(chr, range(128))))
+def test_rows_of_letters_are_those_of_unicode(text: str) -> None:
+    assert letters_of(text) == re.findall(r"[^\W\d_]+", text)
+
+
+def definition_of(name: str, **fields: str | Definition) -> Definition:
+    return Definition(name, tuple(Field(field, kind) for field, kind in fields.items()))
+
+
+POINT = definition_of("geometry_msgs/msg/Point", x="float64", y="float64", z="float64")
+
+VECTOR = definition_of("geometry_msgs/msg/Vector3", x="float64", y="float64", z="float64")
+
+QUATERNIONS = definition_of(
+    "geometry_msgs/msg/Quaternion", x="float64", y="float64", z="float64", w="float64"
+)
+
+FIX = definition_of("sensor_msgs/msg/NavSatFix", latitude="float64", altitude="float64")
+
+ROBOT = Definition(
+    "demo_msgs/msg/Robot",
+    (
+        Field("corner", POINT),
+        Field("translation", VECTOR),
+        Field("linear", VECTOR),
+        Field("facing", QUATERNIONS),
+        Field("fix", FIX),
+        Field("yaw", "float64"),
+        Field("altitude", "float64"),
+        Field("steering_angle", "float32"),
+        Field("points", POINT, SEQUENCE),
+        Field("joints", definition_of("sensor_msgs/msg/JointState", position="float64")),
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    ("path", "step"),
+    [
+        ("corner.x", METRES),
+        ("translation.z", METRES),
+        ("linear.x", VELOCITY),
+        ("facing.w", QUATERNION),
+        ("facing.x", QUATERNION),
+        ("fix.latitude", DEGREES),
+        ("fix.altitude", METRES),
+        ("altitude", RELATIVE),
+        ("yaw", RADIANS),
+        ("steering_angle", RADIANS),
+        ("points.y", METRES),
+        ("joints.position.", RADIANS),
+        ("joints.position.least", RADIANS),
+        ("unheard.of", RELATIVE),
+    ],
+)
+def test_steps_follow_the_type_of_the_message(path: str, step: Step) -> None:
+    assert step_of(path, ROBOT) == step

@@ -59,7 +59,8 @@ def test_the_index_of_one_recording_finds_what_a_scan_of_it_finds(
         (tmp_path / folder / "damaged.mcap").write_bytes(b"this is not a bag" * 100)
         (tmp_path / folder / "other.db3").symlink_to(tmp_path / "run_0.mcap")
     index = index_of(tmp_path)
-    index.refresh()
+    for path, own in recordings_of(index.refresh()).items():
+        assert [*index.alone(name_of(path, own, str(tmp_path))).refresh().bags] == own
     part = index.alone(name)
     assert comparable(part.refresh()) == comparable(index_of(tmp_path, name).refresh())
     write(tmp_path, "a/a_2", at_s=50)
@@ -83,22 +84,11 @@ def test_the_index_of_one_recording_has_no_other_than_that_which_it_is_made_of(
     assert found("deep", "a") == found("deep/b", "deep/c") == found("run", "a") == []
 
 
-def test_every_recording_is_found_by_its_name(tmp_path: Path) -> None:
-    for n, bag in enumerate(["a/0", "a/1", "run_0", "run_1", "loose", "deep/b/x", "deep/b/y"]):
-        write(tmp_path, bag, at_s=n)
-    index = index_of(tmp_path)
-    for path, bags in recordings_of(index.refresh()).items():
-        part = index.alone(name_of(path, bags, str(tmp_path))).refresh()
-        assert list(part.bags) == bags
-
-
-def robot(folder: Path, spans: Mapping[str, Sequence[tuple[float, float]]]) -> Memory:
-    """Bags of odometry at 10 Hz, by recording, from and until so many seconds."""
-    for recording, times in spans.items():
-        for number, (first, last) in enumerate(times):
-            tenths = range(round(first * 10), round(last * 10) + 1)
-            messages = [odom((T0 * 10 + n) * NS_PER_S // 10, 0.0, 0.0) for n in tenths]
-            write_mcap(folder / recording / f"{number}.mcap", messages)
+def robot(folder: Path, spans: Mapping[str, tuple[int, int]]) -> Memory:
+    """Bags of odometry at 1 Hz, by recording, from and until so many seconds."""
+    for recording, (first, last) in spans.items():
+        messages = [odom((T0 + at) * NS_PER_S, 0.0, 0.0) for at in range(first, last + 1)]
+        write_mcap(folder / recording / "0.mcap", messages)
     return memory_of(folder)
 
 
@@ -116,7 +106,7 @@ def pairs(found: tuple[Overlapping, ...]) -> list[tuple[str, str, float, float]]
 
 @pytest.mark.parametrize("side", ["previous", "next"])
 def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, side: str) -> None:
-    taken = robot(tmp_path, {"a": [(0, 60)], "b": [(5, 60)]})
+    taken = robot(tmp_path, {"a": (0, 60), "b": (5, 60)})
     assert len(overlapping(taken)) == 1
     if side == "next":
         write_handover(tmp_path / "a", Handover(next="b"))
@@ -126,7 +116,7 @@ def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, sid
 
 
 def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
-    spans = {"a": [(0, 10)], "moments/20261120T080000Z-cup/a": [(5, 15)], "b": [(8, 20)]}
+    spans = {"a": (0, 10), "moments/20261120T080000Z-cup/a": (5, 15), "b": (8, 20)}
     taken = robot(tmp_path, spans)
     assert pairs(overlapping(taken)) == [("a", "b", 8.0, 15.0)]
     write_handover(tmp_path / "b", Handover(previous="a"))
@@ -137,8 +127,8 @@ def test_two_robots_are_found_behind_however_many_handovers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recordings, "_MAX_READ", 3)
-    joined = {f"a{number}": [(number * 10, number * 10 + 20)] for number in range(5)}
-    taken = robot(tmp_path, {**joined, "b": [(100, 150)], "c": [(100, 150)]})
+    joined = {f"a{number}": (number * 10, number * 10 + 20) for number in range(5)}
+    taken = robot(tmp_path, {**joined, "b": (100, 150), "c": (100, 150)})
     for number in range(1, 5):
         write_handover(tmp_path / f"a{number}", Handover(previous=f"a{number - 1}"))
     assert pairs(overlapping(taken)) == [("b", "c", 100.0, 150.0)]
@@ -173,20 +163,18 @@ def test_recordings_may_overlap_where_the_range_of_times_ends(tmp_path: Path) ->
     assert topic.count == 4
 
 
-LISTED = 1_700_000_000 * 10**9
-
-LONG_AGO = (LISTED / 1e9, LISTED / 1e9)
+T0_NS = T0 * NS_PER_S
 
 
 def listed_recording(bag_dir: Path, name: str = "r", *, messages: int = 1) -> Memory:
     """A listed_recording of five splits, of which two are missing, as another program left it."""
     for n in (0, 2, 4):
-        write_mcap(bag_dir / name / f"r_{n}.mcap", [text(LISTED + n, "a")])
+        write_mcap(bag_dir / name / f"r_{n}.mcap", [text(T0_NS + n, "a")])
     files = "".join(f"  - path: r_{n}.mcap\n    message_count: {messages}\n" for n in range(5))
     listing = bag_dir / name / "metadata.yaml"
     listing.write_text(f"rosbag2_bagfile_information:\n  files:\n{files}")
     for each in (listing, listing.parent):
-        os.utime(each, LONG_AGO)
+        os.utime(each, (T0, T0))
     return memory_of(bag_dir)
 
 
@@ -197,7 +185,7 @@ def absent_of(memory: Memory) -> Sequence[Absent]:
 def test_what_changed_since_is_read_again(tmp_path: Path) -> None:
     memory = listed_recording(tmp_path)
     assert [each.files for each in absent_of(memory)] == [("r_1.mcap", "r_3.mcap")]
-    write_mcap(tmp_path / "r" / "r_1.mcap", [text(LISTED + 1, "a")])
+    write_mcap(tmp_path / "r" / "r_1.mcap", [text(T0_NS + 1, "a")])
     assert [each.files for each in absent_of(memory)] == [("r_3.mcap",)]
     (tmp_path / "r" / "metadata.yaml").unlink()
     assert absent_of(memory) == []
