@@ -1,8 +1,6 @@
 """Conditions over columns, and extracted values as trees: the same as of each decoded message."""
 
 import math
-from collections import Counter
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from random import Random
 
@@ -12,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import Beyond, Condition
-from ros2_memory.columns.shown import Constant, Node, Shape, numbers
+from ros2_memory.columns.shown import numbers
 from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
@@ -22,9 +20,7 @@ from ros2_memory.columns.values import (
     Kind,
     Leaf,
     TruthValues,
-    UnknownShapeError,
     Values,
-    placed,
     seconds,
 )
 from ros2_memory.columns.zones import PartZones, Zones
@@ -32,7 +28,7 @@ from ros2_memory.core.model import JsonValue, Quaternion
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
-from ros2_memory.messages.conversions import ANGLES, Summary, euler_of
+from ros2_memory.messages.conversions import ANGLES, euler_of
 from tests.support.bags import make
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
@@ -88,16 +84,21 @@ def as_part(table: Table) -> PartZones:
     return PartZones(topic, np.zeros(1, np.int64), zones)
 
 
-def judged(table: Table, condition: Condition, values: list[JsonValue]) -> int:
+def judged(
+    table: Table,
+    condition: Condition,
+    values: list[JsonValue],
+    extractor: SchemaExtractor = EXTRACTOR,
+) -> int:
     """Checks what a table says of each of its rows, and what is ruled out without reading any."""
-    column = ColumnCondition(condition, EXTRACTOR)
+    column = ColumnCondition(condition, extractor)
     if not np.all(column.may_match(as_part(table))):
         assert not any(map(condition.matches, values)), condition
     return compared(column.truth(table), condition, values)
 
 
-def values_of(drawn: Drawn) -> list[JsonValue]:
-    return [EXTRACTOR.exact(message, drawn.type) for message in drawn.messages]
+def values_of(drawn: Drawn, extractor: SchemaExtractor = EXTRACTOR) -> list[JsonValue]:
+    return [extractor.exact(message, drawn.type) for message in drawn.messages]
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -110,15 +111,21 @@ def test_truth_is_sure_where_columns_hold_the_whole_value(drawn: Drawn, random: 
 
 
 @settings(max_examples=examples(150), deadline=None)
-@given(drawn_tables(), st.sampled_from([None, None, None, 0.0, 1e-4, 0.1]), RANDOM)
+@given(
+    drawn_tables(),
+    st.sampled_from([None, None, None, 0.0, 1e-4, 0.1]),
+    st.sampled_from([50, 50, 2]),
+    RANDOM,
+)
 def test_truth_of_columns_is_that_of_each_message_or_unsure_where_they_were_rounded(
-    drawn: Drawn, step: float | None, random: Random
+    drawn: Drawn, step: float | None, limit: int, random: Random
 ) -> None:
-    values = values_of(drawn)
+    """Also where longer arrays are only summarised."""
+    extractor = shipped_extractor(limit)
+    values = values_of(drawn, extractor)
     table = drawn.table if step is None else stored(drawn.table, step)
     for _ in range(4):
-        condition = condition_on(values, random)
-        judged(table, condition, values)
+        judged(table, condition_on(values, random), values, extractor)
 
 
 def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
@@ -158,74 +165,6 @@ FULL_PATHS = (
 )
 
 ODOMETRY = "nav_msgs/msg/Odometry"
-
-
-def named_leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, object]]:
-    """The leaves of a value, with their paths; null and NaN, and sizes of arrays, are left out."""
-    if isinstance(value, Summary):
-        value = {name: part for name, part in value.items() if isinstance(part, str)}
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from named_leaves(inner, f"{path}.{name}" if path else name)
-    elif isinstance(value, list):
-        for inner in value:
-            yield from named_leaves(inner, path)
-    elif value is not None and not (isinstance(value, float) and math.isnan(value)):
-        yield path, value
-
-
-def paths_in(node: Node, path: str = "") -> Iterator[tuple[str, Leaf]]:
-    """The leaves of a tree, with their paths; sizes of arrays are left out."""
-    if isinstance(node, Leaf):
-        yield path, node
-    elif isinstance(node, dict):
-        for name, inner in node.items():
-            if not isinstance(node, Summary) or isinstance(inner, Leaf):
-                yield from paths_in(inner, f"{path}.{name}" if path else name)
-    elif not isinstance(node, Constant):
-        for inner in node:
-            yield from paths_in(inner, path)
-
-
-def read_leaves(drawn: Drawn, extractor: SchemaExtractor) -> list[Counter[tuple[str, object]]]:
-    """The leaves of each message as the columns hold them."""
-    assert drawn.table.definition is not None
-    values = Values(drawn.table)
-    found: list[Counter[tuple[str, object]]] = [Counter() for _ in drawn.messages]
-    shape = Shape(drawn.table.definition, drawn.type, extractor)
-    for path, leaf in paths_in(shape.value):
-        try:
-            column, size = column_of(values, leaf), values.size(leaf.level)
-        except UnknownShapeError:
-            continue
-        if not values.holds_all(leaf):
-            continue
-        kept, rows = placed(values, leaf.level, np.arange(size), leaf.limits, surely=True)
-        for at, row in zip(kept.tolist(), rows.tolist(), strict=True):
-            if column[at] == column[at]:
-                found[row][path, column[at]] += 1
-    return found
-
-
-def column_of(values: Values, leaf: Leaf) -> Sequence[object]:
-    if leaf.kind is Kind.TEXT:
-        return values.texts(leaf).values()
-    known = values.numbers(leaf)
-    if known.exactly is not None:
-        return known.exactly(np.arange(len(known.values))).tolist()
-    return known.values.tolist()
-
-
-@pytest.mark.parametrize("limit", [50, 2])
-@settings(max_examples=examples(40), deadline=None)
-@given(drawn=drawn_tables())
-def test_leaves_of_columns_are_those_of_extracted_values(limit: int, drawn: Drawn) -> None:
-    extractor = shipped_extractor(limit)
-    for message_, found in zip(drawn.messages, read_leaves(drawn, extractor), strict=True):
-        expected = Counter(named_leaves(extractor.exact(message_, drawn.type)))
-        assert not found - expected
-        if not drawn.table.left_out:
-            assert not expected - found
 
 
 @settings(max_examples=examples(90), deadline=None)
