@@ -128,9 +128,6 @@ def test_a_database_beside_its_journal_is_not_stored(tmp_path: Path) -> None:
     assert world.fill() == 0
 
 
-# Erasing, screening
-
-
 # Retention
 
 
@@ -261,49 +258,43 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
         assert world.fill() == 1
 
 
+def replace_store(bag_dir: Path) -> None:
+    """Another program finds no store, makes one, and stores another bag first."""
+    for path in store_file(bag_dir).parent.glob(f"{store_file(bag_dir).name}*"):
+        path.unlink()
+    path = write_mcap(bag_dir / "other" / "other_0.mcap", [odom(T0 + 10**6 * S, 0, 0)])
+    os.utime(path, ns=(T0, T0))
+    other = World.of(bag_dir)
+    bags = other.memory.index.snapshot().bags
+    other.fill_alone([bag for bag in bags if bag.path == path])
+    other.store.close()
+
+
 @pytest.mark.usefixtures("small_groups")
-def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path: Path) -> None:
-    write_long_bag(tmp_path)
-    one = World.of(tmp_path)
-    [bag] = one.memory.index.snapshot().bags
-    groups = map(Group.tables, undecoded(one.memory.reader, bag.path))
-
-    def deleted_meanwhile() -> Iterator[list[Table]]:
-        yield next(groups)
-        forget(store_file(tmp_path), tmp_path, ["rec/rec_0.mcap"])
-        yield from groups
-
-    to_store = ReadBag(one.filling._key(bag), bag)
-    assert not one.store.put_long(to_store, deleted_meanwhile(), budget=10**6)
-    assert (count(one, "part"), count(one, "bag")) == (0, 0)
-
-
-@pytest.mark.parametrize("is_asked", [False, True], ids=["", "asked meanwhile"])
-def test_a_bag_is_not_stored_on_in_another_file_that_replaces_the_lost_one(
-    tmp_path: Path, *, is_asked: bool
+@pytest.mark.parametrize("fault", ["deleted", "replaced", "replaced, and asked meanwhile"])
+def test_a_bag_is_not_stored_on_where_another_program_deleted_or_replaced_what_was(
+    tmp_path: Path, fault: str
 ) -> None:
     write_long_bag(tmp_path)
     one = World.of(tmp_path)
     [bag] = one.memory.index.snapshot().bags
     groups = map(Group.tables, undecoded(one.memory.reader, bag.path))
 
-    def replaced_meanwhile() -> Iterator[list[Table]]:
+    def interrupted() -> Iterator[list[Table]]:
         yield next(groups)
-        for path in store_file(tmp_path).parent.glob(f"{store_file(tmp_path).name}*"):
-            path.unlink()
-        other_bag = write_mcap(tmp_path / "other" / "other_0.mcap", [odom(T0 + 10**6 * S, 0, 0)])
-        os.utime(other_bag, ns=(T0, T0))
-        other = World.of(tmp_path)
-        other.fill_alone([new for new in other.memory.index.snapshot().bags if new != bag])
-        other.store.close()
-        if is_asked:
+        if fault == "deleted":
+            forget(store_file(tmp_path), tmp_path, ["rec/rec_0.mcap"])
+        else:
+            replace_store(tmp_path)
+        if fault.endswith("meanwhile"):
             one.store.read(lambda connection: connection.execute("SELECT 1 FROM bag"), None)
         yield from groups
 
     to_store = ReadBag(one.filling._key(bag), bag)
-    assert not one.store.put_long(to_store, replaced_meanwhile(), budget=10**6)
+    assert not one.store.put_long(to_store, interrupted(), budget=10**6)
     again = World.of(tmp_path)
-    assert again.stored() == {"other/other_0.mcap"}
+    assert again.stored() == (set() if fault == "deleted" else {"other/other_0.mcap"})
+    assert count(again, "part") == count(again, "bag") == len(again.stored())
     check_all(again)
 
 
