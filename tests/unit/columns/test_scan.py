@@ -1,11 +1,9 @@
 """What a scan yields is what the bags say, whatever of them is stored, and since when."""
 
-import os
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +17,12 @@ from ros2_memory.history.view import View
 from ros2_memory.queries import find_last_match
 from ros2_memory.storage.base import Batch
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import odom, text, write_mcap
+from tests.support.bags import odom, text, write_mcap, write_splits
 from tests.support.column_worlds import EVERYTHING, World, check_rows, store_file
 from tests.support.memories import memory_of
 
 S = 10**9
 T0 = 1_700_000_000 * S
-
-
-def cut(bag_dir: Path, cuts: list[int], count: int = 40, each: int = 50 * S) -> None:
-    """One recording of one robot, cut into splits at these messages."""
-    messages = [
-        message
-        for n in range(count)
-        for message in (odom(T0 + n * each, n / 3, -n / 7), text(T0 + n * each + 1, f"w{n}"))
-    ]
-    edges = [0, *sorted({*cuts}), len(messages)]
-    for number, (begin, end) in enumerate(pairwise(edges)):
-        if begin < end:
-            path = bag_dir / "rec_0" / f"rec_0_{number}.mcap"
-            os.utime(write_mcap(path, messages[begin:end]), ns=(T0, T0))
 
 
 def test_columns_of_a_bag_that_take_too_much_are_not_held_and_it_is_read(
@@ -103,7 +87,7 @@ def test_a_file_that_is_replaced_while_a_scan_is_read_hides_no_row(tmp_path: Pat
 def test_a_store_that_fails_while_it_is_asked_hides_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    cut(tmp_path, [10, 30, 31, 60])
+    write_splits(tmp_path, [odom(T0 + n * 50 * S, n / 3, -n / 7) for n in range(40)], 500)
     World.of(tmp_path).fill()
     world = World.of(tmp_path)
     whole = getattr(world.store, name)
