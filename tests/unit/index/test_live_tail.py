@@ -161,7 +161,9 @@ def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, re
     tail.write("rec/rec_0.mcap", path.read_bytes()[: ends[3][0]], at=10 * S)
     if recall:
         tail.memory = with_store(tail.memory, tail.bag_dir)
-    notes = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 9)["notes"]
+    reply = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 10)
+    assert reply["total"] == ends[3][1] - (ends[1][1] - ends[0][1])
+    notes = reply["notes"]
     assert any(note.startswith("rec/rec_0.mcap: left out: 1 damaged record") for note in notes), (
         notes
     )

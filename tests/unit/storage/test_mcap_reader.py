@@ -1,23 +1,25 @@
+"""MCAP files, also unfinished: what is read of them by their indexes, though these are wrong."""
+
+import random
 import struct
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zstandard
 from mcap.opcode import Opcode
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
-from ros2_memory.core.errors import (
-    BagContradictionError,
-    BagError,
-    UndecodableError,
-)
+from ros2_memory.core.errors import BagContradictionError, BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BagReader, Record
+from ros2_memory.storage.base import BagReader, Closing, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.fuzz.records import message
-from tests.support.bags import VOLATILE, McapLayout, boolean, text, write_mcap
+from tests.support.bags import VOLATILE, McapLayout, Msg, boolean, text, write_mcap
 from tests.support.mcap_surgery import (
     FOOTER,
     SMALL,
@@ -32,6 +34,7 @@ from tests.support.mcap_surgery import (
 from tests.support.memories import asked, memory_of
 
 EVERYTHING = TimeWindow.everything()
+
 STRING = "std_msgs/msg/String"
 
 
@@ -282,3 +285,83 @@ def test_times_and_channels_that_cannot_be_are_left_out_and_reported(
     assert "left out: 2 messages without a possible log time" in summary.notes
     assert "left out: 1 message of no declared channel" in summary.notes
     assert times(read(reader, path, "/t")) == [5]
+
+
+@pytest.mark.parametrize("layout", [McapLayout(), SMALL, McapLayout(chunk_size=None)])
+def test_of_uncompressed_files_every_message_that_reached_the_disk_is_read(
+    layout: McapLayout, tmp_path: Path
+) -> None:
+    messages = [text(time, f"{time}", f"/{time % 2}") for time in (3, 1, 2, 5, 4, 0)]
+    whole = write_mcap(tmp_path / "whole.mcap", messages, layout).read_bytes()
+    ends = sorted(whole.index(m.payload) + len(m.payload) for m in messages)
+    path = tmp_path / "cut.mcap"
+    reader = McapReader()
+    for size in range(8, len(whole) - 8, 7):
+        path.write_bytes(whole[:size])
+        summary = reader.summarize(path)
+        on_disk = sum(end <= size for end in ends)
+        assert summary.count == on_disk, size
+        assert len(read(reader, path, "/0", "/1")) == on_disk
+        assert reader.closing(path) is Closing.OPEN
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("layout", "left", "count", "note"),
+    [
+        # Its record begins 31 bytes before the payload.
+        (McapLayout(), lambda whole, third: whole[: third + 10], 2, "the last 41 bytes {}"),
+        (McapLayout(), lambda whole, _: whole[:-20], 5, "behind its messages: none is lost"),
+        # What a power cut leaves.
+        (
+            McapLayout(chunk_size=None, finish=False),
+            lambda whole, _: whole + bytes(4096),
+            5,
+            "the last 4096 bytes {}",
+        ),
+    ],
+)
+def test_the_note_states_how_much_could_not_be_read(
+    tmp_path: Path,
+    layout: McapLayout,
+    left: Callable[[bytes, int], bytes],
+    count: int,
+    note: str,
+) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(5), layout)
+    whole = path.read_bytes()
+    path.write_bytes(left(whole, whole.index(chatter(5)[2].payload)))
+    summary = McapReader().summarize(path)
+    assert (summary.count, summary.complete) == (count, False)
+    assert summary.notes[0].startswith("the file ends early")
+    assert summary.notes[0].endswith(note.format("could not be read"))
+
+
+@pytest.mark.parametrize(
+    ("layout", "note"),
+    [
+        (McapLayout(8 << 20, CompressionType.ZSTD), "only a part could be read"),
+        (McapLayout(8 << 20, CompressionType.LZ4), "only a part could be read"),
+        (McapLayout(50_000), "its compressed file ends early"),
+    ],
+    ids=["zstd", "lz4", "file"],
+)
+def test_of_a_compressed_chunk_or_file_that_is_cut_what_can_be_decompressed_counts(
+    tmp_path: Path, layout: McapLayout, note: str
+) -> None:
+    messages = [
+        Msg("/noise", STRING, time, random.Random(time).randbytes(4000)) for time in range(300)
+    ]
+    path = write_mcap(tmp_path / "a.mcap", messages, layout)
+    whole = path.read_bytes()
+    if "file" in note:
+        path, whole = tmp_path / "a.mcap.zstd", zstandard.compress(whole)
+    path.write_bytes(whole[: len(whole) // 2])
+    reader = Rosbag2Reader()
+    summary = reader.summarize(path)
+    assert reader.closing(path) is Closing.OPEN
+    assert 60 < summary.count < 240
+    assert not summary.complete
+    assert any(note in each for each in summary.notes)
+    found = read(reader, path, "/noise")
+    assert [r.payload for r in found] == [m.payload for m in messages[: summary.count]]
