@@ -18,11 +18,16 @@ FLAT: dict[str, JsonValue] = {"x": 1.0, "y": 2.0, "z": 3.0}
 AT: JsonValue = {"position": FLAT}
 
 
+PLACE = (1.0, 2.0, 3.0)
+CUP = Detection("cup", PLACE, "camera", 0.5)
+STAMPED: JsonValue = {"header": {"frame_id": "map"}, "pose": AT}
+
+
 @pytest.mark.parametrize(
-    ("value", "label", "frame"),
+    ("value", "expected"),
     [
         # vision_msgs 2, yolo_msgs, a number alone, aruco_msgs, and a stamped pose
-        ({"results": [{"id": "cup", "score": 0.5, "pose": {"pose": AT}}]}, "cup", "camera"),
+        ({"results": [{"id": "cup", "score": 0.5, "pose": {"pose": AT}}]}, CUP),
         (
             {
                 "class_id": 41,
@@ -31,45 +36,34 @@ AT: JsonValue = {"position": FLAT}
                 "id": "3",
                 "bbox3d": {"center": AT, "frame_id": "base_link"},
             },
-            "cup",
-            "base_link",
+            CUP._replace(frame_id="base_link"),
         ),
-        ({"class_id": 41, "score": 0.5, "pose": AT}, "41", "camera"),
-        ({"id": 7, "confidence": 0.5, "pose": {"pose": AT}}, "7", "camera"),
-        (
-            {"label": "cup", "score": 0.5, "pose": {"header": {"frame_id": "map"}, "pose": AT}},
-            "cup",
-            "map",
-        ),
+        ({"class_id": 41, "score": 0.5, "pose": AT}, CUP._replace(label="41")),
+        ({"id": 7, "confidence": 0.5, "pose": {"pose": AT}}, CUP._replace(label="7")),
+        ({"label": "cup", "score": 0.5, "pose": STAMPED}, CUP._replace(frame_id="map")),
         # JSON of ultralytics, and with a flat place
-        ({"name": "cup", "class": 41, "confidence": 0.5, "pose": FLAT}, "cup", "camera"),
-        ({"category": "cup", "confidence": 0.5, **FLAT}, "cup", "camera"),
+        ({"name": "cup", "class": 41, "confidence": 0.5, "pose": FLAT}, CUP),
+        ({"category": "cup", "confidence": 0.5, **FLAT}, CUP),
+        # Without a label: isaac_ros_apriltag_interfaces, aruco_opencv_msgs, darknet_ros_msgs
+        (
+            {"family": "tag36h11", "id": 7, "pose": {"pose": {"pose": AT}}},
+            Detection("7", PLACE, "camera"),
+        ),
+        ({"marker_id": 7, "pose": AT}, Detection("7", PLACE, "camera")),
+        (
+            {"Class": "cup", "probability": 0.5, "xmin": 1, "id": 41},
+            Detection("cup", None, "camera", 0.5),
+        ),
     ],
 )
 def test_detections_are_named_and_placed_as_common_packages_do(
-    value: JsonValue, label: str, frame: str
+    value: JsonValue, expected: Detection
 ) -> None:
-    expected = Detection(label, (1.0, 2.0, 3.0), frame, 0.5)
     assert detections_of({"detections": [value]}, "camera") == (expected,)
     wrapped = {"payload": {"frame_id": "camera", "detections": [value]}}
     assert detections_of({"data": json.dumps(wrapped)}) == (expected,)
-    assert detections_of(without_low_scores({"detections": [value]}, 0.6)) == ()
-
-
-@pytest.mark.parametrize(
-    ("value", "label", "place", "score"),
-    [
-        # isaac_ros_apriltag_interfaces, aruco_opencv_msgs, and darknet_ros_msgs of ROS 1
-        ({"family": "tag36h11", "id": 7, "pose": {"pose": {"pose": AT}}}, "7", True, None),
-        ({"marker_id": 7, "pose": AT}, "7", True, None),
-        ({"Class": "cup", "probability": 0.5, "xmin": 1, "id": 41}, "cup", False, 0.5),
-    ],
-)
-def test_detections_of_types_without_a_label_have_the_name_that_the_type_gives(
-    value: JsonValue, label: str, place: bool, score: float | None
-) -> None:
-    found = Detection(label, (1.0, 2.0, 3.0) if place else None, "camera", score)
-    assert detections_of([value], "camera") == (found,)
+    left = () if expected.score else (expected,)
+    assert detections_of(without_low_scores({"detections": [value]}, 0.6), "camera") == left
 
 
 @pytest.mark.parametrize(

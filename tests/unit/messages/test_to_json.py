@@ -1,7 +1,8 @@
-"""Messages as JSON: exactly, and short, thinned and rounded for a reply."""
+"""Messages as JSON: exactly, and short, thinned and rounded for a reply; and what is converted."""
 
 import json
 import math
+from itertools import count
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import JsonValue
+from ros2_memory.messages.conversions import ABSENT, descend, view, xyz
 from ros2_memory.messages.to_json import (
     MAX_DEPTH,
     ExactJson,
@@ -30,35 +32,32 @@ def exact(node: object, limit: int = 50) -> JsonValue:
     return ExactJson(limit).value(node, "")
 
 
-def test_exactly_nan_stays_and_shown_it_is_null() -> None:
-    node = {"a": math.nan, "b": np.array([1.0, math.inf], dtype=np.float32)}
-    kept = exact(node)
-    assert isinstance(kept, dict)
-    assert isinstance(kept["a"], float)
-    assert math.isnan(kept["a"])
-    assert kept["b"] == [1.0, math.inf]
-    assert shown(node) == ({"a": None, "b": [1, None]}, ())
+WIDTHS = (np.float16(0.5), np.longdouble(0.5), np.float64(0.5))
 
 
-def test_numpy_scalars_become_values_of_python() -> None:
-    node = [np.float32(0.1), np.float64(0.5), np.int32(-3), np.uint64(2**64 - 1), np.bool_(True)]
-    value, _ = shown(node)
-    assert value == [0.1, 0.5, -3, 2**64 - 1, True]
-    assert isinstance(value, list)
-    assert [type(one) for one in value] == [float, float, int, int, bool]
-
-
-def test_bytes_leave_as_numbers_while_few_and_as_their_count_when_many() -> None:
-    few, many = np.arange(50, dtype=np.uint8), np.arange(51, dtype=np.uint8)
-    for rendered in (shown(many)[0], exact(many), shown(bytes(51))[0], exact(bytes(51))):
-        assert rendered == {"bytes": 51}
-    assert shown(few)[0] == exact(few) == list(range(50))
-    assert shown(b"\x01\x02")[0] == [1, 2]
-
-
-def test_arrays_of_several_dimensions_leave_as_lists_of_lists() -> None:
-    assert shown(np.array([[1, 2], [3, 4]]))[0] == [[1, 2], [3, 4]]
-    assert exact(np.array([[1.5, 2], [3, 4]])) == [[1.5, 2.0], [3.0, 4.0]]
+@pytest.mark.parametrize(
+    ("node", "short", "whole"),
+    [
+        (math.nan, "null", "NaN"),
+        (np.array([1.0, math.inf], dtype=np.float32), "[1, null]", "[1.0, Infinity]"),
+        *((number, "0.5", "0.5") for number in WIDTHS),
+        *((np.array([number]), "[0.5]", "[0.5]") for number in WIDTHS),
+        ([np.int32(-3), np.uint64(2**64 - 1)], f"[-3, {2**64 - 1}]", f"[-3, {2**64 - 1}]"),
+        (np.float32(0.1), "0.1", "0.10000000149011612"),
+        (np.bool_(True), "true", "true"),
+        (np.array([[1, 2], [3, 4]]), "[[1, 2], [3, 4]]", "[[1, 2], [3, 4]]"),
+        (np.array([[1.5, 2]]), "[[1.5, 2]]", "[[1.5, 2.0]]"),
+        # Bytes are numbers while they are few.
+        (b"\x01\x02", "[1, 2]", "[1, 2]"),
+        (np.arange(50, dtype=np.uint8), str([*range(50)]), str([*range(50)])),
+        (np.arange(51, dtype=np.uint8), '{"bytes": 51}', '{"bytes": 51}'),
+        (bytes(51), '{"bytes": 51}', '{"bytes": 51}'),
+    ],
+    ids=count(),
+)
+def test_values_of_numpy_become_json(node: object, short: str, whole: str) -> None:
+    assert (json.dumps(shown(node)[0]), json.dumps(exact(node))) == (short, whole)
+    assert shown(node)[1] == ()
 
 
 def test_nesting_beyond_reason_is_cut_with_a_note() -> None:
@@ -84,6 +83,7 @@ numbers = st.one_of(
     st.integers(0, 255).map(np.uint8),
     st.just(10**4000),
 )
+
 arrays = st.one_of(
     st.lists(st.floats(width=32), max_size=40).map(lambda v: np.array(v, dtype=np.float32)),
     st.lists(st.floats(), max_size=40).map(lambda v: np.array(v, dtype=np.float64)),
@@ -92,7 +92,9 @@ arrays = st.one_of(
     st.lists(st.booleans(), max_size=40).map(lambda v: np.array(v, dtype=np.bool_)),
     st.integers(0, 12).map(lambda n: np.full((n, 2, 3), math.nan)),
 )
+
 parts = st.one_of(st.floats(), st.just(0.0))
+
 geometry = st.one_of(
     st.builds(bags.vector3, parts, parts, parts),
     st.builds(
@@ -101,10 +103,13 @@ geometry = st.one_of(
     ),
     st.integers(0, 2**62).map(bags.stamp),
 )  # fmt: skip
+
 texts = st.text(st.characters(codec=None, exclude_categories=()))
+
 leaves = st.one_of(
     st.none(), st.booleans(), numbers, texts, st.binary(max_size=40), arrays, geometry
 )
+
 values = st.recursive(
     leaves,
     lambda inner: st.one_of(
@@ -131,12 +136,6 @@ def test_any_message_becomes_strict_json_within_the_limit(node: object, limit: i
     assert json.loads(text.encode("utf-8")) == value
     assert longest_list(value) <= limit
     assert len(set(notes)) == len(notes)
-
-
-@pytest.mark.parametrize("kind", [np.float16, np.longdouble])
-def test_the_unusual_widths_of_floats_leave_as_numbers(kind: type[np.floating]) -> None:
-    assert shown(kind(0.5))[0] == exact(kind(0.5)) == 0.5
-    assert shown(np.array([0.5], dtype=kind))[0] == exact(np.array([0.5], dtype=kind)) == [0.5]
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
@@ -174,3 +173,49 @@ def test_ints_of_64_bits_leave_as_they_are_and_longer_ones_as_floats() -> None:
     assert round_integer(-(2**63)) == -(2**63)
     assert round_integer(10**30) == 1e30
     assert round_integer(10**5000) is None
+
+
+def image(encoding: str, height: int = 2, width: int = 4, size: int = 24) -> object:
+    return bags.make(
+        "sensor_msgs/msg/Image",
+        header=bags.header(0, "camera"),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=size // height,
+        data=np.zeros(size, dtype=np.uint8),
+    )
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shape"),
+    [
+        ("rgb8", [2, 4, 3]),
+        ("bgr16", [2, 4, 3]),
+        ("rgba8", [2, 4, 4]),
+        ("bgra8", [2, 4, 4]),
+        ("mono8", [2, 4, 1]),
+        ("16UC1", [2, 4, 1]),
+        ("32FC3", [2, 4, 3]),
+        ("bayer_rggb8", [2, 4, 1]),
+        ("yuv422", [2, 4]),
+        ("", [2, 4]),
+    ],
+)
+def test_an_image_is_its_size_encoding_and_shape(encoding: str, shape: list[int]) -> None:
+    assert view(image(encoding), "data") == {"bytes": 24, "encoding": encoding, "shape": shape}
+
+
+@pytest.mark.parametrize(
+    "node", [None, [1.0, 2.0, 3.0], {"x": True, "y": 2.0, "z": 3.0}, {"x": 10**400, "y": 2, "z": 3}]
+)
+def test_what_is_not_shaped_like_a_point_is_none(node: object) -> None:
+    assert xyz(node) is None
+
+
+def test_the_numbers_of_an_array_are_reached_by_number_and_have_no_fields() -> None:
+    scan = SimpleNamespace(ranges=np.array([1.5, 2.5]), none=np.zeros(0))
+    assert descend(scan, ("ranges", "1")) == 2.5
+    assert descend(scan, ("ranges", "size")) is ABSENT
+    assert descend(scan, ("none", "x")) == []
