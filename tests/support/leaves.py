@@ -15,14 +15,13 @@ TIMES: Final = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"
 
 
 class Comparison:
-    """What was compared: how many leaves, and which differ. All columns must have been met.
+    """What differs of what was compared. All columns must have been met.
 
     `error` returns by how much the numbers of a column may differ, by its path from the table.
     """
 
     def __init__(self, error: Callable[[str], float] = lambda _: 0.0) -> None:
         self._error = error
-        self.leaves = 0
         self.wrong: list[str] = []
 
     def table(self, table: Table, messages: Sequence[object]) -> None:
@@ -60,7 +59,6 @@ class Comparison:
             self._elements(inner, found_lists, f"{where} {path}", f"{around}{path}.")
 
     def _leaf(self, where: str, found: object, expected: object, allowed: float) -> None:
-        self.leaves += 1
         if not same(found, expected) and not _is_near(found, expected, allowed):
             self.wrong.append(f"{where}: {found!r} for {expected!r}")
 
