@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from ros2_memory.core import geometry
 from ros2_memory.core.geometry import multiply, normalised, rpy, simplified, slerp
