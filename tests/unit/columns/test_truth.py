@@ -22,6 +22,7 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
+from ros2_memory.messages.conversions import ANGLES
 from tests.support.bags import make
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
@@ -161,14 +162,19 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 @settings(max_examples=examples(150), deadline=None)
-@given(drawn_tables(), st.sampled_from([None, None, 1e-6, 1e-4, 1e-3]), RANDOM)
+@given(
+    drawn_tables() | drawn_tables((ODOMETRY,)),
+    st.sampled_from([None, None, 1e-6, 1e-4, 1e-3]),
+    RANDOM,
+)
 def test_numbers_of_a_field_are_those_of_each_message_or_off_by_less_than_they_say(
     drawn: Drawn, step: float | None, random: Random
 ) -> None:
     """Also angles of quaternions that were rounded."""
     table = drawn.table if step is None else stored(drawn.table, step)
     value = EXTRACTOR.exact(drawn.messages[0], drawn.type)
-    for field in (random.choice([*paths_of(value), "nothing"]), random.choice(FULL_PATHS)):
+    fields = [random.choice([*paths_of(value), "nothing"]), random.choice(FULL_PATHS)]
+    for field in (*fields, *(f"orientation.{angle}" for angle in ANGLES)):
         found = numbers(table, field, EXTRACTOR)
         if found is None:
             continue
