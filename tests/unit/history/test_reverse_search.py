@@ -6,7 +6,6 @@ Replies of a call that was out of time have what is known, and claim no more tha
 import itertools
 import math
 import random
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import chain, repeat
@@ -71,17 +70,18 @@ def filled(bag_dir: Path) -> tuple[Memory, NotingReader]:
 
 def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.5), text(T0, "POWER_SUPPLY_STATUS_FULL")])
-    memory, call = memory_of(tmp_path), Call()
+    memory = memory_of(tmp_path)
 
-    def newest(word: str, topic: str = "/battery_state", field: str = "power_supply_status") -> int:
-        found = queries.find_last_match(memory, call, topic, "equals", word, field=field).found
-        return 0 if found is None else found.sample.time
+    def newest(
+        word: str, topic: str = "/battery_state", field: str = "power_supply_status"
+    ) -> Match:
+        return last(memory, "equals", f"POWER_SUPPLY_STATUS_{word}", topic, field=field)
 
-    assert newest("POWER_SUPPLY_STATUS_DISCHARGING") == T0
-    assert newest("POWER_SUPPLY_STATUS_CHARGING") == 0
-    assert newest("POWER_SUPPLY_STATUS_FULL", "/chatter", "value") == T0  # a text stays one
+    assert at(newest("DISCHARGING")) == 0
+    assert newest("CHARGING").found is None
+    assert at(newest("FULL", "/chatter", "value")) == 0  # a text stays one
     with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
-        newest("POWER_SUPPLY_STATUS_EMPTY")
+        newest("EMPTY")
 
 
 @pytest.mark.parametrize("recalls", [False, True])
@@ -112,23 +112,16 @@ def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recall
 def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
     question = (memory_of(tmp_path), Call(), "/battery_state")
-    searches: list[Callable[..., object]] = [queries.find_last_match, find_matches]
-    for kind, search in itertools.product(("below", "above"), searches):
+    for kind, search in itertools.product(
+        ("below", "above"), (queries.find_last_match, find_matches)
+    ):
         with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
             search(*question, kind, 20, field="percentage")
-    found = queries.find_last_match(*question, "above", 0.2, field="percentage").found
-    assert found is not None
-    assert found.sample.time == T0
-
-
-@pytest.mark.parametrize("unknown", [math.nan, -1.0])
-def test_percent_of_a_battery_that_states_no_charge_is_not_refused_as_if_it_stated_fractions(
-    tmp_path: Path, unknown: float
-) -> None:
-    write_mcap(tmp_path / "bag.mcap", [battery(T0, unknown)])
-    question = (memory_of(tmp_path), Call(), "/battery_state")
-    found = queries.find_last_match(*question, "above", 20, field="percentage").found
-    assert found is None
+    assert at(queries.find_last_match(*question, "above", 0.2, field="percentage")) == 0
+    for unknown in (math.nan, -1.0):  # it states no charge, be it in percent or as a fraction
+        write_mcap(tmp_path / "bag.mcap", [battery(T0, unknown)])
+        question = (memory_of(tmp_path), Call(), "/battery_state")
+        assert queries.find_last_match(*question, "above", 20, field="percentage").found is None
 
 
 @pytest.mark.parametrize("kind", ["contains", "contains_word", "equals"])
@@ -184,13 +177,12 @@ def last(
     memory: Memory,
     condition_type: str,
     value: JsonValue,
-    *,
     topic: str = SCENE,
     call: Call | None = None,
-    before_s: float | None = None,
+    field: str | None = None,
 ) -> Match:
     return queries.find_last_match(
-        memory, call or Call(), topic, condition_type, value, before_s=before_s
+        memory, call or Call(), topic, condition_type, value, field=field
     )
 
 
