@@ -6,6 +6,9 @@ import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Never
+from unittest.mock import patch
+
+import pytest
 
 
 @contextmanager
@@ -26,3 +29,18 @@ def failing(number: int = errno.ENOSPC) -> Callable[..., Never]:
         raise OSError(number, os.strerror(number))
 
     return fails
+
+
+@contextmanager
+def broken(owner: object, name: str, number: int = errno.ENOSPC) -> Iterator[None]:
+    """Within the block a function fails, as on a full disk, unless another error is given."""
+    with patch.object(owner, name, failing(number)):
+        yield
+
+
+@contextmanager
+def killed_at(owner: object, name: str) -> Iterator[None]:
+    """The program is killed when it calls a function, which ends the block."""
+    killed = patch.object(owner, name, side_effect=KeyboardInterrupt)
+    with killed, pytest.raises(KeyboardInterrupt):
+        yield

@@ -13,7 +13,7 @@ from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.core.errors import RecorderError
 from tests.faults.small_disk import needs_mounts, small_disk
-from tests.support.fakes import failing
+from tests.support.fakes import broken, failing
 
 
 def held_by(bag_dir: Path, text: str) -> int:
@@ -91,13 +91,10 @@ class TestRenewal:
         os.close(descriptor)
         lock.release()
 
-    def test_a_directory_that_cannot_be_looked_at_is_locked_as_before(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_directory_that_cannot_be_looked_at_is_locked_as_before(self, tmp_path: Path) -> None:
         lock = BagDirLock.acquire(tmp_path)
 
-        with monkeypatch.context() as disk:
-            disk.setattr(os, "stat", failing(errno.EIO))
+        with broken(os, "stat", errno.EIO):
             assert not lock.renew()
         assert f"process {os.getpid()} on" in refusal(tmp_path)
         lock.release()

@@ -29,7 +29,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
-from tests.support.fakes import failing
+from tests.support.fakes import broken
 
 S = 10**9
 T0 = 1_795_150_800 * S  # 2026-11-20T05:00:00Z
@@ -158,12 +158,9 @@ def test_what_is_no_request_is_told_and_dropped(tmp_path: Path, text: str) -> No
     assert names(tmp_path) == [f"{NUMBER}.answer"]
 
 
-def test_who_asked_is_told_that_the_disk_did_not_give_the_request(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_asked_is_told_that_the_disk_did_not_give_the_request(tmp_path: Path) -> None:
     posted, queue = asked(tmp_path), RequestQueue(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(moment_file, "_read_request", failing(errno.EIO))
+    with broken(moment_file, "_read_request", errno.EIO):
         assert list(queue.take(T0)) == []
     outcome = posted.outcome()
     assert outcome is not None

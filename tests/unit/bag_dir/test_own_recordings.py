@@ -24,7 +24,7 @@ from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import examples
-from tests.support.fakes import failing
+from tests.support.fakes import broken, failing
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import embedding, lines, own_all
 from tests.support.log_lines import with_checks
@@ -130,7 +130,7 @@ class TestWhatAKillLeaves:
     """The steps of a recording: list it, start the child, which makes it, list its directory."""
 
     def test_a_directory_that_was_not_listed_is_ours_where_the_heartbeat_names_it(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path: Path
     ) -> None:
         claimed(tmp_path).begin(A)
         embedding(tmp_path / A / f"{A}_0.mcap")
@@ -145,13 +145,12 @@ class TestWhatAKillLeaves:
         own = OwnRecordings(tmp_path)
         assert not own.owns(tmp_path / A)
         # A list that cannot be written is known all the same.
-        with monkeypatch.context() as patch, capture_logs() as logs:
-            patch.setattr(own_recordings, "write_durably", failing())
+        with broken(own_recordings, "write_durably"), capture_logs() as logs:
             own.claim()
             assert events(logs, "recordings_not_listed")
             assert own.owns(tmp_path / A)
-            patch.setattr(own_recordings, "append_lines", failing())
-            with pytest.raises(RecorderError, match="No space left"):
+            no_append = broken(own_recordings, "append_lines")
+            with no_append, pytest.raises(RecorderError, match="No space left"):
                 own.begin(B)
         own.begin(B)
         assert [each.get("recording") for each in lines(tmp_path)] == [A, A, B]

@@ -30,7 +30,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
-from tests.support.fakes import failing
+from tests.support.fakes import broken, failing
 from tests.support.housekeepers import (
     PLENTY,
     files_in,
@@ -436,14 +436,11 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]
 
 
-def test_what_a_full_disk_leaves_unrepaired_is_repaired_when_there_is_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_full_disk_leaves_unrepaired_is_repaired_when_there_is_room(tmp_path: Path) -> None:
     open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
     free = Mock(return_value=1000)
     keeper = keeper_of(tmp_path, measure_free=free)
-    with monkeypatch.context() as full:
-        full.setattr(McapWriter, "rewrite", failing())
+    with broken(McapWriter, "rewrite"):
         keeper.apply()
     free.return_value = PLENTY
     keeper.apply()

@@ -10,7 +10,7 @@ from ros2_memory.bag_dir.state_files import SCREENED, read_withheld
 from ros2_memory.recorder.background import Background
 from ros2_memory.storage.mcap.writer import McapWriter
 from tests.support.bags import McapLayout
-from tests.support.fakes import failing
+from tests.support.fakes import broken, failing
 from tests.support.housekeepers import keeper_of, recording_now
 from tests.support.screened_bags import ScreenedBags, off, on, privacy, words
 from tests.support.simulated_recorders import assert_each_counts_once, rotating
@@ -46,13 +46,10 @@ class TestSessions:
             True
         ] * (len(names) - 1)
 
-    def test_a_recording_that_cannot_be_held_back_does_not_begin(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_recording_that_cannot_be_held_back_does_not_begin(self, tmp_path: Path) -> None:
         house = keeper_of(tmp_path, screening=ScreenedBags(tmp_path).screening)
         world = rotating(tmp_path, 15, housekeeper=house)
-        with monkeypatch.context() as patched:
-            patched.setattr(SCREENED, "write", failing())
+        with broken(SCREENED, "write"):
             world.run(15)
             assert len(world.recorders) == 1
             assert "screened.json: No space left" in world.heartbeat()["last_error"]

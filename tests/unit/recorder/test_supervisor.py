@@ -46,11 +46,8 @@ class TestStart:
         with pytest.raises(RecorderError, match="no more processes"):
             world.supervisor.start()
         beat = world.heartbeat()
-        assert (beat["state"], beat["recordings"], beat["last_error"]) == (
-            "stopped",
-            [],
-            "no more processes",
-        )
+        left = (beat["state"], beat["recordings"], beat["last_error"])
+        assert left == ("stopped", [], "no more processes")
 
 
 class TestRotation:
@@ -79,16 +76,9 @@ class TestRotation:
         assert world.heartbeat()["last_error"] is None
         assert_each_counts_once(world)
 
-    def test_a_split_that_the_old_one_opens_while_it_ends_is_in_its_sidecar(
-        self, tmp_path: Path
-    ) -> None:
-        world = rotating(tmp_path)
-        world.recorders[0].obeys_after = 40
+    def test_a_split_that_the_old_one_opens_while_it_ends_counts_once(self, tmp_path: Path) -> None:
+        world = rotating(tmp_path, defaults={"obeys_after": 40})
         world.run(40)
-        old = read_handover(world.recorders[0].directory).handover
-        assert old.end is not None
-        last = f"{world.recorders[0].directory.name}_{world.recorders[0].splits}.mcap"
-        assert last in old.end.files
         assert_each_counts_once(world)
 
     def test_a_rotation_that_cannot_begin_is_tried_again(self, tmp_path: Path) -> None:
@@ -139,8 +129,9 @@ class TestStop:
         world.run(12)
         assert_what_stands_counts_once(world)
 
-    def test_a_process_that_nothing_ends_is_named(self, tmp_path: Path) -> None:
-        world = World(tmp_path, defaults={"obeys_after": 10**9, "patience_s": 0.05}).started(2)
+    def test_a_process_that_nothing_ends_is_named(self, world: World) -> None:
+        [recorder] = world.recorders
+        recorder.obeys_after, recorder.patience_s = 10**9, 0.05
         with capture_logs() as logs:
             world.supervisor.stop()
         (said,) = events(logs, "recorder_not_ended")
@@ -195,16 +186,16 @@ class TestClock:
 
     @pytest.mark.parametrize(("seconds", "recordings"), [(-100, 1), (-121, 2)])
     def test_set_back_by_more_than_two_minutes_a_new_recording_begins(
-        self, tmp_path: Path, seconds: int, recordings: int
+        self, world: World, seconds: int, recordings: int
     ) -> None:
-        world = World(tmp_path).started(10)
+        world.run(7)
         world.set_clock(seconds)
         world.run(20)
         assert len(world.recorders) == recordings
         assert_what_stands_counts_once(world)
 
-    def test_set_back_while_nothing_records_no_recording_is_cut_short(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(10)
+    def test_set_back_while_nothing_records_no_recording_is_cut_short(self, world: World) -> None:
+        world.run(7)
         world.free = 5
         world.run(3)
         world.set_clock(-3600)
@@ -219,8 +210,8 @@ UNKNOWN = "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_m
 
 
 class TestWatch:
-    def test_a_robot_that_falls_silent_has_its_last_split_closed_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(18)
+    def test_a_robot_that_falls_silent_has_its_last_split_closed_once(self, world: World) -> None:
+        world.run(15)
         world.silent = True
         [reported] = world.logged(300, "no_growth")
         assert world.heartbeat()["last_error"] == reported["reason"]
@@ -234,9 +225,9 @@ class TestWatch:
         assert_what_stands_counts_once(world)
 
     def test_a_directory_that_vanished_is_reported_and_recording_goes_on_elsewhere(
-        self, tmp_path: Path
+        self, world: World
     ) -> None:
-        world = World(tmp_path).started(8)
+        world.run(5)
         shutil.rmtree(world.recorders[0].directory)
         assert len(world.logged(4, "recording_vanished")) == 1
         assert [recorder.status for recorder in world.recorders] == [0, None]
@@ -305,10 +296,9 @@ class TestWatch:
 
 class TestHeartbeat:
     def test_one_that_cannot_be_written_is_reported_once_and_recording_goes_on(
-        self, tmp_path: Path
+        self, world: World
     ) -> None:
-        world = World(tmp_path).started(2)
-        (tmp_path / ".recorder.json.tmp").mkdir()
+        (world.bag_dir / ".recorder.json.tmp").mkdir()
         assert len(world.logged(20, "heartbeat_not_written")) == 1
         assert world.supervisor.is_recording
 
@@ -344,11 +334,11 @@ class TestOffers:
         world.run(10)
         assert world.heartbeat()["missing"] == ["/gone"]
 
-    def test_nodes_that_have_gone_are_reported_until_they_come_back(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    def test_nodes_that_have_gone_are_reported(
+        self, world: World, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
-        world = World(tmp_path).started(12)
+        world.run(9)
         world.silent, world.defaults = True, {"topics": ()}
         [said] = world.logged(90, "topic_silent")
         assert said["topics"] == ["/bumper", "/door"]
@@ -437,21 +427,20 @@ class TestShortfall:
 
     @pytest.mark.parametrize("still", [("/bumper",), ()])
     def test_a_regular_topic_that_stops_is_silent_until_it_comes(
-        self, tmp_path: Path, still: tuple[str, ...]
+        self, world: World, still: tuple[str, ...]
     ) -> None:
-        world = World(tmp_path).started(60)
-        assert world.heartbeat()["fell_silent"] == []
-        world.running[-1].heard = still
-        world.defaults["heard"] = still
-        world.run(30)
-        stopped = sorted({"/bumper", "/door"} - {*still})
-        assert world.heartbeat()["fell_silent"] == stopped
-        world.run(60)
-        assert world.heartbeat()["fell_silent"] == stopped
-        for recorder in world.running:
-            recorder.heard = ("/bumper", "/door")
-        world.run(20)
-        assert world.heartbeat()["fell_silent"] == []
+        stopped = sorted({*TOPICS} - {*still})
+        for heard, run_s, silent in (
+            (TOPICS, 57, []),
+            (still, 30, stopped),
+            (still, 60, stopped),
+            (TOPICS, 20, []),
+        ):
+            world.defaults["heard"] = heard
+            for recorder in world.running:
+                recorder.heard = heard
+            world.run(run_s)
+            assert world.heartbeat()["fell_silent"] == silent
 
     def test_a_slow_topic_that_is_written_with_its_split_is_not_silent(
         self, tmp_path: Path
@@ -521,15 +510,15 @@ class TestChangedList:
 
 
 def test_a_death_is_told_with_its_time_and_last_words_and_is_past_once_recording_goes_on(
-    tmp_path: Path,
+    world: World,
 ) -> None:
-    world = World(tmp_path).started(20)
+    world.run(17)
     world.recorders[0].lines.append("terminate called after throwing")
     world.recorders[0].die(-6)
     [died] = world.logged(0.25, "recorder_died")
     assert died["log_level"] == "error"
-    assert "was killed (SIGABRT)" in str(died["reason"])
-    assert "terminate called" in str(died["reason"])
+    assert "was killed (SIGABRT)" in died["reason"]
+    assert "terminate called" in died["reason"]
     beat = world.heartbeat()
     assert (beat["state"], beat["recordings"]) == ("starting", [])
     told = (died["reason"], world.wall, False)
@@ -539,14 +528,11 @@ def test_a_death_is_told_with_its_time_and_last_words_and_is_past_once_recording
     assert (later["last_error"], later["last_error_at"], later["recovered"]) == (*told[:2], True)
 
 
-def test_an_error_that_lasts_is_not_past(tmp_path: Path) -> None:
-    world = World(tmp_path).started()
+def test_an_error_that_lasts_is_not_past(world: World) -> None:
     world.background.failed("apply", "the list cannot be read")
     world.run(30)
-    assert (world.heartbeat()["last_error"], world.heartbeat()["recovered"]) == (
-        "the list cannot be read",
-        False,
-    )
+    beat = world.heartbeat()
+    assert (beat["last_error"], beat["recovered"]) == ("the list cannot be read", False)
     world.background.run("apply", bool)
     world.run(10)
     assert world.heartbeat()["recovered"] is True

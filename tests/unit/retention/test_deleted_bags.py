@@ -4,7 +4,6 @@ import errno
 import shutil
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 from structlog.testing import capture_logs
@@ -23,7 +22,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.retention import collect
 from tests.support.clocks import SettableClock
-from tests.support.fakes import failing
+from tests.support.fakes import broken, killed_at
 from tests.support.housekeepers import (
     NOW,
     T0,
@@ -138,7 +137,7 @@ def test_a_deletion_is_written_down_before_it_happens(
 
 
 def test_a_kill_before_the_directory_goes_with_its_last_bag_leaves_it_to_the_next_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     listed(tmp_path, A, 0)
     listed(tmp_path, B, 3 * 3600)
@@ -146,10 +145,8 @@ def test_a_kill_before_the_directory_goes_with_its_last_bag_leaves_it_to_the_nex
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs" / "metadata.yaml").touch()
     limits: dict[str, Any] = {"max_age_h": 1, "keeps_foreign": True}
-    with monkeypatch.context() as patched:
-        patched.setattr(collect, "remove_emptied", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            house_of(tmp_path, **limits).apply()
+    with killed_at(collect, "remove_emptied"):
+        house_of(tmp_path, **limits).apply()
     assert not [*(tmp_path / A).glob("*.mcap")]
     house = house_of(tmp_path, **limits)
     house.prepare()
@@ -159,14 +156,13 @@ def test_a_kill_before_the_directory_goes_with_its_last_bag_leaves_it_to_the_nex
 
 
 def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_there_is_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     old = listed(tmp_path, A, 0)
     listed(tmp_path, B, 3 * 3600)
     house = house_of(tmp_path, max_age_h=1)
 
-    with monkeypatch.context() as patched, capture_logs() as captured:
-        patched.setattr(DELETED, "append", failing())
+    with broken(DELETED, "append"), capture_logs() as captured:
         house.apply()
     assert "deletions_not_written" in {each["event"] for each in captured}
     assert not any(path.exists() for path in old)
@@ -198,8 +194,7 @@ def test_a_list_that_cannot_be_read_when_it_is_too_long_loses_nothing(
 
     for n in range(4):
         at = T0 + n * 100 * S
-        with monkeypatch.context() as patched:
-            patched.setattr(DELETED, "rows", failing(errno.EMFILE))
+        with broken(DELETED, "rows", errno.EMFILE):
             append_deleted(tmp_path, [deleted_of(f"rec_{n}", [("a_0.mcap", at, at + 9 * S)])])
     assert [(start - T0) // S for start, _ in deleted_spans(tmp_path)] == [0, 100, 200, 300]
     append_deleted(tmp_path, [deleted_of("rec_4", [("a_0.mcap", at + 100 * S, at + 109 * S)])])

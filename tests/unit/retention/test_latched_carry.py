@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -31,7 +30,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.fakes import failing
+from tests.support.fakes import broken, killed_at
 from tests.support.housekeepers import files_in, keeper_of
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
@@ -164,11 +163,10 @@ class TestTheBagOfCarriedMessages:
         assert "rec/rec_0.mcap" in files_in(bags)
 
     def test_where_it_cannot_be_written_bags_without_latched_messages_go_instead(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path: Path
     ) -> None:
         at_home(tmp_path, splits=3)
-        with monkeypatch.context() as full:
-            full.setattr(McapWriter, "write", failing())
+        with broken(McapWriter, "write"):
             keeper_of(tmp_path, max_bytes=1).apply()
         assert files_in(tmp_path) == ["rec", "rec/rec_0.mcap", "rec/rec_2.mcap"]
         keeper_of(tmp_path, max_bytes=1).apply()
@@ -190,16 +188,13 @@ class TestTheBagOfCarriedMessages:
         keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
 
-    def test_its_grace_does_not_begin_with_a_carry_that_failed(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_its_grace_does_not_begin_with_a_carry_that_failed(self, tmp_path: Path) -> None:
         at_home(tmp_path, splits=4)
         size, now = (tmp_path / "rec/rec_0.mcap").stat().st_size, SettableClock(0)
         keeper = keeper_of(
             tmp_path, max_bytes=3 * size + 1, grace_s=60.0, monotonic=lambda: now.now() / S
         )
-        with monkeypatch.context() as full:
-            full.setattr(McapWriter, "write", failing())
+        with broken(McapWriter, "write"):
             keeper.apply()
         for number in (4, 5, 6):
             write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", drive_in(number), LAYOUT)
@@ -208,14 +203,10 @@ class TestTheBagOfCarriedMessages:
         assert carried_at(tmp_path) == [T0]
         assert "rec/rec_0.mcap" in files_in(tmp_path)
 
-    def test_after_a_kill_it_is_the_recorder_s_own(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_after_a_kill_it_is_the_recorder_s_own(self, tmp_path: Path) -> None:
         at_home(tmp_path)
-        with monkeypatch.context() as killed:
-            killed.setattr(OwnRecordings, "hold", Mock(side_effect=KeyboardInterrupt))
-            with pytest.raises(KeyboardInterrupt):
-                keeper_of(tmp_path, max_bytes=1).apply()
+        with killed_at(OwnRecordings, "hold"):
+            keeper_of(tmp_path, max_bytes=1).apply()
         keeper_of(tmp_path, max_bytes=1).apply()
         assert OwnRecordings(tmp_path).owns_bag(tmp_path / "latched/carried.mcap")
 

@@ -10,7 +10,7 @@ from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
-from tests.support.fakes import failing
+from tests.support.fakes import broken
 
 S = 10**9
 T0_S = 1_790_000_000.0
@@ -94,17 +94,14 @@ def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_p
     assert RecordedTime(tmp_path).doubtful("ab") == {"a", "b"}
 
 
-def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b", "c")
     end = recorded(RecordedTime(tmp_path), "gone", 1000)
     recorded(RecordedTime(tmp_path), "a", 100, since_s=end)
     before = (tmp_path / FILE).read_text()
 
     time = RecordedTime(tmp_path)
-    with monkeypatch.context() as patched, capture_logs() as captured:
-        patched.setattr(RECORDED, "lines", failing(errno.EMFILE))
+    with broken(RECORDED, "lines", errno.EMFILE), capture_logs() as captured:
         end = recorded(time, "b", 200)
         assert time.since("ab") == {"a": 0, "b": 0}
         assert time.doubtful("ab") == {"a", "b"}

@@ -22,7 +22,7 @@ from ros2_memory.retention.saved_moments import (
 )
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
-from tests.support.fakes import failing
+from tests.support.fakes import broken
 from tests.support.housekeepers import (
     NOW,
     T0,
@@ -102,7 +102,7 @@ class TestKeeping:
         assert not events(logs, "moment_not_followed")
 
     def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path: Path
     ) -> None:
         made = recording(tmp_path, A, 0)
         house = house_of(tmp_path, moments_bytes=sum(path.stat().st_size for path in made[:3]))
@@ -111,8 +111,7 @@ class TestKeeping:
             return str(kept(house, tmp_path, start, end).refused)
 
         assert "nothing was recorded then" in refusal(500, 600)
-        with monkeypatch.context() as patched:
-            patched.setattr(os, "link", failing(errno.EPERM))
+        with broken(os, "link", errno.EPERM):
             assert "by hard links: Operation not permitted" in refusal(15, 25)
         assert not [*(tmp_path / "moments").glob("*")]
         # A bag that two moments share counts once in the share.
@@ -200,13 +199,12 @@ class TestOpenBags:
 
     @pytest.mark.parametrize("stays_full", [False, True])
     def test_a_disk_that_is_full_when_a_split_closes_costs_nothing_unless_it_stays_so(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, stays_full: bool
+        self, tmp_path: Path, *, stays_full: bool
     ) -> None:
         house, clock = waiting(tmp_path)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
 
-        with monkeypatch.context() as patched, capture_logs() as captured:
-            patched.setattr(os, "link", failing())
+        with broken(os, "link"), capture_logs() as captured:
             for second in (26, 86):
                 clock.at = T0 + second * S
                 house.keep_moments()
@@ -266,9 +264,7 @@ class TestCrashes:
         assert outcome.bags == len(in_moments(tmp_path)) >= 2
         assert len(list(stored_moments_in(tmp_path))) == 1
 
-    def test_a_moment_that_cannot_be_written_holds_up_no_other(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_moment_that_cannot_be_written_holds_up_no_other(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
         clock = SettableClock(T0 + 19 * S)
         house = house_of(tmp_path, clock=clock)

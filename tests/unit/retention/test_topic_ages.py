@@ -5,7 +5,6 @@ import fcntl
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 from structlog.testing import capture_logs
@@ -29,7 +28,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.fakes import failing
+from tests.support.fakes import broken, failing, killed_at
 from tests.support.housekeepers import HOUR, keeper_of, own_all
 from tests.support.memories import reply_over
 from tests.support.simulated_recorders import events
@@ -189,13 +188,9 @@ def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(
     assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
 
 
-def test_what_a_kill_interrupted_is_counted_once(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patched:
-        patched.setattr(McapWriter, "cut", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            house(bag_dir, cutter_of(bag_dir)).apply()
+def test_what_a_kill_interrupted_is_counted_once(bag_dir: Path) -> None:
+    with killed_at(McapWriter, "cut"):
+        house(bag_dir, cutter_of(bag_dir)).apply()
     assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
     house(bag_dir, cutter_of(bag_dir)).apply()
     assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10, 10]
@@ -237,12 +232,11 @@ def test_bags_wait_until_they_are_shipped_and_count_as_shipped_afterwards(
 
 @pytest.mark.parametrize("step", ["receipt", "new name"])
 def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
-    bag_dir: Path, shipped: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    bag_dir: Path, shipped: Path, step: str
 ) -> None:
 
     owner, name = (SHIPPED, "append") if step == "receipt" else (repair, "replace_file")
-    with monkeypatch.context() as patched:
-        patched.setattr(owner, name, failing())
+    with broken(owner, name):
         house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert counts_of(shipped)["/speech"] == 10
     assert is_shipped(shipped)
@@ -253,10 +247,9 @@ def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
 
 
 def test_what_went_stays_written_down_where_the_folder_cannot_be_flushed_afterwards(
-    bag_dir: Path, shipped: Path, monkeypatch: pytest.MonkeyPatch
+    bag_dir: Path, shipped: Path
 ) -> None:
-    with monkeypatch.context() as patched:
-        patched.setattr(repair, "flush", failing(errno.EIO))
+    with broken(repair, "flush", errno.EIO):
         house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert "/speech" not in counts_of(shipped)
     assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]

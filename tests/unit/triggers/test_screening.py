@@ -20,7 +20,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.triggers.screening import ExclusionRule
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.examples import LONG
-from tests.support.fakes import failing
+from tests.support.fakes import broken
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.noting_reader import fail_reading
 from tests.support.screened_bags import (
@@ -195,12 +195,11 @@ def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(bags: Screened
     assert bags.seconds("/map") == [55.0]
 
 
-def test_a_full_disk_holds_splits_back(bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_holds_splits_back(bags: ScreenedBags) -> None:
     name = bags.begin(0)
     split = bags.split(name, [off(-2), on(5), *words(0, 10)])
 
-    with monkeypatch.context() as patched:
-        patched.setattr(McapWriter, "cut", failing())
+    with broken(McapWriter, "cut"):
         bags.end()
         assert bags.served() == []
         problem = bags.screening.problem() or ""
@@ -255,14 +254,13 @@ def test_a_bag_of_others_in_a_recording_is_neither_changed_nor_served(bags: Scre
 
 
 def test_a_state_that_cannot_be_written_or_read_changes_and_serves_nothing(
-    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
+    bags: ScreenedBags,
 ) -> None:
     name = bags.begin(0)
     split = bags.split(name, [off(-2), on(5), *words(0, 10)])
     before = split.read_bytes()
 
-    with monkeypatch.context() as patched:
-        patched.setattr(SCREENED, "write", failing())
+    with broken(SCREENED, "write"):
         with pytest.raises(OSError, match="No space"):
             bags.end()
         with pytest.raises(RecorderError, match=r"screened\.json: No space"):
@@ -356,7 +354,7 @@ EXPECTED = [*halves(0, 4), *halves(14, 24)]
 
 @pytest.mark.parametrize("moment", range(0, POINTS + 1, 1 if LONG else 2))
 def test_a_kill_at_any_point_serves_nothing_unscreened(
-    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch, moment: int
+    bags: ScreenedBags, moment: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     killed = 0
 
