@@ -29,36 +29,24 @@ from ros2_memory.retention.delete import remove_bag
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.bags import McapLayout, odom, write_db3
 from tests.support.fakes import broken, failing
 from tests.support.housekeepers import (
+    HOUR,
     PLENTY,
+    T0,
+    A,
+    S,
+    bag,
     files_in,
     keeper_of,
     later,
+    recording,
     recording_now,
     size_of,
 )
 from tests.support.memories import asked, memory_of
 from tests.support.simulated_recorders import events
-
-S = 10**9
-T0 = 1_790_000_000 * S
-HOUR = 3600 * S
-OWN = "rec_20260921T101320Z"
-
-
-def bag(path: Path, start: int, count: int = 20, layout: McapLayout | None = None) -> Path:
-    times = [T0 + start * S + n * S // 4 for n in range(count)]
-    return write_mcap(path, [odom(time, 1.0, 2.0) for time in times], layout)
-
-
-def recording(bag_dir: Path, name: str, start: int, splits: int = 3) -> list[Path]:
-    """A closed recording as `ros2 bag record` and its supervisor leave it."""
-    made = [bag(bag_dir / name / f"{name}_{n}.mcap", start + n * 10) for n in range(splits)]
-    (bag_dir / name / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
-    (bag_dir / name / "handover.json").write_text('{"format": 1}')
-    return made
 
 
 def receipt(path: Path, bag_dir: Path, more: int = 0) -> Receipt:
@@ -66,8 +54,8 @@ def receipt(path: Path, bag_dir: Path, more: int = 0) -> Receipt:
     return Receipt(name, "id", path.stat().st_size + more, "00", "lake", T0)
 
 
-def left_open(path: Path, start: int = 0, count: int = 20) -> Path:
-    return bag(path, start, count, McapLayout(chunk_size=400, finish=False))
+def left_open(path: Path, start: int = 0) -> Path:
+    return bag(path, start, McapLayout(chunk_size=400, finish=False))
 
 
 def said(keeper: Housekeeping, event: str) -> list[MutableMapping[str, Any]]:
@@ -107,7 +95,7 @@ class TestRetention:
         assert first.exists()
 
     def test_a_bag_dated_after_2262_stops_no_deletion(self, tmp_path: Path) -> None:
-        first, second, _ = recording(tmp_path, "a", 0)
+        first, second, *_ = recording(tmp_path, "a", 0)
         os.utime(second, ns=(T0, 10_413_792_000 * S))
         keeper_of(tmp_path, max_bytes=size_of(tmp_path) - 1).apply()
         assert not first.exists()
@@ -137,7 +125,8 @@ class TestRetention:
     def test_where_bags_must_be_shipped_age_waits_for_the_receipt_of_this_very_bag(
         self, tmp_path: Path
     ) -> None:
-        old, young = recording(tmp_path, "a", 0), recording(tmp_path, "b", 3 * 3600)
+        old = recording(tmp_path, "a", 0, splits=3)
+        young = recording(tmp_path, "b", 3 * 3600)
         keeper = keeper_of(tmp_path, max_age_h=2, require_shipped=True)
         keeper.apply()
         append_receipts(tmp_path, [receipt(old[0], tmp_path), receipt(old[1], tmp_path, more=1)])
@@ -150,7 +139,8 @@ class TestRetention:
         assert keeper.status().unshipped is None
 
     def test_what_the_budget_deletes_unshipped_is_counted_and_named(self, tmp_path: Path) -> None:
-        old, new = recording(tmp_path, "a", 0), recording(tmp_path, "b", 3 * 3600)
+        old = recording(tmp_path, "a", 0, splits=3)
+        new = recording(tmp_path, "b", 3 * 3600)
         append_receipts(tmp_path, [receipt(old[1], tmp_path)])
         budget = size_of(tmp_path) - sum(path.stat().st_size for path in old)
         keeper = keeper_of(tmp_path, max_bytes=budget, max_age_h=2, require_shipped=True)
@@ -321,7 +311,7 @@ class TestInTheBackground:
 def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
     tmp_path: Path,
 ) -> None:
-    paths = recording(tmp_path, "a", 0)
+    paths = recording(tmp_path, "a", 0, splits=3)
     memory = memory_of(tmp_path)
     index = IndexManager(
         tmp_path, memory.reader, memory.clock, refresh_s=10**6, split_duration_s=10.0
@@ -332,11 +322,11 @@ def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
     def ask(tool: str, **given: object) -> Any:
         return asked(memory, tmp_path, tool, start=T0 / S, end=T0 / S + 24.5, **given)
 
-    assert ask("get_topic_in_range", topic="/odom")["total"] == 59
+    assert ask("get_topic_in_range", topic="/odom")["total"] == 25
     for path in paths[:2]:
         path.unlink()
     found = ask("get_topic_in_range", topic="/odom")
-    assert len(found["samples"]) == 19
+    assert len(found["samples"]) == 5
     [gone] = [note for note in found["notes"] if "deleted before" in note]
     assert gone.startswith("2 bags were deleted before they could be read: ")
     assert ask("trajectory_summary")["start"] == T0 / S + 20
@@ -417,10 +407,10 @@ def test_an_interruption_that_comes_while_another_is_written_is_written_too(
 
 
 def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
-    open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
-    empty = tmp_path / OWN / f"{OWN}_1.mcap"
+    open_one = left_open(tmp_path / A / f"{A}_0.mcap")
+    empty = tmp_path / A / f"{A}_1.mcap"
     empty.write_bytes(b"")
-    (tmp_path / OWN / "metadata.yaml").touch()  # as on a disk that was full
+    (tmp_path / A / "metadata.yaml").touch()  # as on a disk that was full
     readable = McapReader().summarize(open_one).topics
     with capture_logs() as captured:
         keeper_of(tmp_path).apply()
@@ -437,7 +427,7 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
 
 
 def test_what_a_full_disk_leaves_unrepaired_is_repaired_when_there_is_room(tmp_path: Path) -> None:
-    open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
+    open_one = left_open(tmp_path / A / f"{A}_0.mcap")
     free = Mock(return_value=1000)
     keeper = keeper_of(tmp_path, measure_free=free)
     with broken(McapWriter, "rewrite"):
@@ -464,7 +454,7 @@ def test_a_recording_of_another_is_left_alone_until_it_lay_still_and_nobody_hold
 
 
 def test_what_cannot_be_repaired_is_reported_once_and_stays(tmp_path: Path) -> None:
-    damaged = tmp_path / OWN / f"{OWN}_0.mcap"
+    damaged = tmp_path / A / f"{A}_0.mcap"
     damaged.parent.mkdir()
     damaged.write_bytes(b"\x89MCAP")
     keeper = keeper_of(tmp_path)
