@@ -24,7 +24,7 @@ from ros2_memory.bag_dir.moment_file import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.columns.database import open_file
-from ros2_memory.config import Settings, load_settings
+from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -74,14 +74,11 @@ def hearing() -> Iterator[list[str]]:
         _heard = None
 
 
-def settings_for(bag_dir: Path, *overrides: str) -> Settings:
-    wanted = ["recorder=none", "storage=rosbag2", "data.now=latest", *overrides]
-    return load_settings(wanted, {"MEMORY_BAG_DIR": str(bag_dir)})
-
-
 @contextmanager
-def asking(bag_dir: Path) -> Iterator[EpisodicServer]:
-    settings = settings_for(bag_dir)
+def asking(bag_dir: Path, *overrides: str) -> Iterator[EpisodicServer]:
+    """A server whose store has all that lies there."""
+    wanted = ["recorder=none", "storage=rosbag2", "data.now=latest", *overrides]
+    settings = load_settings(wanted, {"MEMORY_BAG_DIR": str(bag_dir)})
     memory = build_memory(settings)
     filler = build_backfill(settings, memory)
     for batch in filler.batches():
@@ -115,20 +112,16 @@ def outside(tmp_path: Path) -> Path:
     return folder
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
 @contextmanager
 def untouched(folder: Path) -> Iterator[None]:
     """Nothing below the folder changes in the block."""
-    before = contents(folder)
+
+    def contents() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    before = contents()
     yield
-    assert contents(folder) == before
+    assert contents() == before
 
 
 LINKS: dict[str, Any] = {
@@ -165,12 +158,13 @@ async def test_no_tool_reads_what_a_link_leads_to(bags: Path, outside: Path) -> 
         with hearing() as heard, asking(bags) as server:
             for name, given, _ in ANSWERED:
                 assert SECRET not in await told(server, name, given)
-            for name in ("get_topic_in_range", "get_topic_at_time"):
-                given = {"topic": SECRET, "start": T0_S, "end": T0_S + 9}
-                if name == "get_topic_at_time":
-                    given = {"topic": SECRET, "timestamp": T0_S + 3}
-                assert "secret 1" not in await told(server, name, given)
-            assert "topic_not_recorded" in await told(server, name, given)
+            for name, at in (
+                ("get_topic_in_range", {"start": T0_S, "end": T0_S + 9}),
+                ("get_topic_at_time", {"timestamp": T0_S + 3}),
+            ):
+                answer = await told(server, name, {"topic": SECRET, **at})
+                assert "secret 1" not in answer
+                assert "topic_not_recorded" in answer
         assert [each for each in heard if "outside" in each or "/rec_" in each] == []
 
 
@@ -178,20 +172,16 @@ async def test_a_directory_that_a_link_replaced_since_it_was_listed_is_not_read(
     bags: Path, outside: Path
 ) -> None:
     write_mcap(bags / "rec" / "rec_0.mcap", [text(T0, "own", "/own")])
-    settings = settings_for(bags, "reader.index_refresh_s=1000")
-    memory = build_memory(settings)
-    server = build_server(settings, memory)
-    assert "/own" in await told(server, "list_recorded_topics", {})
-    shutil.rmtree(bags / "rec")
-    (bags / "rec").symlink_to(outside)
-    given = {"topic": SECRET, "start": T0_S, "end": T0_S + 9}
-    with hearing() as heard:
-        assert "secret 1" not in await told(server, "get_topic_in_range", given)
-        given["topic"] = "/own"
-        answer = await told(server, "get_topic_in_range", given)
+    with asking(bags, "reader.index_refresh_s=1000") as server:
+        assert "/own" in await told(server, "list_recorded_topics", {})
+        shutil.rmtree(bags / "rec")
+        (bags / "rec").symlink_to(outside)
+        given = {"topic": SECRET, "start": T0_S, "end": T0_S + 9}
+        with hearing() as heard:
+            assert "secret 1" not in await told(server, "get_topic_in_range", given)
+            answer = await told(server, "get_topic_in_range", given | {"topic": "/own"})
     assert [each for each in heard if "rec_0" in each] == []
     assert "symbolic link" in answer
-    server.dispatcher.stop()
 
 
 @pytest.mark.parametrize("reader", [McapReader, Rosbag2Reader])
@@ -262,21 +252,18 @@ class TestDeletions:
         self, bags: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         write_mcap(bags / "rec" / "rec_0.mcap", [text(T0, "own", "/own")])
-        before, real = contents(outside), os.open
-        done: list[str] = []
+        real, moved = os.open, bags / "moved"
 
-        def swapping(path: Any, flags: int, *rest: Any, **more: Any) -> int:
-            if path == "rec" and not done:
-                done.append(path)
-                (bags / "rec").rename(bags / "moved")
+        def swapping(path: Any, *given: Any, **more: Any) -> int:
+            if path == "rec" and not moved.exists():
+                (bags / "rec").rename(moved)
                 (bags / "rec").symlink_to(outside)
-            return real(path, flags, *rest, **more)
+            return real(path, *given, **more)
 
         monkeypatch.setattr(os, "open", swapping)
-        wiped = clear_bags(bags)
-        assert done
-        assert contents(outside) == before
-        assert len(wiped.faults) == 1
+        with untouched(outside):
+            assert len(clear_bags(bags).faults) == 1
+        assert moved.exists()
 
     def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
         self, bags: Path, outside: Path

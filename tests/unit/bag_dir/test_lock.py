@@ -13,7 +13,7 @@ from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.core.errors import RecorderError
 from tests.faults.small_disk import needs_mounts, small_disk
-from tests.support.fakes import broken, failing
+from tests.support.fakes import broken
 
 
 def held_by(bag_dir: Path, text: str) -> int:
@@ -48,11 +48,9 @@ def test_a_directory_that_cannot_be_written_into_is_refused_with_its_key(tmp_pat
     assert "recording.bag_dir" in refusal(tmp_path / "nowhere")
 
 
-def test_a_full_disk_keeps_nobody_from_taking_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "pwrite", failing())
-    lock = BagDirLock.acquire(tmp_path)
+def test_a_full_disk_keeps_nobody_from_taking_it(tmp_path: Path) -> None:
+    with broken(os, "pwrite"):
+        lock = BagDirLock.acquire(tmp_path)
     assert "left no name" in refusal(tmp_path)
     lock.release()
 

@@ -3,10 +3,10 @@
 They are given as an installed robot has them on its disk, so their formats are tested, too.
 """
 
-import errno
 import os
 import re
 import stat
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 from unittest.mock import Mock, call
@@ -46,6 +46,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.core.spans import united
 from tests.support.examples import examples
+from tests.support.fakes import broken
 from tests.support.log_lines import with_checks
 
 Log: TypeAlias = JsonLog[Any]
@@ -137,18 +138,17 @@ class TestEveryFile:
 
         def fsync(descriptor: int) -> None:
             flushed.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
-            if len(flushed) > 2:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
         monkeypatch.setattr(os, "fsync", fsync)
         replace(file, tmp_path, value)
         written = path.read_text()
         assert flushed == [f".{path.name}.tmp", ".episodic"]
-        with pytest.raises(OSError, match="No space left"):
-            replace(file, tmp_path, value)
-        if isinstance(file, JsonLog):
+        with broken(os, "fsync"):
             with pytest.raises(OSError, match="No space left"):
-                file.append(tmp_path, value * 9)
+                replace(file, tmp_path, value)
+            if isinstance(file, JsonLog):
+                with pytest.raises(OSError, match="No space left"):
+                    file.append(tmp_path, value * 9)
         assert path.read_text() == written
         assert [*path.parent.iterdir()] == [path]
 
@@ -162,14 +162,12 @@ class TestEveryFile:
         (linked / ".episodic").symlink_to(elsewhere.parent)
         (within / ".episodic").mkdir(parents=True)
         (within / file.name).symlink_to(elsewhere)
-        with pytest.raises(OSError, match="symbolic link"):
-            read(file, within)
-        with pytest.raises(OSError, match="symbolic link"):
-            replace(file, linked, value)
-        for bag_dir in (linked, within):
-            if isinstance(file, JsonLog):
-                with pytest.raises(OSError, match="symbolic link"):
-                    file.append(bag_dir, value)
+        ways = [partial(read, file, within), partial(replace, file, linked, value)]
+        if isinstance(file, JsonLog):
+            ways += [partial(file.append, bag_dir, value) for bag_dir in (linked, within)]
+        for way in ways:
+            with pytest.raises(OSError, match="symbolic link"):
+                way()
         assert elsewhere.read_text() == text
         # What is no file at all is told at once, too.
         elsewhere.unlink()
@@ -382,15 +380,13 @@ class TestForgotten:
         whole, last = with_checks("\n".join(FORGOTTEN_ROWS)).splitlines(keepends=True)
         laid(tmp_path, FORGOTTEN, whole + last + last)
         topics, _ = read_forgettings(tmp_path)
-        for length in range(len(last) - 1):
-            laid(tmp_path, FORGOTTEN, whole + last[:length])
-            if last[:length].endswith(
-                ("]}", '"}')
-            ):  # within a name that looks like the end of a line
+        for cut in (last[:length] for length in range(len(last) - 1)):
+            laid(tmp_path, FORGOTTEN, whole + cut)
+            if cut.endswith(("]}", '"}')):  # within a name that looks like the end of a line
                 with pytest.raises(ValueError, match="line 2: it is damaged"):
                     read_forgettings(tmp_path)
-                continue
-            assert read_forgettings(tmp_path) == [topics]
+            else:
+                assert read_forgettings(tmp_path) == [topics]
 
     @pytest.mark.parametrize("at", [0, 1])
     @pytest.mark.parametrize(
