@@ -103,7 +103,7 @@ def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
     plain(tmp_path / "rec_0.mcap", [1, 2], closed=plain_closed)
     plain(tmp_path / "rec_0.mcap.zstd", [1, 2], closed=packed_closed)
     yard.age()
-    snapshot = yard.scan_after()
+    snapshot = yard.index.refresh()
     assert _names(snapshot.bags) == [answers]
     assert snapshot.active == snapshot.damaged == snapshot.unread == ()
 
@@ -184,12 +184,5 @@ def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
     damaged, scanned = events
     assert damaged["event"] == "bag_damaged"
     assert (damaged["reason"], Path(damaged["path"]).name) == ("the file is empty", "rec_1.mcap")
-    assert scanned["event"] == "index_scanned"
-    assert {key: scanned[key] for key in ("bags", "added", "removed", "damaged", "active")} == {
-        "bags": 1,
-        "added": 1,
-        "removed": 0,
-        "damaged": 1,
-        "active": 0,
-    }
-    assert scanned["duration_ms"] >= 0
+    counts = [scanned[key] for key in ("event", "bags", "added", "removed", "damaged", "active")]
+    assert counts == ["index_scanned", 1, 1, 0, 1, 0]

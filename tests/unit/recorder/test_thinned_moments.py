@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ros2_memory.bag_dir.moment_file import Outcome, PendingRequest
+from ros2_memory.bag_dir.moment_file import Outcome
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
+from tests.support import housekeepers
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import own_all
 from tests.support.memories import reply_over
@@ -30,15 +31,10 @@ def window(first: int, stop: int) -> dict[str, float]:
     return {"start": T0_S + 60 * first, "end": T0_S + 60 * stop - 0.1}
 
 
-def saved(keeper: Housekeeping, bag_dir: Path, start: int, end: int, now: int) -> Outcome:
+def saved(keeper: Housekeeping, bag_dir: Path, start: int, end: int) -> Outcome:
     """Asks for the time between so many seconds after `T0`."""
-    pending = PendingRequest(bag_dir, "spilled", T0 + start * S, T0 + end * S, now)
-    pending.post()
-    keeper.keep_moments()
-    outcome = pending.outcome()
-    pending.close()
-    assert outcome is not None
-    return outcome
+    since = (T0 - housekeepers.T0) // S
+    return housekeepers.kept(keeper, bag_dir, since + start, since + end, at=NEWEST)
 
 
 class Bags(NamedTuple):
@@ -62,7 +58,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Bags:
     own_all(folder)
     keeper = house(folder, NEWEST, max_age_h=12, memory=days_of(folder))
     for start, end in ((1205, 1315), (1445, 1500)):
-        assert saved(keeper, folder, start, end, NEWEST).bags == 2
+        assert saved(keeper, folder, start, end).bags == 2
     whole = shutil.copytree(folder, tmp_path_factory.mktemp("whole") / "bags")
     keeper.apply()
     assert not (folder / "rec_A").exists()
@@ -93,7 +89,7 @@ def test_a_moment_answers_its_time_and_the_day_what_is_around_it(bags: Bags) -> 
 
 
 def test_nothing_can_be_saved_of_a_time_of_which_a_thinned_day_alone_is_left(bags: Bags) -> None:
-    assert "deleted" in str(saved(bags.keeper, bags.thinned, 1000, 1030, NEWEST).refused)
+    assert "deleted" in str(saved(bags.keeper, bags.thinned, 1000, 1030).refused)
 
 
 def test_a_moment_that_was_deleted_by_hand_leaves_no_memory_of_its_time(

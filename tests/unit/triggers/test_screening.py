@@ -34,8 +34,7 @@ from tests.support.screened_bags import (
     word,
     words,
 )
-
-VOLATILE = McapLayout(latched=frozenset())
+from tests.support.simulated_recorders import events
 
 
 @pytest.fixture
@@ -86,8 +85,8 @@ def test_a_recording_from_before_is_left_alone(bags: ScreenedBags) -> None:
 
 
 def test_a_topic_that_falls_silent(bags: ScreenedBags) -> None:
-    said = [off(n) for n in range(5)]
-    bags.split(bags.begin(0), [*said, *words(0, 10)], VOLATILE)
+    said = [*map(off, range(5)), *words(0, 10)]
+    bags.split(bags.begin(0), said, McapLayout(latched=frozenset()))
     bags.end()
     assert bags.seconds() == halves(0, 6)
 
@@ -120,27 +119,22 @@ def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected
         return [odom(T0 + n * S, float(n), 0.0) for n in range(begin, stop)]
 
     bags = ScreenedBags(tmp_path / "bags", rule("pose.position.x"))
-    name = bags.begin(0)
-    bags.split(name, [*driven(0, 10), *words(0, 10)])
     with capture_logs() as logs:
-        bags.step()
-        bags.split(name, [*driven(10, 20), *words(10, 20)])
-        bags.end(name)
-        old = bags.begin(20)
-        bags.split(old, [*driven(20, 30), *words(20, 30)])
+        for name, begin in ((bags.begin(0), 0), (bags.begin(1), 10), (bags.begin(20), 20)):
+            bags.split(name, [*driven(begin, begin + 10), *words(begin, begin + 10)])
+            bags.step()
         bags.end()
     assert bags.served() == []
-    assert (
-        "have no field 'pose.position.x'; their fields are: " in bags.screening.failing_rules()[0]
-    )
+    [said] = bags.screening.failing_rules()
+    assert "have no field 'pose.position.x'; their fields are: " in said
     assert "3 splits are not served" in (bags.screening.problem() or "")
-    failed = [each for each in logs if each["event"] == "exclusion_rule_fails"]
     # Every ten minutes; a step is a minute.
-    assert [each["log_level"] for each in failed] == ["error"]
+    [failed] = events(logs, "exclusion_rule_fails")
+    assert failed["log_level"] == "error"
     bags.now_s += 600
     with capture_logs() as logs:
         bags.step()
-    assert [each["event"] for each in logs].count("exclusion_rule_fails") == 1
+    assert len(events(logs, "exclusion_rule_fails")) == 1
     # As the message has it, and as the schema map names it.
     bags.rules = (rule("pose.pose.position.x"),)
     bags.screening = bags.new()
@@ -161,16 +155,11 @@ def test_what_holds_at_the_end_holds_after_a_restart(tmp_path: Path) -> None:
 
 
 def test_latched_messages_from_before_stay(bags: ScreenedBags) -> None:
-    old = bags.begin(0)
-    map_then = off(0)
-    first = [word(1, "/map"), map_then, on(5), word(6, "/map"), *words(0, 10)]
-    bags.split(old, first)
+    old, maps = bags.begin(0), [word(1, "/map"), word(6, "/map")]
+    bags.split(old, [off(0), on(5), *maps, *words(0, 10)])
     new = bags.begin(10)
     bags.end(old)
-    again = [
-        type(each)(each.topic, each.type, T0 + 11 * S, each.body, each.log_time)
-        for each in (word(1, "/map"), word(6, "/map"))
-    ]
+    again = [replace(each, log_time=T0 + 11 * S, publish_time=each.log_time) for each in maps]
     bags.split(new, [*again, on(11, published=5), *words(11, 20)])
     bags.end()
     # Before the first second nothing was known.
