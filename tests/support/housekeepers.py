@@ -157,6 +157,15 @@ def own_all(bag_dir: Path) -> OwnRecordings:
     return own
 
 
+def list_ended(bag_dir: Path, name: str) -> OwnRecordings:
+    """Lists a recording with its splits, as a recorder that was ended as it should leaves it."""
+    own = OwnRecordings(bag_dir)
+    own.begin(name)
+    own.complete(name)
+    own.note(name, {path.name for path in (bag_dir / name).glob("*.mcap")}, ended=True)
+    return own
+
+
 def lines(bag_dir: Path) -> list[dict[str, Any]]:
     """What the list says, line by line, without their checks."""
     rows = [json.loads(line) for line in (bag_dir / LIST_FILE).read_text().splitlines()]

@@ -269,15 +269,6 @@ class TestWithoutAList:
 class TestBags:
     """Which files in a recording are the recorder's."""
 
-    def made(self, bag_dir: Path, name: str, splits: int) -> OwnRecordings:
-        """The list after a recording that was ended as it should."""
-        own = claimed(bag_dir)
-        own.begin(name)
-        files = [embedding(bag_dir / name / f"{name}_{n}.mcap") for n in range(splits)]
-        own.complete(name)
-        own.note(name, {path.name for path in files}, ended=True)
-        return claimed(bag_dir)
-
     def test_a_recorder_notes_each_split(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=40).started(25)
         foreign = embedding(world.recorders[0].directory / "x_0.mcap")

@@ -1,7 +1,6 @@
 """What is kept outlives retention, and counts once."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,10 +9,10 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.model import Sample
 from ros2_memory.history.context import Call
-from ros2_memory.history.view import AtTime, TimeRange
+from ros2_memory.history.view import AtTime
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
@@ -26,6 +25,7 @@ from tests.support.housekeepers import (
     bag,
     house_of,
     kept,
+    list_ended,
     recording,
     size_of,
 )
@@ -33,78 +33,46 @@ from tests.support.memories import memory_of
 
 
 class TestRetention:
-    def test_a_moment_outlives_its_bags_and_answers_as_before(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        young = recording(tmp_path, B, 3 * 3600)
-        house = house_of(tmp_path, max_age_h=1)
-        memory = memory_of(tmp_path, clock=SettableClock(NOW))
-        questions: list[Callable[[], object]] = [
-            lambda: queries.position(memory, Call(), AtTime(at_s=T0 / S + 17)),
-            lambda: queries.topic_range(
-                memory, Call(), "/odom", TimeRange(start_s=T0 / S + 10, end_s=T0 / S + 29)
-            ),
-        ]
-        before = [ask() for ask in questions]
-        kept(house, tmp_path, 15, 25)
-        assert [ask() for ask in questions] == before
-        house.apply()
-        assert not any(path.exists() for path in made)
-        assert not (tmp_path / A).exists()
-        assert [ask() for ask in questions] == before
-        assert all(path.exists() for path in young)
-
     @pytest.mark.parametrize("behind_h", [169, 300])
     def test_a_clock_that_was_behind_deletes_nothing(self, tmp_path: Path, behind_h: int) -> None:
-        own = OwnRecordings(tmp_path)
-        own.claim()
         made = []
         for name, hours in ((A, -150), (B, 0), ("rec_wrong", -behind_h), ("rec_right", 1)):
-            own.begin(name)
-            odometry = [odom(T0 + hours * 3600 * S + n * S, n, 0) for n in range(9)]
-            made.append(write_mcap(tmp_path / name / f"{name}_0.mcap", odometry))
-            own.complete(name)
-            own.note(name, {f"{name}_0.mcap"}, ended=True)
-        clock = SettableClock(T0 + 2 * 3600 * S)
-        house_of(tmp_path, max_age_h=168, clock=clock, keeps_foreign=True).apply()
+            made.append(bag(tmp_path / name / f"{name}_0.mcap", hours * 3600))
+            list_ended(tmp_path, name)
+        house_of(tmp_path, max_age_h=168, keeps_foreign=True).apply()
         assert all(path.exists() for path in made)
-        small = size_of(tmp_path) * 6 // 10
-        house_of(tmp_path, max_bytes=small, clock=clock, keeps_foreign=True).apply()
+        house_of(tmp_path, max_bytes=size_of(tmp_path) * 6 // 10, keeps_foreign=True).apply()
         assert [path.exists() for path in made] == [False, False, True, True]
 
     def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
         self, tmp_path: Path
     ) -> None:
-        def fixed(at: int, x: float) -> None:
-            mounted = transform(at, "base_link", "laser", (x, 0.0, 0.0))
+        for at, x in ((T0 - 100 * S, 0.1), (T0 + 100 * S, 0.2)):
+            mounted = tf(at, transform(at, "base_link", "laser", (x, 0, 0)), topic="/tf_static")
             path = tmp_path / A / f"{A}_{(at - T0) // S}.mcap"
-            write_mcap(path, [odom(at, 0.0, 0.0), tf(at, mounted, topic="/tf_static")])
-
-        fixed(T0 - 100 * S, 0.1)
+            write_mcap(path, [odom(at, 0.0, 0.0), mounted])
         recording(tmp_path, A, 0)
-        fixed(T0 + 100 * S, 0.2)
         recording(tmp_path, B, 3 * 3600)
         house = house_of(tmp_path, max_age_h=1)
         kept(house, tmp_path, 15, 25)
         memory = memory_of(tmp_path, clock=SettableClock(NOW))
 
-        def mounted() -> Sample:
+        def known() -> Sample:
             moment = AtTime(at_s=T0 / S + 17)
             return queries.topic_value(memory, Call(), "/tf_static", moment).sample
 
-        before = mounted()
+        before = known()
         assert "0.1" in str(before.value)
         for _ in range(2):
             house.apply()
-            assert mounted() == before
+            assert known() == before
         assert not (tmp_path / A).exists()
 
     def test_the_sidecar_of_a_recording_that_goes_on_is_followed(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
         house = house_of(tmp_path)
         kept(house, tmp_path, 15, 25)
-        anew = tmp_path / A / "anew"
-        anew.write_text('{"format": 1, "state": "counts", "clock": "publish", "notes": ["x"]}')
-        anew.replace(tmp_path / A / "handover.json")
+        write_handover(tmp_path / A, Handover(notes=("x",)))
         house.apply()
         [sidecar] = (tmp_path / "moments").rglob("handover.json")
         assert sidecar.samefile(tmp_path / A / "handover.json")
