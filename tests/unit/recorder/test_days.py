@@ -273,9 +273,7 @@ def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(bag_dir: Pat
     assert {bag.partition("/")[0] for bag in read_superseded(bag_dir).bags} == {"rec_A", "rec_B"}
 
 
-def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(
-    bag_dir: Path,
-) -> None:
+def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(bag_dir: Path) -> None:
     (bag_dir / "memory").mkdir()
     (bag_dir / DAY_FILE).write_bytes(b"\x89MCAP0\r\nbroken")
     split(bag_dir, 0)

@@ -263,9 +263,7 @@ def test_without_stalls_the_cut_counts_each_once_and_nothing_is_listed(
     assert_union(bag_dir)
 
 
-def test_none_is_settled_while_a_file_that_may_hold_the_messages_is_written(
-    tmp_path: Path,
-) -> None:
+def test_none_is_settled_while_a_file_that_may_hold_the_messages_is_written(tmp_path: Path) -> None:
     published = publications(30)
     old, new = tmp_path / "a", tmp_path / "b"
     Recorder(0, 7.5, splits=(6.0,)).writes(old, published)

@@ -11,15 +11,10 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
-from ros2_memory.bag_dir.moment_file import (
-    stored_moments_in,
-)
+from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention import saved_moments
-from ros2_memory.retention.saved_moments import (
-    LONGEST_WAIT_NS,
-    Share,
-)
+from ros2_memory.retention.saved_moments import LONGEST_WAIT_NS, Share
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
 from tests.support.fakes import broken
@@ -51,16 +46,13 @@ class TestKeeping:
         # Both ends are part of it: each of these bags has one.
         outcome = kept(house_of(tmp_path), tmp_path, 19, 20, "Küche")
         assert (outcome.bags, outcome.pending, outcome.refused) == (2, False, None)
-        folder = tmp_path / "moments" / str(outcome.moment)
-        assert sorted(path.name for path in (folder / A).iterdir()) == [
-            "handover.json",
-            f"{A}_1.mcap",
-            f"{A}_2.mcap",
-        ]
-        assert (folder / A / f"{A}_1.mcap").samefile(made[1])
+        folder = tmp_path / "moments" / str(outcome.moment) / A
+        names = ["handover.json", f"{A}_1.mcap", f"{A}_2.mcap"]
+        assert sorted(path.name for path in folder.iterdir()) == names
+        assert (folder / names[1]).samefile(made[1])
         reported = told_of(tmp_path)
-        assert (reported["label"], reported["complete"], reported["missing"]) == ("Küche", True, [])
-        assert (reported["start_ns"], reported["end_ns"]) == (T0 + 19 * S, T0 + 20 * S)
+        told = [reported[key] for key in ("label", "complete", "missing", "start_ns", "end_ns")]
+        assert told == ["Küche", True, [], T0 + 19 * S, T0 + 20 * S]
         assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
 
     @pytest.mark.parametrize("name", [A, os.fsdecode(b"caf\xe9")])
@@ -70,18 +62,14 @@ class TestKeeping:
         # As `forget`, in another process, deletes beside the recorder.
         made = recording(tmp_path, name, 0)
         house = house_of(tmp_path)
-        pending = asked(tmp_path, 15, 25)
+        asked(tmp_path, 15, 25)
         with house._index.undisturbed() as snapshot:
             made[1].unlink()
             house._moments.keep(snapshot)
-        outcome = pending.outcome()
-        assert outcome is not None
-        assert outcome.bags == 1
         reported = told_of(tmp_path)
-        assert reported["complete"] is False
-        assert reported["missing"] == [
-            f"{name}/{name}_1.mcap is missing, or another file has its name"
-        ]
+        missing = [f"{name}/{name}_1.mcap is missing, or another file has its name"]
+        assert (reported["complete"], reported["missing"]) == (False, missing)
+        assert len(in_moments(tmp_path)) == 1
 
     def test_a_sidecar_that_goes_meanwhile_refuses_no_moment(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -149,8 +137,7 @@ class TestKeeping:
         (tmp_path / "else").mkdir()
         (tmp_path / "bags/moments").symlink_to(tmp_path / "else")
         refused = kept(house_of(tmp_path / "bags"), tmp_path / "bags", 0, 5).refused
-        assert refused is not None
-        assert "symbolic link" in refused
+        assert "symbolic link" in str(refused)
         assert files_in(tmp_path / "else") == []
 
 
@@ -179,10 +166,8 @@ class TestOpenBags:
         bag(tmp_path / A / f"{A}_3.mcap", 30, layout)
         # Another recorder may be the one that goes on with it.
         house_of(tmp_path, clock=now).keep_moments()
-        assert [name.rpartition("/")[2] for name in in_moments(tmp_path)] == [
-            f"{A}_1.mcap",
-            f"{A}_2.mcap",
-        ]
+        names = [name.rpartition("/")[2] for name in in_moments(tmp_path)]
+        assert names == [f"{A}_1.mcap", f"{A}_2.mcap"]
 
     def test_what_passes_the_share_when_it_closes_is_reported_and_not_kept(
         self, tmp_path: Path

@@ -95,14 +95,14 @@ def bag_dir(tmp_path: Path) -> Path:
 def test_answers_say_that_it_was_deleted_and_count_it(bag_dir: Path) -> None:
     house(bag_dir, cutter_of(bag_dir)).apply()
     start = T0 / S
-    reply = reply_over(bag_dir, "get_topic_in_range", topic="/speech", start=start, end=start + 9)
-    assert (reply["error"], reply["reason"]) == ("no_data", "deleted")
-    assert "10 messages deleted by retention (retention.topics): /speech (10)" in reply["notes"]
-    odometry = reply_over(bag_dir, "get_position_at", timestamp=start + 5)
-    assert odometry["x"] == 5.0
-    young = start + 29 * 3600
-    found = reply_over(bag_dir, "get_topic_in_range", topic="/speech", start=young, end=young + 9)
-    assert len(found["samples"]) == 10
+    old, young = (
+        reply_over(bag_dir, "get_topic_in_range", topic="/speech", start=at, end=at + 9)
+        for at in (start, start + 29 * 3600)
+    )
+    assert (old["error"], old["reason"]) == ("no_data", "deleted")
+    assert "10 messages deleted by retention (retention.topics): /speech (10)" in old["notes"]
+    assert reply_over(bag_dir, "get_position_at", timestamp=start + 5)["x"] == 5.0
+    assert len(young["samples"]) == 10
 
 
 def test_messages_that_count_in_another_recording_go_too(bag_dir: Path) -> None:
@@ -169,10 +169,9 @@ def test_a_pass_ends_after_its_time_and_the_next_goes_on(bag_dir: Path) -> None:
 
 
 def test_metadata_counts_what_is_left(bag_dir: Path) -> None:
-    recording = bag_dir / "rec_A"
-    assert correct(recording, McapReader())
+    assert correct(bag_dir / "rec_A", McapReader())
     house(bag_dir, cutter_of(bag_dir)).apply()
-    assert not correct(recording, McapReader()), (recording / "metadata.yaml").read_text()
+    assert not correct(bag_dir / "rec_A", McapReader())
 
 
 def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(
