@@ -5,7 +5,7 @@ import os
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Never
+from typing import Any, Never
 from unittest.mock import patch
 
 import pytest
@@ -32,9 +32,23 @@ def failing(number: int = errno.ENOSPC) -> Callable[..., Never]:
 
 
 @contextmanager
-def broken(owner: object, name: str, number: int = errno.ENOSPC) -> Iterator[None]:
-    """Within the block a function fails, as on a full disk, unless another error is given."""
-    with patch.object(owner, name, failing(number)):
+def broken(
+    owner: object,
+    name: str,
+    number: int = errno.ENOSPC,
+    *,
+    where: Callable[..., bool] = lambda *_: True,
+) -> Iterator[None]:
+    """Within the block a function fails, as on a full disk, unless another error is given.
+
+    Of a function that fails for some arguments alone, `where` tells for which.
+    """
+    work, fails = getattr(owner, name), failing(number)
+
+    def call(*given: Any, **how: Any) -> Any:
+        return (fails if where(*given) else work)(*given, **how)
+
+    with patch.object(owner, name, call):
         yield
 
 

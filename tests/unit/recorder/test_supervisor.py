@@ -81,16 +81,6 @@ class TestRotation:
         world.run(40)
         assert_each_counts_once(world)
 
-    def test_a_rotation_that_cannot_begin_is_tried_again(self, tmp_path: Path) -> None:
-        world = rotating(tmp_path, 19)
-        world.refuse = "no more processes"
-        world.run(4)
-        assert read_handover(world.recorders[0].directory).handover.next is None
-        world.refuse = ""
-        world.run(12)
-        assert len(world.recorders) == 2
-        assert_each_counts_once(world)
-
 
 class TestStop:
     @pytest.mark.parametrize("is_deaf", [False, True])

@@ -4,10 +4,8 @@ import errno
 import os
 import shutil
 import threading
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 from structlog.testing import capture_logs
@@ -119,44 +117,26 @@ class TestDeath:
         assert_what_stands_counts_once(world)
 
 
-class FailingDisk:
-    """Lets whatever asks for the status of some paths fail, as a disk or a server that is gone."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, fails: Callable[[Path], bool]) -> None:
-        self.failing = True
-        stat = os.stat
-
-        def failing(path: Any, **options: Any) -> os.stat_result:
-            if self.failing and isinstance(path, Path) and fails(path):
-                raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
-            return stat(path, **options)
-
-        monkeypatch.setattr(os, "stat", failing)
-
-
 class TestFailingDisk:
-    def test_a_restart_whose_name_cannot_be_looked_up_is_tried_again(
-        self, world: World, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_restart_whose_name_cannot_be_looked_up_is_tried_again(self, world: World) -> None:
         world.recorders[0].die()
-        known = [recorder.directory for recorder in world.recorders]
-        disk = FailingDisk(
-            monkeypatch, lambda path: path.name.startswith("rec_") and path not in known
-        )
-        assert "Input/output error" in world.logged(3, "recorder_not_started")[0]["reason"]
+        known = world.recorders[0].directory
+        with broken(
+            os, "stat", errno.EIO, where=lambda path: "/rec_" in str(path) and path != known
+        ):
+            assert "Input/output error" in world.logged(3, "recorder_not_started")[0]["reason"]
         assert "Input/output error" in world.heartbeat()["last_error"]
-        disk.failing = False
         world.run(10)
         assert world.supervisor.is_recording
 
     def test_a_handover_is_given_up_where_the_new_directory_cannot_be_found_out(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path: Path
     ) -> None:
         world = rotating(tmp_path, 20.75)
         old, new = world.recorders
         new.die()
-        FailingDisk(monkeypatch, lambda path: path == new.directory)
-        assert "Input/output error" in world.logged(1, "rotation_failed")[0]["reason"]
+        with broken(os, "stat", errno.EIO, where=lambda path: path == new.directory):
+            assert "Input/output error" in world.logged(1, "rotation_failed")[0]["reason"]
         assert world.running == [old]
 
     @pytest.mark.parametrize("refused_s", [0.5, 30])
@@ -172,10 +152,17 @@ class TestFailingDisk:
         assert len(world.recorders) > 2
         assert_each_counts_once(world)
 
-    def test_a_rotation_that_was_noted_and_not_flushed_is_tried_again(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("fails", ["its start", "its sidecar's flush"])
+    def test_a_rotation_that_fails_is_tried_again(self, tmp_path: Path, fails: str) -> None:
         world = rotating(tmp_path, 19)
-        with broken(durable_write, "flush", errno.EIO):
-            assert world.logged(3, "rotation_failed")
+        if fails == "its start":
+            world.refuse = "no more processes"
+            world.run(4)
+            assert read_handover(world.recorders[0].directory).handover.next is None
+            world.refuse = ""
+        else:
+            with broken(durable_write, "flush", errno.EIO):
+                assert world.logged(3, "rotation_failed")
         assert len(world.recorders) == 1
         world.run(20)
         assert len(world.recorders) == 2

@@ -47,11 +47,9 @@ def test_silence_does_not_count_for_more_than_a_minute(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     time = RecordedTime(tmp_path)
     time.note(["a"], 0, 0.0, 0)
-    time.note(["b"], 1, 1.0, 0)
-    time.note(["b"], 1, 3000.0, 0)
-    assert time.since(["a"]) == {"a": 1 * S}
-    time.note(["b"], 2, 3600.0, 0)
-    assert time.since(["a"]) == {"a": 61 * S}
+    for written, at_s, since_s in ((1, 1.0, 1), (1, 3000.0, 1), (2, 3600.0, 61)):
+        time.note(["b"], written, at_s, 0)
+        assert time.since(["a"]) == {"a": since_s * S}
 
 
 def test_pauses_do_not_count_and_write_nothing(tmp_path: Path) -> None:
@@ -106,10 +104,8 @@ def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(tmp_path: 
         assert time.since("ab") == {"a": 0, "b": 0}
         assert time.doubtful("ab") == {"a", "b"}
         assert (tmp_path / FILE).read_text() == before
-    assert [each["event"] for each in captured] == [
-        "recorded_time_not_read",
-        "recorded_time_not_kept",
-    ]
+    told = ["recorded_time_not_read", "recorded_time_not_kept"]
+    assert [each["event"] for each in captured] == told
     recorded(time, "c", 100, since_s=end)
     for each in (time, RecordedTime(tmp_path)):
         found = each.since("abc")
