@@ -29,13 +29,11 @@ def test_jobs_of_one_task_run_in_order_and_those_of_another_beside_them() -> Non
 )
 def test_a_fault_stays_until_the_task_succeeds(error: Exception, reason: str) -> None:
     background = Background()
-    background.add("task", Mock(side_effect=error))
-    background.add("other", Mock())
-    background.wait(None)
-    assert background.faults() == {"task": reason}
-    background.add("task", Mock())
-    background.wait(None)
-    assert background.faults() == {}
+    for job, faults in ((Mock(side_effect=error), {"task": reason}), (Mock(), {})):
+        background.add("task", job)
+        background.add("other", Mock())
+        background.wait(None)
+        assert background.faults() == faults
 
 
 def test_what_does_not_end_is_waited_for_no_longer_than_the_patience() -> None:

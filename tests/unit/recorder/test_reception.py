@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import yaml
@@ -51,12 +52,12 @@ def latched_split(path: Path, *topics: str) -> Path:
     return write_mcap(path, messages, McapLayout(latched=frozenset(topics)))
 
 
-def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
-    found: dict[str, dict[str, object]] = yaml.safe_load(of.overrides(recording))
+def profiles(of: Reception, recording: str) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = yaml.safe_load(of.overrides(recording))
     return found
 
 
-def qos(of: Reception, recording: str) -> dict[str, tuple[object, object]]:
+def qos(of: Reception, recording: str) -> dict[str, tuple[str, str]]:
     """Reliability and durability of each topic."""
     asked = profiles(of, recording).items()
     return {topic: (each["reliability"], each["durability"]) for topic, each in asked}
@@ -76,8 +77,7 @@ def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: 
     assert made.rotation_due("a", 0.0) is None
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = rotated(made, "a", 10.0)
-    assert rotation.event == "queues_deepened"
-    assert rotation.topics == {"/odom"}
+    assert (rotation.event, {*rotation.topics}) == ("queues_deepened", {"/odom"})
     assert profiles(made, "b")["/odom"]["depth"] == 200
     made.learn("b", split(tmp_path / "b_0.mcap", 50, 4))
     assert made.rotation_due("b", 1000.0) is None
@@ -95,8 +95,7 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     # The recording that refused it still states what the other publishers offered.
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = rotated(made, "a", 50.0)
-    assert rotation.event == "asking_again"
-    assert rotation.topics == {"/odom"}
+    assert (rotation.event, {*rotation.topics}) == ("asking_again", {"/odom"})
     assert qos(made, "b")["/odom"] == ("best_effort", "volatile")
     made.refused("b", "/odom")
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S - 1) is None
@@ -144,9 +143,8 @@ def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_h
     made.overrides("a")
     made.learn("a", splits[0])
     weaker = TopicFlow(OfferedQos(reliable=False, latched=False, publishers=2), 10, 700)
-    with pytest.MonkeyPatch.context() as patch:
-        measured = measure_split(McapReader(), splits[0])._replace(flows={"/odom": weaker})
-        patch.setattr(reception_module, "measure_split", lambda *_, **__: measured)
+    measured = measure_split(McapReader(), splits[0])._replace(flows={"/odom": weaker})
+    with patch.object(reception_module, "measure_split", return_value=measured):
         made.learn("a", splits[0])
     made.learn("a", splits[1])
     assert profiles(made, "b")["/odom"]["reliability"] == "best_effort"
@@ -260,10 +258,9 @@ def test_no_more_is_asked_for_than_all_publishers_offer(
     assert offered_by_all([text]) == OfferedQos(reliable, latched, len(offers))
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{a: 1}", "- 1", "- [", "text"])
-def test_a_topic_whose_publishers_are_not_stated_gets_no_override(text: str) -> None:
-    assert offered_by_all([text]) is None
-    assert offered_by_all([]) is None
+@pytest.mark.parametrize("texts", [[], [""], ["[]"], ["{a: 1}"], ["- 1"], ["- ["], ["text"]])
+def test_a_topic_whose_publishers_are_not_stated_gets_no_override(texts: list[str]) -> None:
+    assert offered_by_all(texts) is None
 
 
 @given(

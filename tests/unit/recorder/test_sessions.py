@@ -40,6 +40,5 @@ def test_a_closed_split_that_cannot_be_read_is_reported_and_counts_as_closed(
     splits.directory.mkdir()
     (splits.directory / "rec_1_0.mcap").write_bytes(b"a text file of that name")
     changes = splits.observe(0)
-    assert changes.closed == ("rec_1_0.mcap",)
-    assert len(changes.faults) == 1
+    assert (changes.closed, len(changes.faults)) == (("rec_1_0.mcap",), 1)
     assert splits.observe(1) == SplitChanges()

@@ -46,19 +46,6 @@ def halves(begin: int, stop: int) -> list[float]:
     return [n + 0.5 for n in range(begin, stop)]
 
 
-def test_a_split_is_served_when_the_next_one_was_read(bags: ScreenedBags) -> None:
-    name = bags.begin(0)
-    bags.split(name, [off(0), *words(0, 10)])
-    bags.step()
-    assert bags.served() == []
-    bags.split(name, words(10, 20))
-    bags.step()
-    assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
-    bags.end()
-    assert bags.seconds() == halves(0, 20)
-    assert not read_withheld(bags.bag_dir).holds_some(name)
-
-
 def test_what_it_excludes_is_cut_with_its_margin(bags: ScreenedBags) -> None:
     name = bags.begin(0)
     bags.split(name, [off(-3), *words(0, 10)])
