@@ -515,17 +515,12 @@ def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
 def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
     bag_dir: Path,
 ) -> None:
-    class FullAtFirst(McapWriter):
-        def write(self, path: Path, records, **how) -> None:  # type: ignore[no-untyped-def]
-            if bags_left(bag_dir, "rec_*") == 11:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            super().write(path, records, **how)
-
     splits(bag_dir, range(10))
     split(bag_dir, 7200, name="rec_B")
     own_all(bag_dir)
-    memory = days_of(bag_dir, writer=FullAtFirst())
-    with capture_logs() as logs:
+    memory = days_of(bag_dir, writer=(writer := McapWriter()))
+    at_first = broken(writer, "write", where=lambda *_: bags_left(bag_dir, "rec_*") == 11)
+    with at_first, capture_logs() as logs:
         house(bag_dir, T0 + 7300 * S, max_bytes=1, memory=memory).apply()
     assert [log["lost"] for log in logs if log["event"] == "memory_not_kept"] == [2]
     assert bags_left(bag_dir, "rec_*") == 1
