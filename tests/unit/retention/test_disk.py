@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -10,45 +11,25 @@ from ros2_memory.retention.disk import RETRIED_S, FailingFiles, HomeDisk, device
 from tests.support.housekeepers import A, B, keeper_of, recording
 
 
-class Devices:
-    """Says which device lies under a directory."""
-
-    number = 1
-
-    def __call__(self, _directory: Path) -> int:
-        return self.number
-
-
-@pytest.fixture
-def devices() -> Devices:
-    return Devices()
-
-
-@pytest.fixture
-def home(tmp_path: Path, devices: Devices) -> HomeDisk:
-    disk = HomeDisk(tmp_path, devices)
-    disk.remember()
-    return disk
-
-
 def test_a_directory_that_is_not_there_lies_where_it_would_be_made(tmp_path: Path) -> None:
     assert device_of(tmp_path / "a" / "b") == tmp_path.stat().st_dev
     assert device_of(Path("/proc")) != tmp_path.stat().st_dev
 
 
-def test_it_is_known_by_its_recordings_under_another_number(
-    tmp_path: Path, home: HomeDisk, devices: Devices
-) -> None:
+def test_it_is_known_by_its_recordings_under_another_number(tmp_path: Path) -> None:
+    device = Mock(return_value=1)
+    home = HomeDisk(tmp_path, device)
+    home.remember()
     assert not home.is_away(["rec_a"])
-    devices.number = 2
+    device.return_value = 2
     assert home.is_away([])
     (tmp_path / "rec_a").mkdir()
-    devices.number = 3
+    device.return_value = 3
     assert not home.is_away([])
     (tmp_path / "rec_a").rmdir()
     assert not home.is_away([])
     # What is recorded on another disk makes it none of its own.
-    devices.number = 4
+    device.return_value = 4
     assert home.is_away([])
     (tmp_path / "rec_b").mkdir()
     assert home.is_away(["rec_b"])
@@ -56,9 +37,9 @@ def test_it_is_known_by_its_recordings_under_another_number(
 
 def test_a_file_is_given_up_after_a_day_unless_it_was_read_meanwhile() -> None:
     path, fault = Path("a_0.mcap"), BagUnreachableError("a_0.mcap", "Input/output error")
-    hours = [*range(24), 24, 72, 73]
-    files = FailingFiles(iter([hour * RETRIED_S / 24 for hour in hours]).__next__)
-    found = [files.may_recover(path, fault) for _ in hours]
+    clock = Mock(side_effect=[hour * RETRIED_S / 24 for hour in (*range(25), 72, 73)])
+    files = FailingFiles(clock)
+    found = [files.may_recover(path, fault) for _ in range(27)]
     assert found == [True] * 24 + [False, True, True]
     assert not files.may_recover(path, BagError("a_0.mcap", "it is damaged"))
 

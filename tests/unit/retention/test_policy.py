@@ -40,10 +40,13 @@ def bag(
     return StoredBag(f"{recording}/{name}", recording, *span, at, 1, number, size)
 
 
-def another_name(of: StoredBag, file: StoredFile) -> StoredBag:
-    """The bag, if its name led to another file."""
-    device, inode = file.inode
-    return of._replace(device=device, inode=inode, size=file.size)
+def sizes(files: Iterable[StoredFile]) -> dict[tuple[int, int], int]:
+    return {file.inode: file.size for file in files}
+
+
+def bytes_of(bags: Iterable[StoredBag], *others: StoredFile) -> int:
+    """What the files of bags take, and others, each once."""
+    return sum(sizes((*others, *(file for bag in bags for file in bag.files))).values())
 
 
 def contents(
@@ -167,16 +170,9 @@ def without(held: DirContents, deleted: Iterable[StoredBag]) -> DirContents:
     """What lies there after these bags are deleted."""
     gone = {each.path for each in deleted}
     bags = [each for each in held.bags if each.path not in gone]
-    inodes = {file.inode for each in bags for file in each.files}
-    freed = {
-        file.inode: file.size
-        for each in held.bags
-        for file in each.files
-        if file.inode not in inodes
-    }
     free = held.free_bytes
     if free is not None:
-        free += sum(freed.values())
+        free += bytes_of(held.bags) - bytes_of(bags)
     return replace(held, bags=bags, free_bytes=free)
 
 
@@ -202,9 +198,8 @@ class TestAlways:
             assert plan.most_free < limits.min_free_bytes
             assert going == expired(held, replace(limits, min_free_bytes=0))
         assert bool(left.bags) == bool(held.bags)
-        assert any(each.has_dates for each in left.bags) == any(
-            each.has_dates for each in held.bags
-        )
+        dates = [any(each.has_dates for each in some.bags) for some in (left, held)]
+        assert dates[0] == dates[1]
         aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
         if deleted := [each for each in going if each not in aged]:
             spared = [each for each in deleted if each.files != deleted[-1].files]
@@ -267,10 +262,6 @@ class TestAlways:
             assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
 
 
-def sizes(files: Iterable[StoredFile]) -> dict[tuple[int, int], int]:
-    return {file.inode: file.size for file in files}
-
-
 class TestMoments:
     """`kept` are files of moments, which other names of may be deleted."""
 
@@ -294,24 +285,13 @@ class TestMoments:
     def test_what_is_said_of_the_budget_is_what_the_disk_would_show(
         self, drawn: list[tuple[int, int]], kept: set[int], most: int
     ) -> None:
-        def file(inode: int) -> StoredFile:
-            return StoredFile((1, inode), 10 + inode)
-
         bags = [
-            another_name(bag(f"b{n}", NOW - hours * HOUR), file(inode))
+            bag(f"b{n}", NOW - hours * HOUR, size=10 + inode, inode=inode)
             for n, (hours, inode) in enumerate(drawn)
         ]
         limits = replace(LIMITS, max_total_bytes=most)
-        files = tuple(file(inode) for inode in kept)
+        files = [StoredFile((1, inode), 10 + inode) for inode in kept]
         found = plan_deletions(replace(contents(*bags), saved=sizes(files)), limits)
-
-        def shown(left: list[StoredBag]) -> int:
-            return sum({each.inode: each.size for each in (*files, *_files(left))}.values())
-
         left = [each for each in bags if each not in found.to_delete]
-        assert found.total_bytes == shown(bags)
-        assert found.fits == (shown(left) <= most)
-
-
-def _files(bags: list[StoredBag]) -> list[StoredFile]:
-    return [each for bag in bags for each in bag.files]
+        assert found.total_bytes == bytes_of(bags, *files)
+        assert found.fits == (bytes_of(left, *files) <= most)
