@@ -150,8 +150,8 @@ class TestRetention:
             found = (applied["log_level"], applied["bags"], applied["recordings"])
             assert found == ("info", 3, 1)
             [lost] = events(captured, "unshipped_deleted")
-            assert (lost["bags"], lost["names"]) == (2, ["a/a_0.mcap", "a/a_2.mcap"])
-            assert lost["reason"] == keeper.status().unshipped
+            told = (lost["bags"], lost["names"], lost["reason"])
+            assert told == (2, ["a/a_0.mcap", "a/a_2.mcap"], keeper.status().unshipped)
             assert "2 bags were deleted unshipped" in lost["reason"]
         assert all(each.exists() for each in new)
 
@@ -306,8 +306,7 @@ def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
         path.unlink()
     found = ask("get_topic_in_range", topic="/odom")
     assert len(found["samples"]) == 5
-    [gone] = [note for note in found["notes"] if "deleted before" in note]
-    assert gone.startswith("2 bags were deleted before they could be read: ")
+    assert "2 bags were deleted before they could be read: " in str(found["notes"])
     assert ask("trajectory_summary")["start"] == T0 / S + 20
     paths[2].unlink()
     assert ask("get_topic_in_range", topic="/odom")["error"] == "no_data"
@@ -397,9 +396,7 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     assert (after.complete, after.topics) == (True, readable)
     assert not empty.exists()
     (reported,) = events(captured, "bag_repaired")
-    assert reported["path"] == str(open_one)
-    assert reported["messages"] == after.count
-    assert reported["cut_bytes"] >= 0
+    assert (reported["path"], reported["messages"]) == (str(open_one), after.count)
     newest = max(topic.last for topic in after.topics) / 1e9
     assert f"the newest message is of {newest:.3f}; later ones that had not" in reported["reason"]
     assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]

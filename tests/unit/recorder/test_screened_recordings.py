@@ -42,9 +42,7 @@ class TestSessions:
         assert len(names) > 2
         assert not any(read_withheld(tmp_path).holds_some(each) for each in names)
         # Compared when they were released, and not before.
-        assert [read_handover(tmp_path / each).handover.compared for each in sorted(names)[1:]] == [
-            True
-        ] * (len(names) - 1)
+        assert all(read_handover(tmp_path / each).handover.compared for each in sorted(names)[1:])
 
     def test_a_recording_that_cannot_be_held_back_does_not_begin(self, tmp_path: Path) -> None:
         house = keeper_of(tmp_path, screening=ScreenedBags(tmp_path).screening)

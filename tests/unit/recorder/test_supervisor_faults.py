@@ -268,7 +268,7 @@ class TestSpace:
         for after_s, is_past in ((2, False), (18, True)):
             world.run(after_s)
             assert world.heartbeat()["recovered"] is is_past
-        assert "is empty" in str(world.heartbeat()["last_error"])
+        assert "is empty" in world.heartbeat()["last_error"]
         assert len(world.recorders) == 1
 
 
