@@ -1,6 +1,6 @@
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,7 @@ import pytest
 from mcap.writer import Writer
 
 from ros2_memory import queries
-from ros2_memory.core.errors import (
-    InvalidArgumentsError,
-    QueryTimeoutError,
-)
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
@@ -30,6 +27,7 @@ from tests.support.bags import (
     tf,
     transform,
     write_mcap,
+    write_splits,
 )
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import asked, each_way, memory_of
@@ -146,10 +144,8 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
 @each_way
 def test_letters_that_json_escapes_are_found(tmp_path: Path, *, recalls: bool) -> None:
     seen = [json.dumps({"label": label}) for label in ("кружка", "cup", 'the "big" one')]
-    write_mcap(
-        tmp_path / "bag.mcap",
-        [text(BEGIN + n * S, word, topic="/seen") for n, word in enumerate(seen)],
-    )
+    said = [text(BEGIN + n * S, word, topic="/seen") for n, word in enumerate(seen)]
+    write_splits(tmp_path, said)
     memory = memory_of(tmp_path, recalls=recalls)
     for value, at in (("Кружка", 0), ('"big"', 2)):
         for condition_type in ("contains", "contains_word"):
@@ -173,33 +169,36 @@ def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: 
     assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
 
 
+def running_out(ask: Callable[[Call], Any]) -> Iterator[Any]:
+    """What is answered where the clock may be looked at ever more often before the time is over."""
+    for looks in range(1, 60):
+        try:
+            yield ask(Call(Deadline.after(looks, iter(range(10_000)).__next__)))
+        except QueryTimeoutError:
+            yield None
+
+
 def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
     tmp_path: Path,
 ) -> None:
-    bags = 6
-    for nth in range(bags):
-        times = [BEGIN + (nth * 10 + t) * S for t in range(10)]
-        write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(at, True) for at in times])
+    write_splits(tmp_path, [boolean(BEGIN + t * S, True) for t in range(60)])
     memory = memory_of(tmp_path)
     counts = []
-    for looks in range(1, 60, 3):  # how often the clock may be looked at before the time is over
-        call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
-        try:
-            answer = find_matches(memory, call, "/bumper", "equals", value=True)
-        except QueryTimeoutError:
-            continue
-        [sighting] = answer.sightings
-        counts.append(sighting.messages)
-        assert answer.more != sighting.begun
-        assert sighting.begun == (sighting.messages == bags * 10)
-        assert sighting.begun != any("ran out of time" in note for note in answer.notes)
+    for answer in running_out(
+        lambda call: find_matches(memory, call, "/bumper", "equals", value=True)
+    ):
+        if answer is not None:
+            [sighting] = answer.sightings
+            counts.append(sighting.messages)
+            assert answer.more != sighting.begun
+            assert sighting.begun == (sighting.messages == 60)
+            assert sighting.begun != any("ran out of time" in note for note in answer.notes)
     assert counts == sorted(counts)
-    assert counts[0] < bags * 10 == counts[-1]
+    assert counts[0] < 60 == counts[-1]
 
 
 def test_a_search_ends_early_enough_to_say_what_it_found(tmp_path: Path) -> None:
-    for nth in range(20):
-        write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(BEGIN + nth * S, True)])
+    write_splits(tmp_path, [boolean(BEGIN + t * S, True) for t in range(20)], 1)
     # A clock that goes on by 0.1 s at each look.
     call = Call(Deadline.after(4, (look / 10 for look in range(1000)).__next__))
     answer = find_matches(memory_of(tmp_path), call, "/bumper", "equals", value=True)
@@ -210,29 +209,22 @@ def test_a_search_ends_early_enough_to_say_what_it_found(tmp_path: Path) -> None
 def test_spells_whose_ends_are_known_count_where_there_is_no_time_to_look_for_all(
     tmp_path: Path,
 ) -> None:
-    spells = 6
-    for nth in range(spells):
-        times = [BEGIN + (nth * 10 + t) * S for t in range(10)]
-        driven = [odom(at, float(at // S % 10), 0.0) for at in times]
-        moods = [text(at + 1, "calm", topic="/mood") for at in times]
-        write_mcap(tmp_path / f"bag_{nth}.mcap", [*driven, *moods])
+    times = [BEGIN + t * S for t in range(60)]
+    driven = [odom(at, float(at // S % 10), 0.0) for at in times]
+    write_splits(tmp_path, [*driven, *(text(at + 1, "calm", topic="/mood") for at in times)])
     memory = memory_of(tmp_path)
     calm = [WhileCondition("/mood", "equals", "calm")]
     answered: list[bool] = []
-    for looks in range(1, 60):  # how often the clock may be looked at before the time is over
-        call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
-        try:
-            answer = count_matches(
-                memory, call, "/odom", "above", 5.5, by="hour", field="position.x", during=calm
-            )
-        except QueryTimeoutError:
-            answered.append(False)
-            continue
-        answered.append(True)
-        whole = table(as_json(answer, tmp_path))["all"]
-        assert whole["seconds"] == whole["count"] * 4 - 1
-        is_whole = whole["count"] == spells
-        assert is_whole != any("out of time" in note for note in answer.notes)
+    for answer in running_out(
+        lambda call: count_matches(
+            memory, call, "/odom", "above", 5.5, by="hour", field="position.x", during=calm
+        )
+    ):
+        answered.append(answer is not None)
+        if answer is not None:
+            whole = table(as_json(answer, tmp_path))["all"]
+            assert whole["seconds"] == whole["count"] * 4 - 1
+            assert (whole["count"] == 6) != any("out of time" in note for note in answer.notes)
     # Once no time was left for the end of the newest one.
     assert answered[answered.index(True) :].count(False) <= 1
 
@@ -240,24 +232,19 @@ def test_spells_whose_ends_are_known_count_where_there_is_no_time_to_look_for_al
 def test_a_damaged_bag_between_the_oldest_sightings_is_noted_where_time_is_over(
     tmp_path: Path,
 ) -> None:
-    for nth in range(6):
-        times = [BEGIN + (nth * 10 + t) * S for t in range(10)]
-        write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(at, at < times[5]) for at in times])
-    bag = tmp_path / "bag_3.mcap"
+    write_splits(tmp_path, [boolean(BEGIN + t * S, t % 10 < 5) for t in range(60)])
+    bag = tmp_path / "rec" / "rec_3.mcap"
     data = bytearray(bag.read_bytes())
     data[200] ^= 0xFF
     bag.write_bytes(data)
     memory = memory_of(tmp_path)
     spanned = 0
-    for looks in range(1, 60):  # how often the clock may be looked at before the time is over
-        call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
-        try:
-            answer = find_matches(
-                memory, call, "/bumper", "equals", value=True, oldest_first=True, limit=2
-            )
-        except QueryTimeoutError:
-            continue
-        if answer.sightings[0].first < BEGIN + 30 * S:
+    for answer in running_out(
+        lambda call: find_matches(
+            memory, call, "/bumper", "equals", value=True, oldest_first=True, limit=2
+        )
+    ):
+        if answer is not None and answer.sightings[0].first < BEGIN + 30 * S:
             assert any("damaged" in note for note in answer.notes)
             spanned += any("ran out of time" in note for note in answer.notes)
     assert spanned
@@ -278,9 +265,9 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
     assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
     slow = find_matches(memory, Call(), "/rosout", "contains", "lo", oldest_first=True, limit=2)
-    assert [((each.first - BEGIN) / S, each.messages) for each in slow.sightings] == [
-        (1, 1),
-        (2, 1),
+    assert [(each.first, each.messages) for each in slow.sightings] == [
+        (BEGIN + S, 1),
+        (BEGIN + 2 * S, 1),
     ]
     assert slow.total == 3
 
