@@ -169,52 +169,33 @@ def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("days", "hours", "expected"),
+    ("zone", "month", "days", "hours", "expected"),
     [
-        ((25, 26), "02:15-02:45", ["02:15-02:45", "02:15-02:45"]),
-        ((25, 26), "01:00-02:30", ["01:00-02:30", "02:00-02:30"]),
-        ((25, 26), "02:15-04:00", ["02:15-02:00", "02:15-04:00"]),
-        ((25, 26), "01:00-04:00", ["01:00-04:00"]),
-        ((25, 26), "03:00-02:30", ["00:00-02:30", "02:00-02:30", "03:00-00:00"]),
+        ("Europe/Berlin", 10, (25, 26), "02:15-02:45", "02:15-02:45 02:15-02:45"),
+        ("Europe/Berlin", 10, (25, 26), "01:00-02:30", "01:00-02:30 02:00-02:30"),
+        ("Europe/Berlin", 10, (25, 26), "02:15-04:00", "02:15-02:00 02:15-04:00"),
+        ("Europe/Berlin", 10, (25, 26), "01:00-04:00", "01:00-04:00"),
+        ("Europe/Berlin", 10, (25, 26), "03:00-02:30", "00:00-02:30 02:00-02:30 03:00-00:00"),
+        (
+            *("Europe/Berlin", 3, (28, 31), "22:00-04:00"),
+            "00:00-04:00 22:00-04:00 22:00-04:00 22:00-00:00",
+        ),
+        ("Europe/Berlin", 3, (29, 30), "02:30-03:30", "03:00-03:30"),
+        ("Europe/Berlin", 3, (29, 30), "01:30-02:15", "01:30-03:00"),
+        ("Europe/Berlin", 3, (29, 30), "02:10-02:50", ""),
+        ("Europe/Berlin", 3, (29, 30), "03:00-02:30", "00:00-03:00 03:00-00:00"),
+        ("Europe/Berlin", 3, (29, 30), "22:00-24:00", "22:00-00:00"),
+        ("Europe/Berlin", 3, (29, 30), "00:00 - 24:00", "00:00-00:00"),
+        # Days that begin in an hour that clocks repeat.
+        (
+            *("Atlantic/Azores", 10, (25, 26), "00:30-00:30"),
+            "00:00-00:30 00:30-00:00 00:00-00:30 00:30-00:00",
+        ),
     ],
 )
-def test_hours_that_clocks_repeat_count_twice(
-    days: tuple[int, int], hours: str, expected: list[str]
+def test_hours_that_clocks_repeat_count_twice_and_those_that_they_skip_are_left_out(
+    zone: str, month: int, days: tuple[int, int], hours: str, expected: str
 ) -> None:
-    assert local_hours(10, days, hours) == expected
-
-
-@pytest.mark.parametrize(
-    ("days", "hours", "expected"),
-    [
-        ((28, 31), "22:00-04:00", ["00:00-04:00", "22:00-04:00", "22:00-04:00", "22:00-00:00"]),
-        ((29, 30), "02:30-03:30", ["03:00-03:30"]),
-        ((29, 30), "01:30-02:15", ["01:30-03:00"]),
-        ((29, 30), "02:10-02:50", []),
-        ((29, 30), "03:00-02:30", ["00:00-03:00", "03:00-00:00"]),
-        ((29, 30), "22:00-24:00", ["22:00-00:00"]),
-        ((29, 30), "00:00 - 24:00", ["00:00-00:00"]),
-    ],
-)
-def test_hours_are_local_and_those_that_clocks_skip_are_left_out(
-    days: tuple[int, int], hours: str, expected: list[str]
-) -> None:
-    assert local_hours(3, days, hours) == expected
-
-
-def test_all_hours_of_days_that_begin_in_an_hour_that_clocks_repeat_are_in_order() -> None:
-    assert local_hours(10, (25, 26), "00:30-00:30", "Atlantic/Azores") == [
-        "00:00-00:30",
-        "00:30-00:00",
-        "00:00-00:30",
-        "00:30-00:00",
-    ]
-
-
-def local_hours(
-    month: int, days: tuple[int, int], hours: str, zone: str = "Europe/Berlin"
-) -> list[str]:
-    """What lies between two local times, from the begin of one day to that of another one."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("TZ", zone)
         time.tzset()
@@ -227,4 +208,4 @@ def local_hours(
             for each in found
         ]
     time.tzset()
-    return shown
+    assert " ".join(shown) == expected
