@@ -1,6 +1,10 @@
-"""A lake answers as the bags do about robots that have little in common; and so does SQL."""
+"""A lake answers as the bags do about robots that have little in common; and so does SQL.
+
+So do a lake and a robot that have some of the bags each.
+"""
 
 import re
+import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -10,9 +14,14 @@ from typing import Any, NamedTuple
 import pytest
 from pyiceberg.expressions import AlwaysTrue
 
+from ros2_memory.columns.scanner import Scanner
+from ros2_memory.core.memo import Memo
 from ros2_memory.core.timebase import iso_local
+from ros2_memory.fleet.joined import JoinedIndex
 from ros2_memory.fleet.robots import Fleet
+from ros2_memory.history.context import Memory
 from ros2_memory.lake.engine import Lake
+from ros2_memory.lake.memory import LakeReader
 from ros2_memory.lake.shipper import Shipped
 from tests.support.bags import text, write_mcap
 from tests.support.clocks import FixedClock
@@ -88,18 +97,18 @@ def _begin_s(name: str) -> float:
     return (BEGIN - (YEAR_NS if name == "behind" else 0)) / S
 
 
+def about(world: World, name: str) -> list[Question]:
+    rows = reply(world.mounted, "list_recorded_topics", {"robot": name})
+    topics, begin_s = sorted({row["topic"] for row in rows}), _begin_s(name)
+    some = every_question(topics, begin_s, begin_s + LENGTH_S, SEEN[name], "/vision/*/*")
+    return [(tool, {**given, "robot": name}) for tool, given in some]
+
+
 def test_every_question_is_answered_by_a_lake_as_by_the_bags_or_refused(world: World) -> None:
     """Eight at once, and twice in one process."""
-    asked: list[Question] = []
-    for name in ROBOTS:
-        rows = reply(world.mounted, "list_recorded_topics", {"robot": name})
-        topics, begin_s = sorted({row["topic"] for row in rows}), _begin_s(name)
-        some = every_question(topics, begin_s, begin_s + LENGTH_S, SEEN[name], "/vision/*/*")
-        for tool, given in some:
-            asked += [
-                (tool, {**given, "robot": name}),
-                *([(tool, given)] if name == "twin" else []),
-            ]
+    asked = [question for name in ROBOTS for question in about(world, name)]
+    for tool, given in about(world, "twin"):
+        asked.append((tool, {key: value for key, value in given.items() if key != "robot"}))
     expected = [reply(world.mounted, *question) for question in asked]
     answered = {tool for (tool, _), own in zip(asked, expected, strict=True) if "error" not in own}
     assert answered == tools_of(world.mounted).keys() - OF_DIRECTORIES
@@ -113,6 +122,54 @@ def test_every_question_is_answered_by_a_lake_as_by_the_bags_or_refused(world: W
             else:
                 assert answer == own, question
         assert refused == {("twin", "/left/image"), ("twin", "/right/image")}
+
+
+@pytest.fixture(scope="module")
+def joined(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    """The robots over a lake that has some of their bags, and over the others.
+
+    Of two of them the lake has the older ones, of the others every second one.
+    """
+    half, names = tmp_path_factory.mktemp("half"), ("behind", "diver", "lost", "twin")
+    for name in names:
+        bag_dir = world.mounted.robots[name].memory.index.bag_dir
+        bags = sorted(bag_dir.rglob("*.mcap"))
+        shipped = bags[:3] if name in {"behind", "twin"} else bags[::2]
+        for bag in bags:
+            share = half / ("lake" if bag in shipped else "own")
+            copy = share / name / bag.relative_to(bag_dir)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(bag, copy)
+    ship(half / "rows", [robot_bags(name, half / "lake" / name) for name in names], most_bags=100)
+    with location(half / "rows").opened() as catalog:
+        lake = Lake(catalog, memory_mb=256, threads=1)
+        of_lake = lake_robots(lake, names, now=NOW, bag_dirs=half / "own")
+        own = {name: memory_of(half / "own" / name, clock=FixedClock(NOW)) for name in names}
+        both = {name: joined_memory(of_lake[name], own[name]) for name in names}
+        yield fleet_of(both, shared_map=True, now=NOW)
+
+
+def joined_memory(of_lake: Memory, own: Memory) -> Memory:
+    index = JoinedIndex(of_lake.index, own.index)
+    assert isinstance(of_lake.reader, LakeReader)
+    reader = replace(of_lake.reader, own=own.reader)
+    scanner = Scanner(None, index.bag_dir)
+    return replace(own, index=index, reader=reader, scanner=scanner, memo=Memo())
+
+
+def test_every_question_is_answered_by_two_shares_as_by_the_whole_or_refused(
+    world: World, joined: Fleet
+) -> None:
+    answered = 0
+    for name in joined.robots:
+        for question in about(world, name):
+            found = reply(joined, *question)
+            if "error" in found and found["error"] == "not_in_lake":
+                assert str(question[1]["topic"]).endswith("/image")
+            else:
+                assert found == reply(world.mounted, *question), question
+                answered += 1
+    assert answered > 50 * len(joined.robots)
 
 
 def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
