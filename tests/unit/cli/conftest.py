@@ -3,7 +3,7 @@
 import os
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -11,9 +11,22 @@ import pytest
 
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.columns.pack import decompressed
-from tests.support.program import exits
+from tests.support.program import Printed, Program, exits
 
 __all__ = ["exits"]
+
+Forget = Callable[..., Printed]
+
+
+@pytest.fixture
+def forget(exits: Program) -> Forget:
+    """`ros2-memory forget`, from and to so many seconds after 1,700,000,000."""
+
+    def run(code: int, first: float, last: float, words: str = "--yes") -> Printed:
+        window = f"--start {1_700_000_000 + first} --end {1_700_000_000 + last}"
+        return exits(code, f"forget {window} {words}")
+
+    return run
 
 
 def left(path: Path) -> Path:

@@ -1,16 +1,15 @@
 """`ros2-memory doctor`: every fault has a finding that says what to do, and an exit code."""
 
-from __future__ import annotations
-
 import os
 import re
 import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from mcap.writer import Writer
@@ -22,14 +21,10 @@ from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import heartbeats, stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.mcap_surgery import raw_mcap
+from tests.support.program import Program
 from tests.unit.cli.conftest import left
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from tests.support.program import Program
-
-    Examined = Callable[..., dict[str, list[dict[str, str]]]]
+Examined = Callable[..., dict[str, list[dict[str, str]]]]
 
 
 class Answering(BaseHTTPRequestHandler):

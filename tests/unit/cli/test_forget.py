@@ -1,14 +1,12 @@
 """`ros2-memory forget`: deletes what lies in a window, and nothing else."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json
 import os
 import shutil
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 import yaml
@@ -23,15 +21,8 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
 from tests.support.housekeepers import described, embedding, made_moment, own_all
-from tests.unit.cli.conftest import columns_in, left, locked
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.support.program import Printed, Program
-
-    Forget = Callable[..., Printed]
+from tests.support.program import Program
+from tests.unit.cli.conftest import Forget, columns_in, left, locked
 
 T0 = 1_700_000_000 * NS_PER_S
 
@@ -51,17 +42,6 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
     return tmp_path
-
-
-@pytest.fixture
-def forget(exits: Program) -> Forget:
-    """`ros2-memory forget`, from and to so many seconds after the first message."""
-
-    def run(code: int, first: float, last: float, words: str = "--yes") -> Printed:
-        start, end = T0 / NS_PER_S + first, T0 / NS_PER_S + last
-        return exits(code, f"forget --start {start} --end {end} {words}")
-
-    return run
 
 
 def bags(bag_dir: Path) -> list[str]:

@@ -12,7 +12,7 @@ import sqlite3
 import subprocess
 from collections import Counter
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import Reader
 
-from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import message_id
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -45,13 +44,14 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import described, made_moment, own_all
-from tests.unit.cli.conftest import columns_in, left, locked
+from tests.support.program import Program
+from tests.unit.cli.conftest import Forget, columns_in, left, locked
 
 S = NS_PER_S
 T0 = 1_700_000_000 * S
 SAID = "open-the-bathroom-door"
 CAMERA, MIC = "/camera/front", "/mic"
-Capture = pytest.CaptureFixture[str]
+OF_CAMERA = f"--yes --topic {CAMERA}"
 Stored = tuple[str, str, int, bytes]
 
 
@@ -95,11 +95,6 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     recorded(bag_dir)
     own_all(bag_dir)
     return bag_dir
-
-
-def forget(first: float, last: float, words: str = f"--topic {CAMERA}") -> int:
-    start, end = T0 / S + first, T0 / S + last
-    return cli.main(f"forget --start {start} --end {end} --yes {words}".split())
 
 
 def stored(recording: Path) -> list[Stored]:
@@ -149,19 +144,15 @@ def traces(root: Path, needle: str) -> list[str]:
     return found
 
 
-def indexed() -> None:
-    assert cli.main(["index"]) == 0
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_what_is_not_forgotten_stays_to_the_byte(
-    tmp_path: Path, bag_dir: Path, layout: str
+    bag_dir: Path, forget: Forget, layout: str
 ) -> None:
     splits = recorded(bag_dir, LAYOUTS[layout])
     before = stored(bag_dir / "rec_a")
     full = [whole(each) for each in splits]
     untouched = splits[2].read_bytes()
-    assert forget(3.5, 15.5, "--topic /camera/*") == 0
+    forget(0, 3.5, 15.5, "--yes --topic /camera/*")
     bounds = (T0 + 3.5 * S, T0 + 15.5 * S)
     expected = [e for e in before if e[0] != CAMERA or not bounds[0] <= e[2] <= bounds[1]]
     assert len(before) - len(expected) == 12
@@ -173,22 +164,22 @@ def test_what_is_not_forgotten_stays_to_the_byte(
 
 
 def test_nothing_of_it_is_left_anywhere(
-    tmp_path: Path, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
-    indexed()
+    exits(0, "index")
     assert f"{OWN_FOLDER}/{FILE}" in " ".join(traces(tmp_path, SAID))
     # A query server has the file open, so that its log lies beside it.
     with closing(sqlite3.connect(bag_dir / OWN_FOLDER / FILE)) as server:
         server.execute("SELECT count(*) FROM bag").fetchone()
-        assert forget(0, 100) == 0
+        forget(0, 0, 100, OF_CAMERA)
         assert traces(tmp_path, SAID) == []
-    indexed()
+    exits(0, "index")
     assert traces(tmp_path, SAID) == []
     assert not [*bag_dir.rglob("*.repair"), *bag_dir.rglob("*.tmp")]
 
 
 def test_a_moment_that_is_kept_meanwhile_follows(
-    tmp_path: Path, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, bag_dir: Path, forget: Forget, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = bag_dir / "rec_a" / "rec_a_1.mcap"
     link = bag_dir / "moments" / "20260101T000000Z-dance" / "rec_a" / source.name
@@ -204,23 +195,23 @@ def test_a_moment_that_is_kept_meanwhile_follows(
         return taken
 
     monkeypatch.setattr(McapWriter, "cut", slow_cut)
-    assert forget(0, 100) == 0
+    forget(0, 0, 100, OF_CAMERA)
     assert link.samefile(source)
     assert traces(tmp_path, SAID) == []
 
 
 def test_a_hard_link_elsewhere_is_named_and_holds_nothing_up(
-    tmp_path: Path, bag_dir: Path, capsys: Capture
+    tmp_path: Path, bag_dir: Path, forget: Forget
 ) -> None:
     os.link(bag_dir / "rec_a" / "rec_a_1.mcap", tmp_path / "copy.mcap")
-    assert forget(0, 100) == 1
-    assert "rec_a_1.mcap: all of it is still in 1 more hard link of it" in capsys.readouterr().out
+    shown = forget(1, 0, 100, OF_CAMERA).out
+    assert "rec_a_1.mcap: all of it is still in 1 more hard link of it" in shown
     assert traces(bag_dir, SAID) == []
     # While it is there, no bag is shipped, none leaves a day, and no topic is cut out of one.
     assert ERASING.read(bag_dir) is None
 
 
-def test_sidecars_follow(bag_dir: Path) -> None:
+def test_sidecars_follow(bag_dir: Path, forget: Forget) -> None:
     going, staying = messages(1)[2], messages(1)[0]
     assert going.topic == CAMERA
     ids = {each.topic: [message_id(each.published, each.payload)] for each in (going, staying)}
@@ -229,7 +220,7 @@ def test_sidecars_follow(bag_dir: Path) -> None:
     sidecar.write_text(json.dumps({"format": 1, "state": "counts", "counts_elsewhere": listed}))
     left(sidecar)
     written = sidecar.stat().st_mtime_ns
-    assert forget(9.5, 15) == 0
+    forget(0, 9.5, 15, OF_CAMERA)
     told = json.loads(sidecar.read_text())["counts_elsewhere"]
     assert told == {
         "rec_a_1.mcap": {staying.topic: ids[staying.topic]},
@@ -238,42 +229,43 @@ def test_sidecars_follow(bag_dir: Path) -> None:
     assert sidecar.stat().st_mtime_ns == written
 
 
-def test_answers_say_that_messages_were_deleted(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(2.5, 4.5) == 0
+def test_answers_say_that_messages_were_deleted(
+    bag_dir: Path, forget: Forget, exits: Program
+) -> None:
+    forget(0, 2.5, 4.5, OF_CAMERA)
     losses = read_losses(bag_dir, MIN_NS, MAX_NS)
     assert [(each.topic, each.lost, each.by) for each in losses] == [(CAMERA, 2, "forgotten")]
-    capsys.readouterr()
     window = f"start={T0 / S} end={T0 / S + 8}"
-    cli.main(f"ask get_topic_in_range topic={CAMERA} {window} --json".split())
-    assert f"2 messages deleted by request: {CAMERA} (2)" in capsys.readouterr().out
+    shown = exits(0, f"ask get_topic_in_range topic={CAMERA} {window} --json").out
+    assert f"2 messages deleted by request: {CAMERA} (2)" in shown
 
 
 def test_carried_messages_follow_where_their_topic_is_named_unless_a_recorder_has_them(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, forget: Forget
 ) -> None:
-    assert forget(-1, 9.9, "") == 0
+    forget(0, -1, 9.9)
     carried = bag_dir / "latched" / "carried.mcap"
     with locked(bag_dir):
-        assert forget(-1, 100, "--topic /tf_static") == 1
-    assert "stays: /tf_static: latched messages, which the recorder" in capsys.readouterr().out
+        shown = forget(1, -1, 100, "--yes --topic /tf_static").out
+    assert "stays: /tf_static: latched messages, which the recorder" in shown
     assert carried.exists()
-    assert forget(-1, 100, "--topic /tf_static") == 0
+    forget(0, -1, 100, "--yes --topic /tf_static")
     assert not carried.exists()
     assert traces(bag_dir, "laser") == []
 
 
-def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> None:
+def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path, forget: Forget) -> None:
     mount = transform(T0, "base_link", "laser", (0.1, 0.0, 0.2))
     again = tf(T0, mount, topic="/tf_static", log_time=T0 + 50 * S)
     again = Msg(again.topic, again.type, again.log_time, again.body, publish_time=T0)
     left(write_mcap(bag_dir / "rec_b" / "rec_b_0.mcap", [again, odom(T0 + 51 * S, 0.0, 0.0)]))
     own_all(bag_dir)
-    assert forget(-1, 5, "--topic /tf_static") == 0
+    forget(0, -1, 5, "--yes --topic /tf_static")
     assert traces(bag_dir, "laser") == []
 
 
 def test_what_cannot_be_rewritten_stays_as_it_is_and_is_named_with_the_reason(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, forget: Forget
 ) -> None:
     recording = bag_dir / "rec_a"
     damaged = recording / "rec_a_1.mcap"
@@ -287,10 +279,9 @@ def test_what_cannot_be_rewritten_stays_as_it_is_and_is_named_with_the_reason(
     os.truncate(recording / "rec_a_4.mcap", 0)
     for kind in ("MCAP", "db3"):
         (recording / f"rec_a_5.{kind}").write_bytes(b"any")
-    assert forget(0, 100) == 1
     told = dict(
         line.removeprefix("stays: rec_a/rec_a_").split(": ", 1)
-        for line in capsys.readouterr().out.splitlines()
+        for line in forget(1, 0, 100, OF_CAMERA).out.splitlines()
         if line.startswith("stays: ")
     )
     for name, reason in (
@@ -305,21 +296,20 @@ def test_what_cannot_be_rewritten_stays_as_it_is_and_is_named_with_the_reason(
 
 
 def test_what_is_being_written_is_named_wherever_its_times_are(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, forget: Forget
 ) -> None:
     names = ("rec_20990101T000000Z/rec_20990101T000000Z_0.mcap", "copied/copied_0.db3")
     layout = McapLayout(finish=False, chunk_size=2048)
     write_mcap(bag_dir / names[0], messages(3), layout)
     write_db3(bag_dir / names[1], messages(3))
     own_all(bag_dir)
-    for more in (f"--topic {CAMERA}", ""):
-        assert forget(30, 40, f"{more} storage=rosbag2") == 1
-        shown = capsys.readouterr().out
+    for words in (OF_CAMERA, "--yes"):
+        shown = forget(1, 30, 40, f"{words} storage=rosbag2").out
         assert all(f"stays: {name}: " in shown for name in names)
-        assert forget(10, 19.9, f"{more} storage=rosbag2") == 0  # it begins later
+        forget(0, 10, 19.9, f"{words} storage=rosbag2")  # it begins later
 
 
-def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
+def test_sqlite_bags_are_written_anew(bag_dir: Path, forget: Forget) -> None:
     path = left(write_db3(bag_dir / "rec_s" / "rec_s_0.db3", messages(0)))
     own_all(bag_dir)
     with closing(sqlite3.connect(path)) as base:
@@ -328,7 +318,7 @@ def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
         every = "SELECT * FROM messages ORDER BY id"
         before = base.execute(every).fetchall()
     left(path)
-    assert forget(3.5, 100, f"--topic {CAMERA} storage=rosbag2") == 0
+    forget(0, 3.5, 100, f"{OF_CAMERA} storage=rosbag2")
     with closing(sqlite3.connect(path)) as base:
         (number,) = base.execute("SELECT id FROM topics WHERE name = ?", (CAMERA,)).fetchone()
         rest = [each for each in before if each[1] != number or each[2] < T0 + 3.5 * S]
@@ -347,7 +337,9 @@ def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
     ],
     ids=["empty log", "name of other bytes"],
 )
-def test_sqlite_bags_that_are_read_are_written_anew(bag_dir: Path, statement: str) -> None:
+def test_sqlite_bags_that_are_read_are_written_anew(
+    bag_dir: Path, forget: Forget, statement: str
+) -> None:
     path = write_db3(bag_dir / "rec_s" / "rec_s_0.db3", messages(0))
     with closing(sqlite3.connect(path)) as base:
         base.execute(statement)
@@ -356,13 +348,13 @@ def test_sqlite_bags_that_are_read_are_written_anew(bag_dir: Path, statement: st
         base.execute("SELECT id FROM topics").fetchall()
     left(path)
     own_all(bag_dir)
-    assert forget(0, 100, f"--topic {CAMERA} storage=rosbag2") == 0
+    forget(0, 0, 100, f"{OF_CAMERA} storage=rosbag2")
     assert SAID.encode() not in path.read_bytes()
     assert b"hum 9" in path.read_bytes()
 
 
 def test_the_time_in_a_place_goes_with_a_second_on_either_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget, exits: Program
 ) -> None:
     """The robot drives along X at 1 m/s; the bathroom is from 3 m to 5 m."""
     home, places = tmp_path / "home", tmp_path / "places.yaml"
@@ -377,9 +369,9 @@ def test_the_time_in_a_place_goes_with_a_second_on_either_side(
     monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    indexed()
-    assert forget(0, 100, f"--where bathroom data.places_file={places}") == 0
-    assert "latched messages stay" in capsys.readouterr().out
+    exits(0, "index")
+    shown = forget(0, 0, 100, f"--yes --where bathroom data.places_file={places}").out
+    assert "latched messages stay" in shown
     times: dict[str, set[int]] = {}
     for each in whole(bag):
         times.setdefault(str(each[3]), set()).add((int(str(each[7])) - T0) // 10**8)
@@ -393,54 +385,46 @@ def test_the_time_in_a_place_goes_with_a_second_on_either_side(
     assert traces(home, f"{SAID} 70")
 
 
-class TestInterruption:
-    """The power goes between any two steps that change a file."""
-
-    def test_whatever_was_done_the_next_one_finishes_it_and_says_so(
-        self,
-        tmp_path: Path,
-        bag_dir: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: Capture,
-    ) -> None:
-        source = bag_dir / "rec_a" / "rec_a_1.mcap"
-        moment = made_moment(bag_dir / "moments" / "20260101T000000Z-dance")
-        link = moment / "rec_a" / source.name
-        link.parent.mkdir()
-        os.link(source, link)
-        indexed()
-        others = [each for each in stored(bag_dir / "rec_a") if each[0] != CAMERA]
-        image = tmp_path / "image"
-        copy(bag_dir, image)
-        for steps in itertools.count():
-            copy(image, bag_dir)
-            own_all(bag_dir)
-            with monkeypatch.context() as patch:
-                cut_off_after(patch, steps)
-                try:
-                    forget(0, 100)
-                except PowerCutError:
-                    finished = False
-                else:
-                    finished = True
-            begun = ERASING.read(bag_dir)
-            if not finished and begun is None:
-                # Nothing was begun, or everything was done.
-                left = traces(bag_dir, SAID)
-                assert not left or {*left} >= {*traces(image, SAID)}, steps
-            capsys.readouterr()
-            if steps == 1:
-                assert cli.main(["doctor"]) > 0
-                assert "was interrupted" in capsys.readouterr().out
-            assert forget(500, 501, f"--topic {MIC}") == 0
-            if begun is not None:
-                assert "an earlier forget was interrupted" in capsys.readouterr().out
-                assert traces(bag_dir, SAID) == [], steps
-                assert stored(bag_dir / "rec_a") == others
-                assert ERASING.read(bag_dir) is None
-            if finished:
-                break
-        assert steps > 8
+def test_whatever_was_done_before_the_power_went_the_next_forget_finishes_it_and_says_so(
+    tmp_path: Path,
+    bag_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    forget: Forget,
+    exits: Program,
+) -> None:
+    """Between any two steps that change a file."""
+    source = bag_dir / "rec_a" / "rec_a_1.mcap"
+    link = made_moment(bag_dir / "moments" / "20260101T000000Z-dance") / "rec_a" / source.name
+    link.parent.mkdir()
+    os.link(source, link)
+    exits(0, "index")
+    others = [each for each in stored(bag_dir / "rec_a") if each[0] != CAMERA]
+    image = tmp_path / "image"
+    copy(bag_dir, image)
+    finished = False
+    for steps in itertools.count():
+        copy(image, bag_dir)
+        own_all(bag_dir)
+        with monkeypatch.context() as patch, suppress(PowerCutError):
+            cut_off_after(patch, steps)
+            forget(0, 0, 100, OF_CAMERA)
+            finished = True
+        begun = ERASING.read(bag_dir)
+        if not finished and begun is None:
+            # Nothing was begun, or everything was done.
+            left = traces(bag_dir, SAID)
+            assert not left or {*left} >= {*traces(image, SAID)}, steps
+        if steps == 1:
+            assert "was interrupted" in exits(2, "doctor").out
+        shown = forget(0, 500, 501, f"--yes --topic {MIC}").out
+        if begun is not None:
+            assert "an earlier forget was interrupted" in shown
+            assert traces(bag_dir, SAID) == [], steps
+            assert stored(bag_dir / "rec_a") == others
+            assert ERASING.read(bag_dir) is None
+        if finished:
+            break
+    assert steps > 8
 
 
 class PowerCutError(BaseException):

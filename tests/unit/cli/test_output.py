@@ -1,20 +1,13 @@
 """Replies as people read them, in a terminal of 80 columns and in a wide one."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import pytest
 
 from ros2_memory.cli.output import format_time, format_value, print_reply, with_commands
+from ros2_memory.core.model import JsonValue
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ros2_memory.core.model import JsonValue
-
-    Shown = Callable[..., str]
-
+Shown = Callable[..., str]
 T0 = 1_700_000_000.25
 
 

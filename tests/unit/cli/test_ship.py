@@ -1,15 +1,13 @@
 """`ros2-memory ship`: one pass, who writes, what is missing, and no secret anywhere."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -21,14 +19,9 @@ from ros2_memory.lake.upkeep import TOMBSTONES_FILE
 from ros2_memory.lake.warehouse import LakeLocation, writing_alone
 from tests.support.fleets import START_S, seeded, write_robot
 from tests.support.lakes import lake_column, write_bag
+from tests.support.program import Printed, Program
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from tests.support.program import Printed, Program
-
-    Ship = Callable[..., Printed]
-
+Ship = Callable[..., Printed]
 Capture = pytest.CaptureFixture[str]
 ROBOTS = ("hall", "kitchen")
 

@@ -1,12 +1,13 @@
 """What the commands that look at bags say where the configuration is that of a fleet."""
 
-import json
 from pathlib import Path
 
 import pytest
 
-from ros2_memory import cli
 from tests.support.fleets import seeded, write_robot
+from tests.support.program import Program, exits
+
+__all__ = ["exits"]
 
 
 @pytest.fixture
@@ -18,31 +19,21 @@ def robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return f"fleet.robots={{r1: {tmp_path}/r1, away: {tmp_path}/away}}"
 
 
-def test_doctor_checks_each_robot(robots: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["doctor", "--json", robots]) == 1
-    told = json.loads(capsys.readouterr().out)
-    found = [each for each in told["findings"] if each["about"] == "robot"]
+def test_doctor_and_info_are_about_each_robot(robots: str, exits: Program) -> None:
+    findings = exits(1, "doctor --json", robots).json["findings"]
+    found = [each for each in findings if each["about"] == "robot"]
     assert [each["level"] for each in found] == ["ok", "warning"]
     assert found[0]["seen"].startswith("r1: 2 bag files are readable")
     assert "away" in found[1]["seen"]
     assert "from fleet.robots" in found[1]["seen"]
-
-
-def test_info_is_about_each_robot(robots: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["info", "--json", robots]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = exits(0, "info --json", robots).json
     assert {name: each["held"]["bags"] for name, each in told.items()} == {"r1": 2, "away": 0}
-    assert cli.main(["info", robots]) == 0
-    shown = capsys.readouterr().out
+    shown = exits(0, "info", robots).out
     assert shown.index("r1 ") < shown.index("messages") < shown.index("away ")
 
 
-def test_what_looks_at_one_robot_asks_which(
-    robots: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["topics", robots]) == 2
-    refused = capsys.readouterr().err
+def test_what_looks_at_one_robot_asks_which(robots: str, tmp_path: Path, exits: Program) -> None:
+    refused = exits(2, "topics", robots).err
     assert f"--bag-dir {tmp_path}/r1 for r1" in refused
     assert "r1, away" in refused
-    assert cli.main(["topics", "--json", "--bag-dir", str(tmp_path / "r1"), robots]) == 0
-    assert "/is_docked" in capsys.readouterr().out
+    assert "/is_docked" in exits(0, f"topics --json --bag-dir {tmp_path}/r1", robots).out
