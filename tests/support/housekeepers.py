@@ -252,10 +252,10 @@ def in_moments(bag_dir: Path) -> list[str]:
     ]
 
 
-def made_moment(folder: Path) -> Path:
+def made_moment(folder: Path, label: str = "here") -> Path:
     """Makes the folder of a saved moment, as the recorder does."""
     folder.mkdir(parents=True)
-    request = SaveRequest(number="0" * 32, label="here", start=T0, end=T0 + S, asked=NOW)
+    request = SaveRequest(number="0" * 32, label=label, start=T0, end=T0 + S, asked=NOW)
     write_saved_moment(folder, SavedMoment(request, pending=False))
     return folder
 

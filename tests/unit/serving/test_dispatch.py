@@ -219,6 +219,9 @@ async def test_a_quick_question_waits_for_no_blocking_one_and_the_list_of_tools_
         held.released.set()
 
 
+BOUND_S = 20
+
+
 class Held:
     """A slow question that lasts until the test lets it end; it counts how often it was begun."""
 
@@ -226,10 +229,14 @@ class Held:
         self.released = threading.Event()
         self.begun = 0
 
-    def ask(self, call: Call) -> Answer:
+    def wait(self) -> int:
         self.begun += 1
-        assert self.released.wait(20)
-        return value(self.begun)
+        number = self.begun
+        assert self.released.wait(BOUND_S)
+        return number
+
+    def ask(self, _call: Call) -> Answer:
+        return value(self.wait())
 
 
 async def test_one_client_that_floods_the_server_does_not_starve_another() -> None:
@@ -326,31 +333,6 @@ async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: 
     assert "s3cret" not in str(log.entries)
 
 
-BOUND_S = 20
-
-
-class Gates:
-    """Questions that end when the test lets them, and the order in which they began."""
-
-    def __init__(self) -> None:
-        self.begun: list[str] = []
-        self._gates: dict[str, threading.Event] = {}
-
-    def ask(self, name: str) -> Callable[[], str]:
-        gate = self._gates.setdefault(name, threading.Event())
-
-        def answer() -> str:
-            self.begun.append(name)
-            assert gate.wait(BOUND_S)
-            return name
-
-        return answer
-
-    def release(self, *names: str) -> None:
-        for name in names or tuple(self._gates):
-            self._gates[name].set()
-
-
 async def until(what: Callable[[], bool]) -> None:
     """Lets everything else go on until it is so."""
     async with asyncio.timeout(BOUND_S):
@@ -358,35 +340,29 @@ async def until(what: Callable[[], bool]) -> None:
             await asyncio.sleep(0.001)
 
 
-def started(queue: FairQueue, gates: Gates, client: str, count: int) -> list[asyncio.Task[str]]:
-    return [asyncio.create_task(queue.run(client, gates.ask(f"{client}{n}"))) for n in range(count)]
-
-
 @pytest.mark.parametrize("has_turn", [True, False])
 async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn: bool) -> None:
-    queue, gates = FairQueue("test", 1), Gates()
-    first, leaving, last = started(queue, gates, "a", 3)
-    await until(lambda: queue.waiting == 2)
-    gates.release("a0")
+    queue, held = FairQueue("test", 1), Held()
+    first, leaving, last = (asyncio.create_task(queue.run("a", held.wait)) for _ in range(3))
+    await until(lambda: queue.waiting == 2 and held.begun == 1)
+    held.released.set()
     queue._threads.submit(int).result(BOUND_S)  # so the first is done, which the loop learns next
     if has_turn:
         asyncio.get_running_loop().call_soon(leaving.cancel)
     else:
         leaving.cancel()
-    gates.release()
-    assert [await first, await last] == ["a0", "a2"]
+    assert [await first, await last] == [1, 2]
     assert leaving.cancelled()
-    assert gates.begun == ["a0", "a2"]
     await until(lambda: (queue.running, queue.waiting) == (0, 0))
 
 
 async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -> None:
-    queue, gates = FairQueue("test", 1), Gates()
-    stuck, following = started(queue, gates, "a", 2)
-    await until(lambda: gates.begun == ["a0"])
+    queue, held = FairQueue("test", 1), Held()
+    stuck, following = (asyncio.create_task(queue.run("a", held.wait)) for _ in range(2))
+    await until(lambda: held.begun == 1)
     stuck.cancel()
     await until(stuck.done)
     assert (queue.running, queue.waiting) == (1, 1)
-    gates.release()
-    assert await following == "a1"
+    held.released.set()
+    assert await following == 2
     await until(lambda: queue.running == 0)

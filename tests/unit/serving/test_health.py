@@ -3,6 +3,7 @@ import os
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import anyio
 import anyio.from_thread
@@ -26,20 +27,6 @@ T0 = 1_784_023_200 * NS_PER_S
 
 def memory_at(bag_dir: Path, *, seconds: int = 0) -> Memory:
     return memory_of(bag_dir, clock=SettableClock(T0 + seconds * NS_PER_S))
-
-
-async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
-    (tmp_path / "torn.mcap").write_bytes(b"no bag at all, but not empty")
-    reply = await Health(memory_at(tmp_path, seconds=3600), "1")()
-    assert reply["status"] == "degraded"
-    assert reply["damaged"] == 1
-    assert reply["problems"] == ["1 damaged bag file; data_time_range lists them"]
-    assert reply["damaged_files"] == [
-        {
-            "file": f"{tmp_path.name}/torn.mcap",
-            "reason": "not an MCAP file: it does not begin as one",
-        }
-    ]
 
 
 async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
@@ -189,10 +176,13 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
         unheard=names[:5],
         required_missing=names[:7],
     )
-    said = await Health(memory_at(tmp_path, seconds=3600), "1")()
+    said: Any = await Health(memory_at(tmp_path, seconds=3600), "1")()
     assert len(json.dumps(said)) < 14_000
-    assert said["damaged"] == 50
-    assert isinstance(said["recorder"], dict)
+    assert (said["status"], said["damaged"]) == ("degraded", 50)
+    assert said["problems"][0] == "50 damaged bag files; data_time_range lists them"
+    damaged = said["damaged_files"][0]
+    assert damaged["file"].startswith(f"{tmp_path.name}/xx")
+    assert damaged["reason"] == "not an MCAP file: it does not begin as one"
     assert said["recorder"]["more_silent_topics"] == 980
     assert said["recorder"]["more_missing_topics"] == 994
 
@@ -208,7 +198,7 @@ async def test_topics_that_are_offered_and_not_recorded_degrade_it(tmp_path: Pat
         required_missing=("/odom: it came regularly, and is silent",),
         advice="look at the users",
     )
-    report = await Health(memory_at(tmp_path), "1.2.3")()
+    report: Any = await Health(memory_at(tmp_path), "1.2.3")()
     assert report["status"] == "degraded"
     assert report["problems"] == [
         "required, and not recorded: /odom: it came regularly, and is silent",
@@ -216,6 +206,4 @@ async def test_topics_that_are_offered_and_not_recorded_degrade_it(tmp_path: Pat
         "offered for 30 s, and no message has come: /scan; look at the users",
         "regular until now, and silent: /odom",
     ]
-    recorder = report["recorder"]
-    assert isinstance(recorder, dict)
-    assert len(recorder["degraded"] or []) == 3  # type: ignore[arg-type]
+    assert len(report["recorder"]["degraded"]) == 3

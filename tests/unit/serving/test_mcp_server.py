@@ -9,26 +9,15 @@ import pytest
 from mcp import Client
 from mcp.server.apps import APP_MIME_TYPE, EXTENSION_ID
 from mcp.shared.exceptions import MCPError
-from mcp.types import (
-    INVALID_PARAMS,
-    TextResourceContents,
-)
+from mcp.types import INVALID_PARAMS, TextResourceContents
 
-from ros2_memory.bag_dir.moment_file import (
-    SavedMoment,
-    SaveRequest,
-    make_moment_folder,
-    write_saved_moment,
-)
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import Settings, load_settings
-from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import VIEW_URI, EpisodicServer, view
 from ros2_memory.tools.build import build_tools, readable_tools
+from tests.support.housekeepers import made_moment
 from tests.support.robot_run import CALLS, write_run
-
-T0 = 1_795_161_600 * NS_PER_S
 
 
 def settings_of(bag_dir: Path, *overrides: str) -> Settings:
@@ -123,22 +112,16 @@ async def test_no_tool_names_another_that_is_not_offered(tmp_path: Path) -> None
     assert [text for text in read if re.search(r": (visits|compare|recap)\b", text)] == []
 
 
-def keep(bag_dir: Path, label: str) -> str:
-    request = SaveRequest("0" * 32, label, T0, T0 + NS_PER_S, T0 + NS_PER_S)
-    folder = make_moment_folder(bag_dir, request)
-    write_saved_moment(folder, SavedMoment(request, pending=False))
-    return folder.name
-
-
 async def test_one_moment_is_a_resource(tmp_path: Path) -> None:
     write_run(tmp_path)
-    name = keep(tmp_path, "spilled coffee")
+    name = "20260921T101320Z-here"
+    made_moment(tmp_path / "moments" / name)
     async with Client(server(tmp_path)) as client:
         shown = await read(client, f"episodic://moments/{name}")
         [listed] = (await read(client, "episodic://moments"))["moments"]
         assert shown == {"now": shown["now"], **listed}
-        assert (shown["moment"], shown["label"]) == (name, "spilled coffee")
-        refused = await read(client, "episodic://moments/spilt-coffee")
+        assert (shown["moment"], shown["label"]) == (name, "here")
+        refused = await read(client, "episodic://moments/there")
     assert refused["error"] == "invalid_arguments"
     assert name in refused["detail"]
 

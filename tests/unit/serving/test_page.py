@@ -51,9 +51,33 @@ async def test_a_browser_that_has_a_file_is_not_sent_it_again() -> None:
     assert again.content == b""
 
 
-def test_it_has_no_inline_script_or_style() -> None:
+def test_it_has_nothing_inline_or_of_elsewhere_and_text_never_becomes_markup_or_code() -> None:
     assert re.findall(r"<script[^>]*>(?!</script>)", HTML) == []
     assert not re.search(r"<style|\sstyle=|\son\w+=", HTML)
+    for text in (HTML, *OWN.values()):
+        assert re.findall(r"\w+://[^\s\"'<]+", text) == []
+    assert re.findall(r"(?:src|href)=\"([^\"]*)\"", HTML) == [
+        "data:,",
+        "/page/page.css",
+        "/page/page.js",
+        "#timeline",
+    ]
+    assert not re.search(r"@import|url\(", "".join(OWN.values()))
+    assert not re.search(r"\bimport\b|XMLHttpRequest|WebSocket|EventSource", SCRIPT)
+    assert len(re.findall(r"\bfetch\(", SCRIPT)) == 1
+    forbidden = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function"
+    assert not re.search(forbidden, SCRIPT)
+    for name in re.findall(r"<(?:input|select|progress)[^>]* id=\"([\w-]+)\"", HTML):
+        assert re.search(rf"<label for=\"{name}\"", HTML), name
+    assert "MIT License" in FOLDER.joinpath("vendor/LICENSE").read_text("utf-8")
+    assert "uPlot 1.6.32" in FOLDER.joinpath("vendor/README.md").read_text("utf-8")
+
+
+def test_it_keeps_the_token_for_its_tab_alone() -> None:
+    assert not re.search(r"localStorage|cookie|indexedDB", SCRIPT)
+    assert set(re.findall(r"sessionStorage\.\w+\((\w+)", SCRIPT)) == {"TOKEN"}
+    # It is never part of an address, which is logged and kept.
+    assert "token" not in OWN["main.js"].partition("function remember")[2].partition("\n}\n")[0]
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", EVERYWHERE, "192.168.7.20", "robot.lan"])
@@ -67,39 +91,3 @@ async def test_it_is_shown_without_the_token_which_it_asks_for(host: str) -> Non
         for path in (route.path for route in page_routes(served().dispatcher)):
             assert (await http.get(path)).status_code == 401
             assert (await http.get(path, headers=SHOWN)).status_code != 401
-
-
-def test_nothing_of_it_comes_from_elsewhere() -> None:
-    for text in (HTML, *OWN.values()):
-        assert re.findall(r"\w+://[^\s\"'<]+", text) == []
-    assert re.findall(r"(?:src|href)=\"([^\"]*)\"", HTML) == [
-        "data:,",
-        "/page/page.css",
-        "/page/page.js",
-        "#timeline",
-    ]
-    assert not re.search(r"@import|url\(", "".join(OWN.values()))
-    assert not re.search(r"\bimport\b|XMLHttpRequest|WebSocket|EventSource", SCRIPT)
-    assert len(re.findall(r"\bfetch\(", SCRIPT)) == 1
-
-
-def test_text_never_becomes_markup_or_code() -> None:
-    forbidden = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function"
-    assert not re.search(forbidden, SCRIPT)
-
-
-def test_it_keeps_the_token_for_its_tab_alone() -> None:
-    assert not re.search(r"localStorage|cookie|indexedDB", SCRIPT)
-    assert set(re.findall(r"sessionStorage\.\w+\((\w+)", SCRIPT)) == {"TOKEN"}
-    # It is never part of an address, which is logged and kept.
-    assert "token" not in OWN["main.js"].partition("function remember")[2].partition("\n}\n")[0]
-
-
-def test_every_field_of_it_has_a_label() -> None:
-    for name in re.findall(r"<(?:input|select|progress)[^>]* id=\"([\w-]+)\"", HTML):
-        assert re.search(rf"<label for=\"{name}\"", HTML), name
-
-
-def test_the_library_it_carries_is_named_with_its_licence() -> None:
-    assert "MIT License" in FOLDER.joinpath("vendor/LICENSE").read_text("utf-8")
-    assert "uPlot 1.6.32" in FOLDER.joinpath("vendor/README.md").read_text("utf-8")

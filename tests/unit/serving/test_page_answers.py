@@ -16,12 +16,6 @@ from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
 from ros2_memory.analysis.motion.robot_track import cut, track_of
-from ros2_memory.bag_dir.moment_file import (
-    SavedMoment,
-    SaveRequest,
-    make_moment_folder,
-    write_saved_moment,
-)
 from ros2_memory.cli.plot import asked_in
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -47,6 +41,7 @@ from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import detections, odom, tf, transform, write_mcap, write_splits
+from tests.support.housekeepers import made_moment
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
 
@@ -341,17 +336,14 @@ def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_un
 def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:
     for n, name in enumerate(("robin", "wren")):
         write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(BEGIN + n * 60 * S, 0.0, 0.0)])
-        request = SaveRequest(f"{n:032x}", f"of {name}", BEGIN, BEGIN + S, BEGIN + S)
-        folder = make_moment_folder(tmp_path, request)
-        write_saved_moment(folder, SavedMoment(request, pending=False))
-        (folder / name).mkdir()
+        (made_moment(tmp_path / "moments" / name, f"of {name}") / name).mkdir()
     memory = memory_of(tmp_path)
 
-    def labels(memory: Memory) -> list[str]:
-        return [each["label"] for each in shown(memory)["moments"]]
+    def labels(memory: Memory) -> set[str]:
+        return {each["label"] for each in shown(memory)["moments"]}
 
-    assert sorted(labels(memory)) == ["of robin", "of wren"]
-    assert labels(Recordings(memory).alone("wren")) == ["of wren"]
+    assert labels(memory) == {"of robin", "of wren"}
+    assert labels(Recordings(memory).alone("wren")) == {"of wren"}
 
 
 async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes_is_refused(
