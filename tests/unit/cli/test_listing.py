@@ -1,4 +1,4 @@
-"""`info`, `topics`, `recordings` and `cat` on bags of any origin, and `--recording`."""
+"""The commands that only look, on bags of any origin: what they print, and how they end."""
 
 import csv
 import json
@@ -13,11 +13,13 @@ from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
+from ros2_memory.cli.app import COMMANDS, epilog
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -25,7 +27,7 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, log_entry, odom, text, write_mcap
 from tests.support.forked_commands import write_command
-from tests.support.housekeepers import own_all
+from tests.support.housekeepers import later, own_all, recording_now
 from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
@@ -235,7 +237,7 @@ class TestIndex:
 
 
 class TestCat:
-    def test_no_text_commands_a_terminal_and_letters_that_it_has_not_are_spelled_out(
+    def test_no_text_commands_a_terminal_nor_a_reply_and_letters_that_it_has_not_are_spelled_out(
         self, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         write_mcap(tmp_path / "rec_0.mcap", [text(T0, "\x1b[2J\x9b31m k\u00fcche", "/speech")])
@@ -243,6 +245,9 @@ class TestCat:
             terminal.setattr(sys.stdout, "isatty", lambda: True)
             for option in ("--csv", "--json"):
                 assert not {"\x1b", "\x9b"} & {*exits(0, "cat /speech", option, tmp_path).out}
+        shown = exits(0, f"ask {tmp_path} get_topic_in_last topic=/speech seconds=4000").out
+        assert "\x1b" not in shown
+        assert "\\x1b[2J" in shown
         written = BytesIO()
         monkeypatch.setattr(sys, "stdout", TextIOWrapper(written, encoding="ascii"))
         assert cli.main(["cat", "/speech", str(tmp_path)]) == 0
@@ -338,3 +343,84 @@ def test_a_date_without_dashes_is_no_second_of_1970() -> None:
     with pytest.raises(InvalidArgumentsError, match="the date is 2026-11-21"):
         parse_time("20261121", 0)
     assert parse_time("20269999", 0) == 20269999
+
+
+def test_without_a_name_the_tools_are_listed_with_their_arguments(exits: Program) -> None:
+    assert "seconds_ago, topic?, tolerance_s?" in exits(0, "ask").out
+
+
+def test_where_something_is_recorded_info_says_for_how_long_the_budget_lasts(
+    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    recording_now(folder, "b", clock=later(0))
+    shown = exits(0, "info deployment=robot retention.max_total_gb=2.0").out
+    assert "of 2 GB: bags 0" in shown
+    assert "what is stored beside them 0" in shown
+    assert "full in" in shown
+
+
+class TestConfig:
+    def test_it_is_shown_as_yaml_that_a_program_would_take_but_no_token_is(
+        self, exits: Program, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MEMORY_BAG_DIR", "/bags")
+        monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
+        text = exits(0, "config show server.port=9300").out
+        shown = yaml.safe_load(text)
+        assert shown["server"]["port"] == 9300
+        assert shown["recording"]["bag_dir"] == "/bags"
+        assert shown["storage"]["_target_"].startswith("ros2_memory.")
+        assert "MEMORY_API_TOKEN is set" in text
+        assert "a-secret" not in text
+
+    def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
+        self, monkeypatch: pytest.MonkeyPatch, exits: Program
+    ) -> None:
+        monkeypatch.setenv("MEMORY_BAG_DIR", "/bags")
+        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot_live")
+        monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "recorder=none")
+        monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", "/")
+        head, *rows = exits(0, "config show --sources server.port=9300").out.splitlines()
+        assert head.startswith("# files are those of ")
+        told = {
+            key: f"{rest} "
+            for key, _, rest in (" ".join(row.split()).partition(" ") for row in rows)
+        }
+        for key, who in (
+            ("deployment", "by MEMORY_DEPLOYMENT "),
+            ("storage", "deployment/robot.yaml "),
+            ("recorder", "by MEMORY_CONFIG_OVERRIDES "),
+            ("server.port", "on the command line "),
+            ("server.name", "config.yaml "),
+            ("server.transport", "deployment/robot.yaml "),
+            ("reader.include_active", "deployment/robot_live.yaml "),
+            ("reader.custom_msg_paths", "config.yaml, and by ROS_VISION_INTERFACES_PATH "),
+            ("recording.bag_dir", "by MEMORY_BAG_DIR "),
+            ("recorder._target_", "recorder/none.yaml "),
+        ):
+            assert told[key].startswith(who), key
+
+
+def test_warnings_are_one_sentence_and_with_v_the_events(folder: Path, exits: Program) -> None:
+    for name in "ab":
+        (folder / "a" / f"{name}.mcap").write_bytes(b"")
+        os.utime(folder / "a" / f"{name}.mcap", (1_700_000_000,) * 2)
+    (line,) = exits(0, "topics .").err.splitlines()
+    assert "2 warnings logged (2 x bag_damaged); -v shows" in line
+    output = [
+        json.loads(line) for line in exits(0, "topics . -v logging.level=warning").err.splitlines()
+    ]
+    assert [each["event"] for each in output] == ["bag_damaged", "bag_damaged"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_every_command_says_what_its_exit_codes_mean(
+    exits: Program, command: str
+) -> None:
+    assert " ".join(exits(0, f"{command} --help").out.split()).endswith(epilog(command))
+
+
+@pytest.mark.parametrize("words", ["-h", "info -h", "config show -h"])
+def test_help_has_a_short_option(words: str, exits: Program) -> None:
+    assert "Usage: ros2-memory" in exits(0, words).out

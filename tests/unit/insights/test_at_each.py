@@ -1,6 +1,5 @@
 """Several moments in one question: each is answered as if it were asked alone."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ import pytest
 from ros2_memory.core.errors import NoDataReason
 from ros2_memory.history.context import Memory
 from tests.support.bags import detections, odom, tf, transform, write_mcap
-from tests.support.memories import asked, memory_of, replied
+from tests.support.memories import asked, memory_of
 
 S = 10**9
 T0 = 1_700_000_000
@@ -49,10 +48,8 @@ def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory, tmp_path:
     for timestamps in ({"timestamps": [T0, T0 + 1]}, {"timestamp": T0}):
         told = asked(memory, tmp_path, "get_topic_at_time", topic="/nope", **timestamps)
         assert (told["error"], told["reason"]) == ("no_data", "topic_not_recorded")
-    refused = replied(
-        memory, tmp_path, "get_position_at", {"timestamps": [T0], "topic": "/vision/*"}
-    )
-    assert json.loads(refused.text)["error"]
+    refused = asked(memory, tmp_path, "get_position_at", timestamps=[T0], topic="/vision/*")
+    assert "error" in refused
 
 
 def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:

@@ -9,10 +9,7 @@ import pytest
 
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import Quoted, named, quote, quoted_keys
-from ros2_memory.fleet.tools import fleet_tools
-from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.tools.build import build_tools
-from ros2_memory.tools.replies import Replies
+from ros2_memory.history.context import Memory
 from tests.support.bags import (
     boolean,
     detections,
@@ -24,7 +21,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.fleets import fleet_over
+from tests.support.fleets import fleet_over, reply
 from tests.support.memories import asked, memory_of, replied
 
 S: Final = 10**9
@@ -156,9 +153,9 @@ def test_a_reply_says_first_where_it_repeats_what_messages_say(
     memory: Memory, bag_dir: Path, what: str
 ) -> None:
     tool, given, places = CALLS[what]
-    reply = asked(memory, bag_dir, tool, **given)
-    require_marked(reply)
-    assert {*places} <= {*reply["quoted"]}
+    found = asked(memory, bag_dir, tool, **given)
+    require_marked(found)
+    assert {*places} <= {*found["quoted"]}
 
 
 @pytest.mark.parametrize(
@@ -193,9 +190,9 @@ def test_a_frame_that_is_named_by_a_sentence_is_marked(
             tf(at, transform(at, ATTACK + "frame_id", ATTACK + "child", (n / 10, 0, 0))),
         ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    reply = asked(memory_of(tmp_path), tmp_path, tool, **given)
+    found = asked(memory_of(tmp_path), tmp_path, tool, **given)
     # Notes are sentences of this program, and name frames as they are.
-    require_marked({key: part for key, part in reply.items() if key != "notes"})
+    require_marked({key: part for key, part in found.items() if key != "notes"})
 
 
 @pytest.mark.parametrize("most", [500, 1500])
@@ -209,9 +206,9 @@ def test_a_reply_that_is_shortened_keeps_its_mark(bag_dir: Path, most: int) -> N
 
 def test_names_in_a_message_are_its_own_and_never_become_the_mark() -> None:
     value: JsonValue = {ATTACK: "x", "quoted": [], "deep": [{ATTACK: {"below": "y"}}], "n": [1.0]}
-    reply: dict[str, JsonValue] = {"value": quote(value)}
-    assert quoted_keys(reply) == ["value", "value.deep", "value.deep.below"]
-    assert reply == {"value": value}
+    shown: dict[str, JsonValue] = {"value": quote(value)}
+    assert quoted_keys(shown) == ["value", "value.deep", "value.deep.below"]
+    assert shown == {"value": value}
 
 
 @pytest.mark.parametrize(
@@ -238,17 +235,15 @@ def test_the_replies_of_several_robots_are_marked_as_one(tmp_path: Path) -> None
     for robot in ("r1", "r2"):
         spoken_to(tmp_path / robot)
     fleet = fleet_over(tmp_path, ("r1", "r2"), shared_map=True)
-    tools = {each.name: each for each in fleet_tools(build_tools(QuerySettings()), fleet, 24_000)}
-    for tool, given, places in (
+    asks: list[tuple[str, dict[str, object], list[str]]] = [
         ("find_last_match", {"topic": "/speech", **CONTAINS}, ["matches.value.value"]),
         ("find_matches", {"topic": "/speech", **CONTAINS}, ["sightings.matched"]),
         ("find_things", {}, ["things.label", "labels"]),
         ("find_things", {"label": "cup"}, ["notes"]),
         ("recap", AROUND, ["robots.events.text"]),
         ("recap", {**AROUND, "robot": "r2"}, ["events.text"]),
-    ):
-        none: Any = None
-        answer = tools[tool].question(given)(none, Call())
-        reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
-        require_marked(reply)
-        assert {*places} <= {*reply["quoted"]}
+    ]
+    for tool, given, places in asks:
+        found = reply(fleet, tool, given)
+        require_marked(found)
+        assert {*places} <= {*found["quoted"]}

@@ -21,8 +21,8 @@ from tests.support.memories import memory_of, replied
 
 TOOLS = {tool.name: tool for tool in build_tools(QuerySettings(), writing=True)}
 DECLARATIONS = (*spec_tools.DECLARATIONS, *extra_tools.DECLARATIONS, *extra_tools.READABLE)
-SIGNATURES = {
-    each.name: Signature(declaration.arguments, each.when)
+EXAMPLES = {
+    each.name: Signature(declaration.arguments, each.when).example
     for declaration in DECLARATIONS
     for each in declaration.names
 }
@@ -50,22 +50,15 @@ WRITING = ["remember_moment"]
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 
 
-def example(tool: Tool) -> dict[str, Any]:
-    return SIGNATURES[tool.name].example
-
-
 def refusal(name: str, **given: Any) -> str:
     with pytest.raises(InvalidArgumentsError) as caught:
         TOOLS[name].question(given)
     return str(caught.value)
 
 
-def test_the_seventeen_tools_of_the_specification_come_first_and_in_its_order() -> None:
+def test_the_seventeen_tools_of_the_specification_come_first_and_others_can_be_left_out() -> None:
     assert list(TOOLS) == NAMES
     assert len(SPECIFIED) == 17
-
-
-def test_additions_and_what_writes_can_be_left_out() -> None:
     assert [tool.name for tool in build_tools(QuerySettings())] == [*SPECIFIED, *ADDED]
     alone = build_tools(QuerySettings(), additions=False, writing=True)
     assert [tool.name for tool in alone] == SPECIFIED
@@ -91,8 +84,10 @@ def test_recap_takes_exactly_one_form_of_a_window(tmp_path: Path) -> None:
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_every_tool_has_an_example_that_it_accepts(tool: Tool) -> None:
     needed: set[str] = set(tool.schema.get("required") or [])  # type: ignore[arg-type]
-    assert set(example(tool)) == needed | {"timestamp", "last_s"} & set(tool.schema["properties"])  # type: ignore[arg-type]
-    assert callable(tool.question(example(tool)))
+    assert set(EXAMPLES[tool.name]) == needed | {"timestamp", "last_s"} & set(
+        tool.schema["properties"]
+    )  # type: ignore[arg-type]
+    assert callable(tool.question(EXAMPLES[tool.name]))
 
 
 def test_descriptions_tell_the_defaults_of_this_deployment() -> None:
@@ -155,7 +150,7 @@ def test_the_specification_alone_has_one_time_and_no_word_of_several() -> None:
         properties: Any = tool.schema["properties"]
         assert properties["timestamp"]["type"] == "number"
         assert "timestamp" in str(tool.schema["required"])
-        given = {name: value for name, value in example(tool).items() if name != "timestamp"}
+        given = {name: value for name, value in EXAMPLES[tool.name].items() if name != "timestamp"}
         with pytest.raises(InvalidArgumentsError, match=r'"?timestamps"?; do you mean timestamp'):
             tool.question({**given, "timestamp": 5, "timestamps": [5, 6]})
         with pytest.raises(InvalidArgumentsError, match=r"timestamp is missing: .*e\.g\. [0-9.]+$"):
@@ -231,13 +226,7 @@ def test_a_condition_value_must_be_something_finite(value: Any) -> None:
     assert reply.startswith("value was ")
 
 
-def read(given: dict[str, Any]) -> LastMatchArguments:
-    required = {"topic": "/a", "condition_type": "contains"}
-    arguments = Signature(LastMatchArguments).parse(required | given)
-    assert isinstance(arguments, LastMatchArguments)
-    return arguments
-
-
-@pytest.mark.parametrize("given", ["position", ["position"], '["position"]', ("position",)])
-def test_fields_may_be_one_name_a_list_or_its_json_text(given: Any) -> None:
-    assert read({"value": "x", "fields": given}).fields == ("position",)
+def test_fields_may_be_one_name_a_list_or_its_json_text() -> None:
+    for fields in ("position", ["position"], '["position"]', ("position",)):
+        given = {"topic": "/a", "condition_type": "contains", "value": "x", "fields": fields}
+        assert dict(Signature(LastMatchArguments).parse(given))["fields"] == ("position",)
