@@ -1,7 +1,8 @@
-"""What the gate lets in; the token that it asks for: where it comes from, what it must be."""
+"""Who can reach the server, what its gate lets in, and the token: where it is from, what it is."""
 
 import hmac
 import os
+import socket
 import traceback
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from ros2_memory.serving.auth import (
     is_admitted,
     take_token,
 )
+from ros2_memory.serving.listen import CannotListenError, bound, resolved
 
 GOOD = "kJ7-x._~+/0123456789=="
 
@@ -247,3 +249,36 @@ def test_in_a_file_of_the_configuration_it_is_refused_and_not_repeated(tmp_path:
         load_settings((), {"MEMORY_CONFIG_DIR": str(tmp_path)})
     assert "server.api_token" in str(caught.value)
     assert "sEcReT7" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("127.0.0.1", True),
+        ("127.0.0.2", True),
+        ("localhost", True),
+        ("LOCALHOST", True),
+        ("::1", True),
+        ("127.1", True),
+        (".".join("0000"), False),
+        ("::", False),
+        ("192.0.2.7", False),
+        ("fe80::1", False),
+        ("2001:db8::1", False),
+    ],
+)
+def test_whether_others_can_reach_it_is_judged_by_the_address(host: str, loopback: bool) -> None:
+    assert resolved(host, 9203).is_loopback is loopback
+
+
+@pytest.mark.parametrize("host", ["nosuch.invalid", "a" * 300, "..", "robot lan"])
+def test_a_host_without_an_address_is_told_with_what_to_do(host: str) -> None:
+    with pytest.raises(CannotListenError, match="give an address of this machine with MCP_HOST"):
+        resolved(host, 9203)
+
+
+def test_what_is_judged_is_what_is_listened_on() -> None:
+    address = resolved("localhost", 0)
+    with bound(address) as listening:
+        assert listening.getsockname()[0] == address.ip
+        assert listening.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
