@@ -83,10 +83,9 @@ def test_recap_takes_exactly_one_form_of_a_window(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_every_tool_has_an_example_that_it_accepts(tool: Tool) -> None:
-    needed: set[str] = set(tool.schema.get("required") or [])  # type: ignore[arg-type]
-    assert set(EXAMPLES[tool.name]) == needed | {"timestamp", "last_s"} & set(
-        tool.schema["properties"]
-    )  # type: ignore[arg-type]
+    schema: Any = tool.schema
+    optional = {"timestamp", "last_s"} & {*schema["properties"]}
+    assert EXAMPLES[tool.name].keys() == {*schema.get("required", ())} | optional
     assert callable(tool.question(EXAMPLES[tool.name]))
 
 
