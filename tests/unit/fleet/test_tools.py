@@ -47,16 +47,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def alone(folder: Path, robot: str, name: str, given: dict[str, object]) -> Any:
-    """The JSON of the reply of a server of one robot alone."""
-    return asked(fleet_memory(folder / robot), folder / robot, name, **given)
+@pytest.fixture(scope="module")
+def fleet(folder: Path) -> Fleet:
+    return fleet_over(folder, NAMES)
+
+
+def alone(folder: Path, name: str, given: dict[str, object]) -> dict[str, Any]:
+    """The replies of servers of one robot alone, by its name."""
+    memories = {robot: fleet_memory(folder / robot) for robot in NAMES}
+    return {robot: asked(memory, folder, name, **given) for robot, memory in memories.items()}
 
 
 @pytest.mark.parametrize("name", TOOLS)
-def test_a_robot_that_is_named_answers_as_alone_with_its_name(folder: Path, name: str) -> None:
+def test_a_robot_that_is_named_answers_as_alone_with_its_name(
+    folder: Path, fleet: Fleet, name: str
+) -> None:
     given = CALLS.get(name, {})
-    found = reply(fleet_over(folder, NAMES), name, {**given, "robot": "r2"})
-    expected = alone(folder, "r2", name, given)
+    found = reply(fleet, name, {**given, "robot": "r2"})
+    expected = alone(folder, name, given)["r2"]
     if isinstance(expected, list):
         assert found == [{"robot_name": "r2", **row} for row in expected]
     elif "error" in expected:
@@ -98,17 +106,18 @@ def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
             assert {row["robot_name"]: row["now"] for row in value["robots"]} == nows, tool
 
 
-def test_which_robot_last_saw_it_is_the_newest_of_the_answers_of_each(folder: Path) -> None:
-    fleet = fleet_over(folder, NAMES)
+def test_which_robot_last_saw_it_is_the_newest_of_the_answers_of_each(
+    folder: Path, fleet: Fleet
+) -> None:
     found = reply(fleet, "find_last_match", MUG)
-    own = {name: alone(folder, name, "find_last_match", MUG) for name in NAMES}
+    own = alone(folder, "find_last_match", MUG)
     expected = [{"robot_name": name, **row} for name, row in own.items() if row is not None]
     expected.sort(key=lambda row: -row["timestamp"])
     assert found["matches"] == expected
     assert found.get("never", []) == [name for name, row in own.items() if row is None]
     # Never of a robot that is named is an object.
     never = MUG | {"value": "elephant"}
-    assert alone(folder, "r1", "find_last_match", never) is None
+    assert alone(folder, "find_last_match", never)["r1"] is None
     found = reply(fleet, "find_last_match", {**never, "robot": "r1"})
     assert found == {"robot_name": "r1", "timestamp": None, "value": None}
 
@@ -126,7 +135,7 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
 ) -> None:
     given = CALLS.get(name, {})
     found = reply(fleet_over(folder, NAMES, shared_map=True), name, given)
-    own = {robot: alone(folder, robot, name, given) for robot in NAMES}
+    own = alone(folder, name, given)
     times = sorted((newest(row) for one in own.values() for row in one[rows]), reverse=True)
     assert [newest(row) for row in found[rows]] == times[:limit]
     assert found.get("more", False) is (len(times) > limit)
@@ -143,9 +152,9 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
         assert row in one[rows]
 
 
-def test_a_topic_has_one_row_with_the_robots_that_record_it(folder: Path) -> None:
-    found = reply(fleet_over(folder, NAMES), "list_recorded_topics", {})["topics"]
-    own = {name: alone(folder, name, "list_recorded_topics", {}) for name in NAMES}
+def test_a_topic_has_one_row_with_the_robots_that_record_it(folder: Path, fleet: Fleet) -> None:
+    found = reply(fleet, "list_recorded_topics", {})["topics"]
+    own = alone(folder, "list_recorded_topics", {})
     assert {row["topic"] for row in found} == {
         row["topic"] for rows in own.values() for row in rows
     }
@@ -166,12 +175,12 @@ def test_a_topic_has_one_row_with_the_robots_that_record_it(folder: Path) -> Non
 @pytest.mark.parametrize("oldest_first", [False, True])
 @pytest.mark.parametrize("limit", [1, 3])
 def test_rows_that_have_no_place_are_left_out_but_count(
-    folder: Path, limit: int, oldest_first: bool
+    folder: Path, fleet: Fleet, limit: int, oldest_first: bool
 ) -> None:
     undocked = {"topic": "/is_docked", "condition_type": "equals", "value": False}
     given = {**undocked, "oldest_first": oldest_first}
-    found = reply(fleet_over(folder, NAMES), "find_matches", {**given, "limit": limit})
-    each = {robot: alone(folder, robot, "find_matches", {**given, "limit": 9}) for robot in NAMES}
+    found = reply(fleet, "find_matches", {**given, "limit": limit})
+    each = alone(folder, "find_matches", {**given, "limit": 9})
     every = [{"robot_name": name, **row} for name in NAMES for row in each[name]["sightings"]]
     every.sort(key=lambda row: row["last_seen"], reverse=not oldest_first)
     assert len(every) == 6
@@ -183,12 +192,13 @@ def test_rows_that_have_no_place_are_left_out_but_count(
 
 
 @pytest.mark.parametrize("name", ["compare", "recap", "memory_status", "data_time_range"])
-def test_what_is_about_a_robot_is_a_row_of_its_whole_reply(folder: Path, name: str) -> None:
-    found = reply(fleet_over(folder, NAMES), name, CALLS.get(name, {}))
+def test_what_is_about_a_robot_is_a_row_of_its_whole_reply(
+    folder: Path, fleet: Fleet, name: str
+) -> None:
+    given = CALLS.get(name, {})
+    found, own = reply(fleet, name, given), alone(folder, name, given)
     order = sorted(NAMES, key=lambda robot: (-seeded(robot).end_s, robot))
-    assert found["robots"] == [
-        {"robot_name": robot, **alone(folder, robot, name, CALLS.get(name, {}))} for robot in order
-    ]
+    assert found["robots"] == [{"robot_name": robot, **own[robot]} for robot in order]
 
 
 BY: dict[str, object] = {**MUG, "topic": SEEN}
@@ -203,13 +213,12 @@ BY: dict[str, object] = {**MUG, "topic": SEEN}
     ],
 )
 def test_a_table_of_all_has_the_rows_of_each_with_the_robot(
-    folder: Path, tool: str, given: dict[str, object]
+    folder: Path, fleet: Fleet, tool: str, given: dict[str, object]
 ) -> None:
-    found = reply(fleet_over(folder, NAMES), tool, given)
+    found = reply(fleet, tool, given)
     rows = [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
     expected = []
-    for name in NAMES:
-        own = alone(folder, name, tool, given)
+    for name, own in alone(folder, tool, given).items():
         expected += [
             {"robot_name": name, **dict(zip(own["columns"], row, strict=True))}
             for row in own["rows"]
@@ -220,9 +229,8 @@ def test_a_table_of_all_has_the_rows_of_each_with_the_robot(
 
 
 def test_one_robot_of_those_that_may_be_asked_is_named_where_a_tool_is_about_one(
-    folder: Path,
+    folder: Path, fleet: Fleet
 ) -> None:
-    fleet = fleet_over(folder, NAMES)
     found = reply(fleet, "get_position_at", {"timestamp": START_S})
     assert found["error"] == "invalid_arguments"
     assert "pass robot, e.g. robot=r1" in found["detail"]
@@ -239,8 +247,7 @@ def test_one_robot_of_those_that_may_be_asked_is_named_where_a_tool_is_about_one
         tools_of(fleet)["find_last_match"].question(MUG | {"condition_type": "like"})
 
 
-def test_several_that_are_named_answer_as_all_do(folder: Path) -> None:
-    fleet = fleet_over(folder, NAMES)
+def test_several_that_are_named_answer_as_all_do(folder: Path, fleet: Fleet) -> None:
     some: dict[str, object] = {"robot": "r3, r1"}
     found = reply(fleet, "find_matches", {**MUG, **some})
     assert found == reply(fleet_over(folder, ("r1", "r3")), "find_matches", MUG)
@@ -265,9 +272,8 @@ def test_several_that_are_named_answer_as_all_do(folder: Path) -> None:
     ],
 )
 def test_coordinates_are_asked_of_one_robot_unless_all_share_a_map(
-    folder: Path, name: str, given: dict[str, object]
+    folder: Path, fleet: Fleet, name: str, given: dict[str, object]
 ) -> None:
-    fleet = fleet_over(folder, NAMES)
     refused = reply(fleet, name, given)
     assert refused["error"] == "invalid_arguments"
     assert "has coordinates" in refused["detail"]
@@ -291,8 +297,7 @@ def test_a_place_is_that_of_each_robots_own_map(folder: Path) -> None:
     assert any(note.startswith("no answer of r3: ") for note in found["notes"])
 
 
-def test_where_nobody_has_an_answer_the_reason_is_that_of_all(folder: Path) -> None:
-    fleet = fleet_over(folder, NAMES)
+def test_where_nobody_has_an_answer_the_reason_is_that_of_all(fleet: Fleet) -> None:
     found = reply(fleet, "find_matches", MUG | {"topic": "/none"})
     assert (found["error"], found["reason"]) == ("no_data", "topic_not_recorded")
     found = reply(fleet, "find_things", {"where": "garden"})
