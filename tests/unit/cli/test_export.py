@@ -118,27 +118,6 @@ class TestMcap:
         assert profile_of(ours) == "ros2"
         assert len(read(ours)) == 100
 
-    @needs_real
-    @pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")))
-    def test_other_programs_open_what_comes_of_public_robots_bags(
-        self, tmp_path: Path, name: str
-    ) -> None:
-        files = [each for each in sorted((REAL / name).iterdir()) if Rosbag2Reader().reads(each)]
-        for number, file in enumerate(files):
-            # Each by itself: in two recordings a message that is the same counts once.
-            folder = tmp_path / str(number)
-            folder.mkdir()
-            left(Path(shutil.copyfile(file, folder / file.name)))
-            out = tmp_path / f"{number}.mcap"
-            self.require_the_same(folder, out)
-
-    @needs_recorded
-    @pytest.mark.parametrize("name", ["session_mcap", "session_sqlite3", "session_zstd_file"])
-    def test_other_programs_open_what_comes_of_a_recorded_session(
-        self, tmp_path: Path, name: str
-    ) -> None:
-        self.require_the_same(RECORDED / name, tmp_path / "out.mcap")
-
     def require_the_same(self, folder: Path, out: Path) -> None:
         """Exports a folder; `mcap`, and where it can `rosbags`, count the same in the file."""
         reader = Rosbag2Reader()
@@ -164,6 +143,27 @@ class TestMcap:
             assert Counter(channel.topic for _, channel, _ in plain.iter_messages()) == expected
         if readable_by_rosbags:
             assert Counter(topic for topic, _, _ in read(out)) == expected
+
+    @needs_real
+    @pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")))
+    def test_other_programs_open_what_comes_of_public_robots_bags(
+        self, tmp_path: Path, name: str
+    ) -> None:
+        files = [each for each in sorted((REAL / name).iterdir()) if Rosbag2Reader().reads(each)]
+        for number, file in enumerate(files):
+            # Each by itself: in two recordings a message that is the same counts once.
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            left(Path(shutil.copyfile(file, folder / file.name)))
+            out = tmp_path / f"{number}.mcap"
+            self.require_the_same(folder, out)
+
+    @needs_recorded
+    @pytest.mark.parametrize("name", ["session_mcap", "session_sqlite3", "session_zstd_file"])
+    def test_other_programs_open_what_comes_of_a_recorded_session(
+        self, tmp_path: Path, name: str
+    ) -> None:
+        self.require_the_same(RECORDED / name, tmp_path / "out.mcap")
 
     @pytest.mark.parametrize("kind", ["db3", "mcap"])
     def test_definitions_that_the_bag_lacks_are_written(self, tmp_path: Path, kind: str) -> None:

@@ -76,71 +76,72 @@ def test_a_recording_is_own_by_whatever_path_it_is_named(
     assert is_foreign(Path("../run3"))
 
 
-class TestMetadata:
-    """Plain rosbags opens what was recovered as a recording, with the right counts."""
+def test_metadata_that_speaks_of_more_than_there_is_is_corrected(tmp_path: Path) -> None:
+    with Writer(tmp_path / "rec", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        store = typestore()
+        odometry = writer.add_connection("/odom", ODOMETRY, typestore=store)
+        writer.add_connection("/quiet", "std_msgs/msg/String", typestore=store)
+        for each in MESSAGES:
+            writer.write(odometry, each.log_time, each.payload)
+        writer.set_custom_data("robot", "seven")
+    cut = left_open(tmp_path / "rec/rec.mcap")
+    os.truncate(cut, cut.stat().st_size - 3000)
+    (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
+    _, printed = recovered(tmp_path / "rec")
+    assert any("metadata.yaml: rewritten" in line for line in printed)
+    held = McapReader().summarize(tmp_path / "rec/rec.mcap")
+    assert 0 < held.count < 100
+    assert counted(tmp_path / "rec") == {"/odom": held.count, "/quiet": 0}
+    assert "robot: seven" in (tmp_path / "rec/metadata.yaml").read_text()
+    with Reader(tmp_path / "rec") as reader:
+        assert (reader.start_time, reader.end_time) == (held.start, held.end + 1)
 
-    def test_that_speaks_of_more_than_there_is_is_corrected(self, tmp_path: Path) -> None:
-        with Writer(tmp_path / "rec", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            store = typestore()
-            odometry = writer.add_connection("/odom", ODOMETRY, typestore=store)
-            writer.add_connection("/quiet", "std_msgs/msg/String", typestore=store)
-            for each in MESSAGES:
-                writer.write(odometry, each.log_time, each.payload)
-            writer.set_custom_data("robot", "seven")
-        cut = left_open(tmp_path / "rec/rec.mcap")
-        os.truncate(cut, cut.stat().st_size - 3000)
-        (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
-        _, printed = recovered(tmp_path / "rec")
-        assert any("metadata.yaml: rewritten" in line for line in printed)
-        held = McapReader().summarize(tmp_path / "rec/rec.mcap")
-        assert 0 < held.count < 100
-        assert counted(tmp_path / "rec") == {"/odom": held.count, "/quiet": 0}
-        assert "robot: seven" in (tmp_path / "rec/metadata.yaml").read_text()
-        with Reader(tmp_path / "rec") as reader:
-            assert (reader.start_time, reader.end_time) == (held.start, held.end + 1)
 
-    @pytest.mark.parametrize(
-        ("text", "reason"),
-        [
-            ("{", "not YAML"),
-            ("rosbag2_bagfile_information: {}", "not of the storage"),
-            ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "not of the storage"),
-            ("rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}", "version 4"),
-            (
-                "rosbag2_bagfile_information: {storage_identifier: mcap, compression_mode: FILE}",
-                "compression",
-            ),
-            ("[]", "holds no keys"),
-        ],
-    )
-    def test_of_another_form_is_kept(self, tmp_path: Path, text: str, reason: str) -> None:
-        left_open(tmp_path / "rec/rec_0.mcap")
-        (tmp_path / "rec/metadata.yaml").write_text(text)
-        _, printed = recovered(tmp_path)
-        assert any("NOT CORRECTED" in line and reason in line for line in printed)
-        assert (tmp_path / "rec/metadata.yaml").read_text() == text
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{", "not YAML"),
+        ("rosbag2_bagfile_information: {}", "not of the storage"),
+        ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "not of the storage"),
+        ("rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}", "version 4"),
+        (
+            "rosbag2_bagfile_information: {storage_identifier: mcap, compression_mode: FILE}",
+            "compression",
+        ),
+        ("[]", "holds no keys"),
+    ],
+)
+def test_metadata_of_another_form_is_kept(tmp_path: Path, text: str, reason: str) -> None:
+    left_open(tmp_path / "rec/rec_0.mcap")
+    (tmp_path / "rec/metadata.yaml").write_text(text)
+    _, printed = recovered(tmp_path)
+    assert any("NOT CORRECTED" in line and reason in line for line in printed)
+    assert (tmp_path / "rec/metadata.yaml").read_text() == text
 
-    @needs_recorded
-    @pytest.mark.parametrize("name", ["session_killed", "session_killed_chunk64k", "session_mcap"])
-    def test_of_a_recorded_session(self, tmp_path: Path, name: str) -> None:
-        folder = tmp_path / name
-        copied(RECORDED / name, folder)
-        if name == "session_mcap":
-            last = folder / f"{name}_6.mcap"
-            last.write_bytes(last.read_bytes()[:-2000])
-        outcome, _ = recovered(folder, force=True)
-        assert outcome.failed == 0
-        found = [McapReader().summarize(each) for each in folder.glob("*.mcap")]
-        expected: Counter[str] = Counter()
-        for summary in found:
-            expected.update({each.topic: each.count for each in summary.topics})
-        assert {topic: n for topic, n in counted(folder).items() if n} == expected
-        for each in folder.glob("*.mcap"):
-            with each.open("rb") as stream:
-                plain = make_reader(stream).get_summary()
-                assert plain is not None
-                assert plain.statistics is not None
-                assert plain.statistics.message_count == McapReader().summarize(each).count
+
+@needs_recorded
+@pytest.mark.parametrize("name", ["session_killed", "session_killed_chunk64k", "session_mcap"])
+def test_metadata_of_a_recorded_session_is_as_plain_rosbags_reads_it(
+    tmp_path: Path, name: str
+) -> None:
+    folder = tmp_path / name
+    copied(RECORDED / name, folder)
+    if name == "session_mcap":
+        last = folder / f"{name}_6.mcap"
+        last.write_bytes(last.read_bytes()[:-2000])
+    outcome, _ = recovered(folder, force=True)
+    assert outcome.failed == 0
+    found = [McapReader().summarize(each) for each in folder.glob("*.mcap")]
+    expected: Counter[str] = Counter()
+    for summary in found:
+        expected.update({each.topic: each.count for each in summary.topics})
+    assert {topic: n for topic, n in counted(folder).items() if n} == expected
+    for each in folder.glob("*.mcap"):
+        with each.open("rb") as stream:
+            plain = make_reader(stream).get_summary()
+            assert plain is not None
+            assert plain.statistics is not None
+            assert plain.statistics.message_count == McapReader().summarize(each).count
 
 
 def counted(recording: Path) -> dict[str, int]:
@@ -189,17 +190,16 @@ def test_a_terminal_sees_which_file_is_repaired_and_then_a_clean_line(
     assert "\x1b[2K" in shown.rpartition("repairing")[2]
 
 
-class TestTheProgram:
-    @pytest.mark.parametrize("answer", ["n\n", ""])
-    def test_asks_before_it_changes_what_another_program_made(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, exits: Program
-    ) -> None:
-        empty = tmp_path / "rec" / "rec_0.mcap"
-        empty.parent.mkdir()
-        empty.write_bytes(b"")
-        monkeypatch.setattr("sys.stdin", io.StringIO(answer))
-        exits(1, f"recover {tmp_path} --force")
-        exits(2, f"recover {tmp_path} --force --json")
-        assert empty.exists()
-        exits(0, f"recover {tmp_path} --force --yes")
-        assert not empty.exists()
+@pytest.mark.parametrize("answer", ["n\n", ""])
+def test_recover_asks_before_it_changes_what_another_program_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, exits: Program
+) -> None:
+    empty = tmp_path / "rec" / "rec_0.mcap"
+    empty.parent.mkdir()
+    empty.write_bytes(b"")
+    monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+    exits(1, f"recover {tmp_path} --force")
+    exits(2, f"recover {tmp_path} --force --json")
+    assert empty.exists()
+    exits(0, f"recover {tmp_path} --force --yes")
+    assert not empty.exists()

@@ -164,71 +164,74 @@ def test_a_server_that_may_not_write_there_says_where(tmp_path: Path) -> None:
     assert ".episodic/requests" in refusal(memory)
 
 
-class TestTheList:
-    def keep(self, bag_dir: Path, number: int, **more: Any) -> None:
-        end = T0 + number * S
-        wish = SaveRequest(f"{number:032x}", f"number {number}", end - S, end, NOW)
-        write_saved_moment(make_moment_folder(bag_dir, wish), replace(SavedMoment(wish), **more))
-
-    def test_rules_are_told_with_how_often_they_fired_and_what_of_a_moment_is_not_kept(
-        self, tmp_path: Path
-    ) -> None:
-        (tmp_path / ".episodic").mkdir()
-        bumper = RuleRecord(fired=3, moments=1, refused=2, last_fired=NOW - 5 * S, problem="full")
-        TRIGGERS.write(tmp_path, TriggerState({"door": RuleRecord(), "bumper": bumper}))
-        missing = ("the share was used up",)
-        self.keep(tmp_path, 1, pending=False, rule="bumper", matches=3, missing=missing)
-        memory = memory_of(tmp_path, clock=SettableClock(NOW))
-        told = shown(memory, tmp_path)
-        [kept] = told["moments"]
-        assert (kept["rule"], kept["matches"]) == ("bumper", 3)
-        assert (kept["complete"], kept["notes"]) == (False, [*missing])
-        assert told["rules"] == [
-            {
-                "rule": "bumper",
-                "fired": 3,
-                "moments": 1,
-                "last_ts": (NOW - 5 * S) / S,
-                "last_ago_s": 5.0,
-                "refused": 2,
-                "problem": "full",
-            },
-            {"rule": "door", "fired": 0, "moments": 0},
-        ]
-        assert asked(memory, tmp_path, "memory_status")["rules"] == told["rules"]
-
-    def test_a_status_says_that_they_cannot_be_listed(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def refused(_bag_dir: Path) -> list[StoredMoment]:
-            raise PermissionError(errno.EACCES, "Permission denied")
-
-        monkeypatch.setattr(saved_moments, "stored_moments_in", refused)
-        status = asked(memory_of(tmp_path), tmp_path, "memory_status")
-        assert "moments" not in status
-        assert any("the moments cannot be listed: Permission denied" in n for n in status["notes"])
-        with pytest.raises(RefusedError, match="Permission denied"):
-            list_moments(memory_of(tmp_path), Call())
-
-    def test_a_file_in_the_place_of_the_folder_holds_none(self, tmp_path: Path) -> None:
-        (tmp_path / MOMENTS_FOLDER).write_text("no folder")
-        assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
+def keep(bag_dir: Path, number: int, **more: Any) -> None:
+    end = T0 + number * S
+    wish = SaveRequest(f"{number:032x}", f"number {number}", end - S, end, NOW)
+    write_saved_moment(make_moment_folder(bag_dir, wish), replace(SavedMoment(wish), **more))
 
 
-class TestTheTool:
-    @pytest.mark.parametrize(
-        ("given", "said"),
-        [
-            ({"label": ""}, "is empty"),
-            ({"label": "x" * 121}, "longer than 120"),
-            ({"label": "a\nb"}, "cannot be seen"),
-            ({"label": "\ud800"}, "cannot be seen"),
-            ({"label": "a", "seconds_before": 3601}, "is more than 3600"),
-            ({"label": "a", "seconds_after": 601}, "is more than 600"),
-            ({"label": "a", "seconds_after": -1}, "at least 0"),
-        ],
-    )
-    def test_its_arguments_are_bounded(self, given: dict[str, Any], said: str) -> None:
-        [tool] = [tool for tool in build_tools(QuerySettings(), writing=True) if tool.writes]
-        with pytest.raises(Exception, match=said):
-            tool.question(given)
+def test_rules_are_told_with_how_often_they_fired_and_what_of_a_moment_is_not_kept(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / ".episodic").mkdir()
+    bumper = RuleRecord(fired=3, moments=1, refused=2, last_fired=NOW - 5 * S, problem="full")
+    TRIGGERS.write(tmp_path, TriggerState({"door": RuleRecord(), "bumper": bumper}))
+    missing = ("the share was used up",)
+    keep(tmp_path, 1, pending=False, rule="bumper", matches=3, missing=missing)
+    memory = memory_of(tmp_path, clock=SettableClock(NOW))
+    told = shown(memory, tmp_path)
+    [kept] = told["moments"]
+    assert (kept["rule"], kept["matches"]) == ("bumper", 3)
+    assert (kept["complete"], kept["notes"]) == (False, [*missing])
+    assert told["rules"] == [
+        {
+            "rule": "bumper",
+            "fired": 3,
+            "moments": 1,
+            "last_ts": (NOW - 5 * S) / S,
+            "last_ago_s": 5.0,
+            "refused": 2,
+            "problem": "full",
+        },
+        {"rule": "door", "fired": 0, "moments": 0},
+    ]
+    assert asked(memory, tmp_path, "memory_status")["rules"] == told["rules"]
+
+
+def test_a_status_says_that_moments_cannot_be_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_bag_dir: Path) -> list[StoredMoment]:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(saved_moments, "stored_moments_in", refused)
+    status = asked(memory_of(tmp_path), tmp_path, "memory_status")
+    assert "moments" not in status
+    assert any("the moments cannot be listed: Permission denied" in n for n in status["notes"])
+    with pytest.raises(RefusedError, match="Permission denied"):
+        list_moments(memory_of(tmp_path), Call())
+
+
+def test_a_file_in_the_place_of_the_folder_holds_no_moment(tmp_path: Path) -> None:
+    (tmp_path / MOMENTS_FOLDER).write_text("no folder")
+    assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"label": ""}, "is empty"),
+        ({"label": "x" * 121}, "longer than 120"),
+        ({"label": "a\nb"}, "cannot be seen"),
+        ({"label": "\ud800"}, "cannot be seen"),
+        ({"label": "a", "seconds_before": 3601}, "is more than 3600"),
+        ({"label": "a", "seconds_after": 601}, "is more than 600"),
+        ({"label": "a", "seconds_after": -1}, "at least 0"),
+    ],
+)
+def test_arguments_of_the_tool_that_saves_moments_are_bounded(
+    given: dict[str, Any], said: str
+) -> None:
+    [tool] = [tool for tool in build_tools(QuerySettings(), writing=True) if tool.writes]
+    with pytest.raises(Exception, match=said):
+        tool.question(given)

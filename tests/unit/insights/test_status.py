@@ -207,88 +207,84 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     assert shown(memory, tmp_path)["doubts"] == SOUND
 
 
-class TestWhatIsMissingIsNamedAndCounted:
-    def doubts(self, folder: Path) -> str:
-        doubts = shown(memory_of(folder), folder)["doubts"]
-        assert isinstance(doubts, str)
-        return doubts
-
-    def recording(self, folder: Path, *listed: tuple[str, int]) -> None:
-        """Two splits of five messages each, and a metadata.yaml that lists those given."""
-        for split in range(2):
-            messages = [odom(BEGIN + (10 * split + t) * S, 0.0, 0.0) for t in range(5)]
-            write_mcap(folder / f"rec_{split}.mcap", messages)
-        names = "".join(f"  - {name}\n" for name, _ in listed)
-        files = "".join(f"  - path: {name}\n    message_count: {n}\n" for name, n in listed)
-        (folder / "metadata.yaml").write_text(
-            "rosbag2_bagfile_information:\n  version: 9\n"
-            f"  message_count: {sum(n for _, n in listed)}\n"
-            f"  relative_file_paths:\n{names}  files:\n{files}"
-        )
-
-    def test_a_file_that_may_be_being_written_or_left_by_a_crash(self, tmp_path: Path) -> None:
-        messages = [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)]
-        path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-        content = path.read_bytes()[:-100]
-        path.write_bytes(content)
-        clock = SettableClock(path.stat().st_mtime_ns + S)
-
-        def doubts(memory: Memory) -> str:
-            return str(shown(memory, tmp_path)["doubts"])
-
-        memory, young = memory_of(tmp_path, clock=clock), "1 file has no end yet"
-        assert young in doubts(memory)
-        # Seen to grow, it is being written.
-        path.write_bytes(content + b"x")
-        assert young not in doubts(memory)
-        # So is one that a live recorder names.
-        assert young in doubts(memory_of(tmp_path, clock=clock))
-        beat(tmp_path, clock.now(), recordings=("rec",))
-        assert young not in doubts(memory_of(tmp_path, clock=clock))
-
-    @pytest.mark.parametrize(
-        ("listed", "beside", "doubts"),
-        [
-            (
-                [("rec_0.mcap", 5), *((f"rec_{n}.mcap", 20) for n in range(1, 14))],
-                "other.json",
-                "lists 12 missing files and 255 messages that no file here contains",
-            ),
-            (
-                [("rec_0.mcap", 5), ("rec_1.mcap", 255)],
-                "other.json",
-                "metadata.yaml of rec lists 250 messages that no file here contains",
-            ),
-            ([("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5)], "other.json", SOUND),  # compressed
-            ([("rec_0.mcap", 9), ("rec_1.mcap", 9)], "handover.json", SOUND),  # cut by a handover
-        ],
+def recording(folder: Path, *listed: tuple[str, int]) -> None:
+    """Two splits of five messages each, and a metadata.yaml that lists those given."""
+    for split in range(2):
+        messages = [odom(BEGIN + (10 * split + t) * S, 0.0, 0.0) for t in range(5)]
+        write_mcap(folder / f"rec_{split}.mcap", messages)
+    names = "".join(f"  - {name}\n" for name, _ in listed)
+    files = "".join(f"  - path: {name}\n    message_count: {n}\n" for name, n in listed)
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 9\n"
+        f"  message_count: {sum(n for _, n in listed)}\n"
+        f"  relative_file_paths:\n{names}  files:\n{files}"
     )
-    def test_splits_and_messages_that_metadata_lists(
-        self, tmp_path: Path, listed: list[tuple[str, int]], beside: str, doubts: str
-    ) -> None:
-        self.recording(tmp_path / "rec", *listed)
-        (tmp_path / "rec" / beside).write_text("{}")
-        assert self.doubts(tmp_path).endswith(doubts)
 
-    def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
-        self, tmp_path: Path
-    ) -> None:
-        self.recording(tmp_path / "rec", *((f"rec_{n}.mcap", 5) for n in range(-3, 3)))
-        beat(tmp_path, BEGIN + 59 * S, RecorderState.STOPPED)
-        own = tmp_path / ".episodic" / "recordings.jsonl"
-        own.parent.mkdir()
-        inode = (tmp_path / "rec").stat().st_ino
-        own.write_text(with_checks('{"bag_dir_id": "5f0c"}'))
-        assert "lists 4 missing files" in self.doubts(tmp_path)
-        with own.open("a") as stream:
-            stream.write(with_checks(json.dumps({"recording": "rec", "inode": inode})))
-        assert "lists 1 missing file" in self.doubts(tmp_path)
 
-    def test_nothing_behind_a_link_is_looked_at(self, tmp_path: Path) -> None:
-        self.recording(tmp_path / "bags" / "rec", ("rec_0.mcap", 5), ("gone.mcap", 5))
-        memory = memory_of(tmp_path / "bags")
-        snapshot = memory.index.snapshot()
-        (tmp_path / "bags" / "rec").rename(tmp_path / "outside")
-        (tmp_path / "bags" / "rec").symlink_to(tmp_path / "outside")
-        (absent,) = memory.absent_splits(snapshot)
-        assert (absent.files, absent.unreadable) == ((), True)
+def test_a_file_without_an_end_may_be_being_written_or_left_by_a_crash(tmp_path: Path) -> None:
+    messages = [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)]
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    content = path.read_bytes()[:-100]
+    path.write_bytes(content)
+    clock = SettableClock(path.stat().st_mtime_ns + S)
+
+    def doubts(memory: Memory) -> str:
+        return str(shown(memory, tmp_path)["doubts"])
+
+    memory, young = memory_of(tmp_path, clock=clock), "1 file has no end yet"
+    assert young in doubts(memory)
+    # Seen to grow, it is being written.
+    path.write_bytes(content + b"x")
+    assert young not in doubts(memory)
+    # So is one that a live recorder names.
+    assert young in doubts(memory_of(tmp_path, clock=clock))
+    beat(tmp_path, clock.now(), recordings=("rec",))
+    assert young not in doubts(memory_of(tmp_path, clock=clock))
+
+
+@pytest.mark.parametrize(
+    ("listed", "beside", "doubts"),
+    [
+        (
+            [("rec_0.mcap", 5), *((f"rec_{n}.mcap", 20) for n in range(1, 14))],
+            "other.json",
+            "lists 12 missing files and 255 messages that no file here contains",
+        ),
+        (
+            [("rec_0.mcap", 5), ("rec_1.mcap", 255)],
+            "other.json",
+            "metadata.yaml of rec lists 250 messages that no file here contains",
+        ),
+        ([("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5)], "other.json", SOUND),  # compressed
+        ([("rec_0.mcap", 9), ("rec_1.mcap", 9)], "handover.json", SOUND),  # cut by a handover
+    ],
+)
+def test_splits_and_messages_that_metadata_lists_and_no_file_has_are_counted(
+    tmp_path: Path, listed: list[tuple[str, int]], beside: str, doubts: str
+) -> None:
+    recording(tmp_path / "rec", *listed)
+    (tmp_path / "rec" / beside).write_text("{}")
+    assert shown(memory_of(tmp_path), tmp_path)["doubts"].endswith(doubts)
+
+
+def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(tmp_path: Path) -> None:
+    recording(tmp_path / "rec", *((f"rec_{n}.mcap", 5) for n in range(-3, 3)))
+    beat(tmp_path, BEGIN + 59 * S, RecorderState.STOPPED)
+    own = tmp_path / ".episodic" / "recordings.jsonl"
+    own.parent.mkdir()
+    inode = (tmp_path / "rec").stat().st_ino
+    own.write_text(with_checks('{"bag_dir_id": "5f0c"}'))
+    assert "lists 4 missing files" in shown(memory_of(tmp_path), tmp_path)["doubts"]
+    with own.open("a") as stream:
+        stream.write(with_checks(json.dumps({"recording": "rec", "inode": inode})))
+    assert "lists 1 missing file" in shown(memory_of(tmp_path), tmp_path)["doubts"]
+
+
+def test_nothing_behind_a_link_is_looked_at(tmp_path: Path) -> None:
+    recording(tmp_path / "bags" / "rec", ("rec_0.mcap", 5), ("gone.mcap", 5))
+    memory = memory_of(tmp_path / "bags")
+    snapshot = memory.index.snapshot()
+    (tmp_path / "bags" / "rec").rename(tmp_path / "outside")
+    (tmp_path / "bags" / "rec").symlink_to(tmp_path / "outside")
+    (absent,) = memory.absent_splits(snapshot)
+    assert (absent.files, absent.unreadable) == ((), True)
