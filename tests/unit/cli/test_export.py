@@ -94,146 +94,144 @@ def things(writer: McapFile) -> None:
     writer.add_message(channel, T0, b'{"x": 1}', T0)
 
 
-class TestMcap:
-    def test_that_nothing_but_latched_messages_of_before_was_found_is_reported(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
-        write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [mount, *driven(T0 + 3, 0)])
-        out = tmp_path / "out.mcap"
-        asked = f"export --start {T0 / NS_PER_S + 5000} --end {T0 / NS_PER_S + 6000} --mcap {out}"
-        assert "no message is in the window" in exits(2, asked).err
+def test_that_nothing_but_latched_messages_of_before_was_found_is_reported(
+    bag_dir: Path, tmp_path: Path, exits: Program
+) -> None:
+    mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
+    write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [mount, *driven(T0 + 3, 0)])
+    out = tmp_path / "out.mcap"
+    asked = f"export --start {T0 / NS_PER_S + 5000} --end {T0 / NS_PER_S + 6000} --mcap {out}"
+    assert "no message is in the window" in exits(2, asked).err
+    assert not out.exists()
+    assert "no message is in the window" in exits(0, asked, "--latched").err
+    assert {row[0] for row in read(out)} == {"/tf_static"}
+
+
+def test_the_profile_is_that_of_ros_2_where_the_first_message_is_cdr(tmp_path: Path) -> None:
+    folder = tmp_path / "bags"
+    raw_mcap(folder / "json_0.mcap", things)
+    write_mcap(folder / "rec_0.mcap", driven(T0 + 1, 0))
+    assert profile_of(exported(folder, tmp_path / "all.mcap")) == ""
+    ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/odom")
+    assert profile_of(ours) == "ros2"
+    assert len(read(ours)) == 100
+
+
+def require_the_same(folder: Path, out: Path) -> None:
+    """Exports a folder; `mcap`, and where it can `rosbags`, count the same in the file."""
+    reader = Rosbag2Reader()
+    expected: Counter[str] = Counter()
+    readable_by_rosbags = True
+    for bag in memory_of(folder, storage="rosbag2").index.refresh().bags:
+        expected.update({each.topic: each.count for each in bag.summary.topics})
+        for channel in reader.channels(bag.path):
+            of_ros2 = channel.schema.encoding in {"", "ros2msg", "ros2idl"}
+            readable_by_rosbags &= channel.encoding == "cdr" and of_ros2
+    settings = "deployment=replay storage=rosbag2"
+    code = cli.main(f"export --mcap {out} --bag-dir {folder} {settings}".split())
+    if not expected:
+        assert code != 0
         assert not out.exists()
-        assert "no message is in the window" in exits(0, asked, "--latched").err
-        assert {row[0] for row in read(out)} == {"/tf_static"}
+        return
+    with out.open("rb") as stream:
+        plain = make_reader(stream)
+        summary = plain.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == expected.total()
+        assert Counter(channel.topic for _, channel, _ in plain.iter_messages()) == expected
+    if readable_by_rosbags:
+        assert Counter(topic for topic, _, _ in read(out)) == expected
 
-    def test_the_profile_is_that_of_ros_2_where_the_first_message_is_cdr(
-        self, tmp_path: Path
-    ) -> None:
-        folder = tmp_path / "bags"
-        raw_mcap(folder / "json_0.mcap", things)
-        write_mcap(folder / "rec_0.mcap", driven(T0 + 1, 0))
-        assert profile_of(exported(folder, tmp_path / "all.mcap")) == ""
-        ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/odom")
-        assert profile_of(ours) == "ros2"
-        assert len(read(ours)) == 100
 
-    def require_the_same(self, folder: Path, out: Path) -> None:
-        """Exports a folder; `mcap`, and where it can `rosbags`, count the same in the file."""
-        reader = Rosbag2Reader()
-        expected: Counter[str] = Counter()
-        readable_by_rosbags = True
-        for bag in memory_of(folder, storage="rosbag2").index.refresh().bags:
-            expected.update({each.topic: each.count for each in bag.summary.topics})
-            for channel in reader.channels(bag.path):
-                of_ros2 = channel.schema.encoding in {"", "ros2msg", "ros2idl"}
-                readable_by_rosbags &= channel.encoding == "cdr" and of_ros2
-        settings = "deployment=replay storage=rosbag2"
-        code = cli.main(f"export --mcap {out} --bag-dir {folder} {settings}".split())
-        if not expected:
-            assert code != 0
-            assert not out.exists()
-            return
-        with out.open("rb") as stream:
-            plain = make_reader(stream)
-            summary = plain.get_summary()
-            assert summary is not None
-            assert summary.statistics is not None
-            assert summary.statistics.message_count == expected.total()
-            assert Counter(channel.topic for _, channel, _ in plain.iter_messages()) == expected
-        if readable_by_rosbags:
-            assert Counter(topic for topic, _, _ in read(out)) == expected
-
-    @needs_real
-    @pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")))
-    def test_other_programs_open_what_comes_of_public_robots_bags(
-        self, tmp_path: Path, name: str
-    ) -> None:
-        files = [each for each in sorted((REAL / name).iterdir()) if Rosbag2Reader().reads(each)]
-        for number, file in enumerate(files):
-            # Each by itself: in two recordings a message that is the same counts once.
-            folder = tmp_path / str(number)
-            folder.mkdir()
-            left(Path(shutil.copyfile(file, folder / file.name)))
-            out = tmp_path / f"{number}.mcap"
-            self.require_the_same(folder, out)
-
-    @needs_recorded
-    @pytest.mark.parametrize("name", ["session_mcap", "session_sqlite3", "session_zstd_file"])
-    def test_other_programs_open_what_comes_of_a_recorded_session(
-        self, tmp_path: Path, name: str
-    ) -> None:
-        self.require_the_same(RECORDED / name, tmp_path / "out.mcap")
-
-    @pytest.mark.parametrize("kind", ["db3", "mcap"])
-    def test_definitions_that_the_bag_lacks_are_written(self, tmp_path: Path, kind: str) -> None:
-        messages = [odom(T0, 1.5, 0.0), text(T0, "x"), Msg("/bell", EMPTY, T0, b"\0\1\0\0\0")]
-        file = tmp_path / "bags" / "rec" / f"rec_0.{kind}"
-        if kind == "db3":
-            write_db3(file, messages, definitions=False)
-        else:
-            write_mcap(file, messages, McapLayout(definitions=False))
-        out = exported(tmp_path / "bags", tmp_path / "out.mcap")
-        with AnyReader([out]) as reader:
-            values = {
-                connection.topic: reader.deserialize(raw, connection.msgtype)
-                for connection, _, raw in reader.messages()
-            }
-        assert values.keys() == {"/odom", "/chatter", "/bell"}
-        assert "x=1.5," in repr(values["/odom"])
-
-    def test_an_interrupted_export_leaves_nothing(self, bag_dir: Path, tmp_path: Path) -> None:
-        def interrupted() -> Iterator[StoredMessage]:
-            view = View(memory_of(bag_dir), Call())
-            yield from view.stream.messages(["/odom"], TimeWindow.everything())
-            raise KeyboardInterrupt
-
-        folder = tmp_path / "out"
+@needs_real
+@pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")))
+def test_other_programs_open_what_comes_of_public_robots_bags(tmp_path: Path, name: str) -> None:
+    files = [each for each in sorted((REAL / name).iterdir()) if Rosbag2Reader().reads(each)]
+    for number, file in enumerate(files):
+        # Each by itself: in two recordings a message that is the same counts once.
+        folder = tmp_path / str(number)
         folder.mkdir()
-        with pytest.raises(KeyboardInterrupt):
-            export_mcap(folder / "out.mcap", interrupted())
-        assert [*folder.iterdir()] == []
+        left(Path(shutil.copyfile(file, folder / file.name)))
+        out = tmp_path / f"{number}.mcap"
+        require_the_same(folder, out)
 
 
-class TestParquet:
-    def test_duckdb_computes_the_way_that_trajectory_summary_reports(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        window = f"start={T0 / NS_PER_S} end={T0 / NS_PER_S + 60}"
-        told = exits(0, f"ask trajectory_summary {window} --json").json["distance_m"]
-        exits(0, f"export --parquet {tmp_path}/rows")
-        ((length,),) = queried(
-            tmp_path / "rows",
-            """
-            SELECT sum(sqrt((x - px)^2 + (y - py)^2 + (z - pz)^2)) FROM (
-              SELECT x, y, z, lag(x) OVER way AS px, lag(y) OVER way AS py, lag(z) OVER way AS pz
-              FROM memory
-              WHERE topic = '/odom' AND recording = 'rec_0'
-              WINDOW way AS (PARTITION BY recording ORDER BY log_time)
-            )
-            """,
+@needs_recorded
+@pytest.mark.parametrize("name", ["session_mcap", "session_sqlite3", "session_zstd_file"])
+def test_other_programs_open_what_comes_of_a_recorded_session(tmp_path: Path, name: str) -> None:
+    require_the_same(RECORDED / name, tmp_path / "out.mcap")
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_definitions_that_the_bag_lacks_are_written(tmp_path: Path, kind: str) -> None:
+    messages = [odom(T0, 1.5, 0.0), text(T0, "x"), Msg("/bell", EMPTY, T0, b"\0\1\0\0\0")]
+    file = tmp_path / "bags" / "rec" / f"rec_0.{kind}"
+    if kind == "db3":
+        write_db3(file, messages, definitions=False)
+    else:
+        write_mcap(file, messages, McapLayout(definitions=False))
+    out = exported(tmp_path / "bags", tmp_path / "out.mcap")
+    with AnyReader([out]) as reader:
+        values = {
+            connection.topic: reader.deserialize(raw, connection.msgtype)
+            for connection, _, raw in reader.messages()
+        }
+    assert values.keys() == {"/odom", "/chatter", "/bell"}
+    assert "x=1.5," in repr(values["/odom"])
+
+
+def test_an_interrupted_export_leaves_nothing(bag_dir: Path, tmp_path: Path) -> None:
+    def interrupted() -> Iterator[StoredMessage]:
+        view = View(memory_of(bag_dir), Call())
+        yield from view.stream.messages(["/odom"], TimeWindow.everything())
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "out"
+    folder.mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        export_mcap(folder / "out.mcap", interrupted())
+    assert [*folder.iterdir()] == []
+
+
+def test_duckdb_computes_the_way_that_trajectory_summary_reports(
+    bag_dir: Path, tmp_path: Path, exits: Program
+) -> None:
+    window = f"start={T0 / NS_PER_S} end={T0 / NS_PER_S + 60}"
+    told = exits(0, f"ask trajectory_summary {window} --json").json["distance_m"]
+    exits(0, f"export --parquet {tmp_path}/rows")
+    ((length,),) = queried(
+        tmp_path / "rows",
+        """
+        SELECT sum(sqrt((x - px)^2 + (y - py)^2 + (z - pz)^2)) FROM (
+          SELECT x, y, z, lag(x) OVER way AS px, lag(y) OVER way AS py, lag(z) OVER way AS pz
+          FROM memory
+          WHERE topic = '/odom' AND recording = 'rec_0'
+          WINDOW way AS (PARTITION BY recording ORDER BY log_time)
         )
-        assert length == pytest.approx(told, abs=1e-3)
-        assert told > 4
+        """,
+    )
+    assert length == pytest.approx(told, abs=1e-3)
+    assert told > 4
 
-    def test_what_cannot_be_decoded_has_a_row_that_says_why(
-        self, tmp_path: Path, exits: Program
-    ) -> None:
-        odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\x00\x01\x00\x00\x00")
-        layout = McapLayout(definitions=False)
-        write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [odd], layout)
-        err = exits(1, f"export --parquet {tmp_path}/rows {tmp_path}/bags").err
-        assert "nobody_msgs/msg/Knows cannot be decoded: their rows have no value" in err
-        ((reason, value),) = queried(tmp_path / "rows", "SELECT undecodable, value FROM memory")
-        assert reason
-        assert value is None
 
-    def test_without_the_optional_part_it_says_how_to_get_it(
-        self, bag_dir: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
-        monkeypatch.setitem(sys.modules, "pyarrow", None)
-        assert "pip install '.[parquet]'" in exits(2, f"export --parquet {tmp_path}/rows").err
+def test_what_cannot_be_decoded_has_a_row_that_says_why(tmp_path: Path, exits: Program) -> None:
+    odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\x00\x01\x00\x00\x00")
+    layout = McapLayout(definitions=False)
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [odd], layout)
+    err = exits(1, f"export --parquet {tmp_path}/rows {tmp_path}/bags").err
+    assert "nobody_msgs/msg/Knows cannot be decoded: their rows have no value" in err
+    ((reason, value),) = queried(tmp_path / "rows", "SELECT undecodable, value FROM memory")
+    assert reason
+    assert value is None
+
+
+def test_without_the_optional_part_it_says_how_to_get_it(
+    bag_dir: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert "pip install '.[parquet]'" in exits(2, f"export --parquet {tmp_path}/rows").err
 
 
 def queried(folder: Path, query: str) -> list[tuple[object, ...]]:
@@ -243,25 +241,24 @@ def queried(folder: Path, query: str) -> list[tuple[object, ...]]:
     return rows
 
 
-class TestWindows:
-    def test_times_are_read_as_people_write_them_and_what_is_none_is_refused(self) -> None:
-        for written, expected in (
-            ("1700000000.5", 1_700_000_000.5),
-            ("2023-11-14T22:13:20+00:00", 1_700_000_000),
-            ("90s", NOW - 90),
-            ("10m ago", NOW - 600),
-            ("1.5 h", NOW - 5400),
-            ("2d", NOW - 172_800),
-            ("14:05", "2023-11-14T14:05:00"),
-            ("today 14:05:30", "2023-11-14T14:05:30"),
-            ("Yesterday 14:05", "2023-11-13T14:05:00"),
-            ("yesterday", "2023-11-13T00:00:00"),
-            ("24:00", "2023-11-15T00:00:00"),
-            ("yesterday 24:00:00", "2023-11-14T00:00:00"),
-            ("2023-11-14 14:05", "2023-11-14T14:05:00"),
-        ):
-            local = datetime.fromisoformat(expected) if isinstance(expected, str) else None
-            assert parse_time(written, NOW) == (local.timestamp() if local else expected)
-        for wrong in ("noon", "", "25:00", "10 weeks", "yesterday noon", "-5m"):
-            with pytest.raises(InvalidArgumentsError, match="yesterday 14:05"):
-                parse_time(wrong, NOW)
+def test_times_are_read_as_people_write_them_and_what_is_none_is_refused() -> None:
+    for written, expected in (
+        ("1700000000.5", 1_700_000_000.5),
+        ("2023-11-14T22:13:20+00:00", 1_700_000_000),
+        ("90s", NOW - 90),
+        ("10m ago", NOW - 600),
+        ("1.5 h", NOW - 5400),
+        ("2d", NOW - 172_800),
+        ("14:05", "2023-11-14T14:05:00"),
+        ("today 14:05:30", "2023-11-14T14:05:30"),
+        ("Yesterday 14:05", "2023-11-13T14:05:00"),
+        ("yesterday", "2023-11-13T00:00:00"),
+        ("24:00", "2023-11-15T00:00:00"),
+        ("yesterday 24:00:00", "2023-11-14T00:00:00"),
+        ("2023-11-14 14:05", "2023-11-14T14:05:00"),
+    ):
+        local = datetime.fromisoformat(expected) if isinstance(expected, str) else None
+        assert parse_time(written, NOW) == (local.timestamp() if local else expected)
+    for wrong in ("noon", "", "25:00", "10 weeks", "yesterday noon", "-5m"):
+        with pytest.raises(InvalidArgumentsError, match="yesterday 14:05"):
+            parse_time(wrong, NOW)

@@ -133,134 +133,135 @@ def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) ->
     assert len(bags(bag_dir)) == 4
 
 
-class TestForeignBags:
-    """Bags that this deployment's recorder did not make."""
-
-    def test_they_are_kept_and_are_named_with_what_to_do_and_with_delete_they_go_too(
-        self, bag_dir: Path, forget: Forget
-    ) -> None:
-        (bag_dir / "rec_1").rename(bag_dir / "session")
-        (bag_dir / "rec_0" / "rec_1.mcap").rename(bag_dir / "loose.mcap")
-        shown = forget(1, 0, 100).out
-        names = {path.name for path in bag_dir.rglob("*.mcap")}
-        assert names == {"carried.mcap", "loose.mcap", "rec_2.mcap", "rec_3.mcap"}
-        assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in shown
-        assert "`ros2-memory adopt session` first" in shown
-        assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in shown
-        forget(0, 40, 100, "--yes retention.foreign=delete")
-        assert not (bag_dir / "session").exists()
-
-    def test_without_a_list_nothing_goes_before_it_is_adopted(
-        self, bag_dir: Path, exits: Program, forget: Forget
-    ) -> None:
-        # What a recorder embeds, a copy without its list embeds as well.
-        shutil.rmtree(bag_dir / ".episodic")
-        name = "rec_20231114T221320Z"
-        path = embedding(bag_dir / name / f"{name}_0.mcap", start=T0 + 200 * NS_PER_S)
-        left(path)
-        shown = forget(1, 190, 300).out
-        assert path.exists()
-        assert f"`ros2-memory adopt {name}` first" in shown
-        exits(0, f"adopt {name}")
-        forget(0, 190, 300)
-        assert not path.exists()
-
-    @pytest.mark.parametrize("more", ["", "--topic /odom"])
-    def test_a_copy_beside_a_bag_is_named_or_goes_too(
-        self, bag_dir: Path, forget: Forget, more: str
-    ) -> None:
-        path = bag_dir / "rec_1" / "rec_3.mcap"
-        copy = path.with_name("rec_3 (copy).mcap")
-        shutil.copy2(path, copy)
-        assert "stays: rec_1/rec_3 (copy).mcap" in forget(1, 55, 100, f"--yes {more}").out
-        forget(0, 55, 100, f"--yes retention.foreign=delete {more}")
-        assert not copy.exists() or not [*McapReader().summarize(copy).of("/odom")]
-
-    @pytest.mark.parametrize("folder", ["latched", "moments/x", "moments/x/rec_1"])
-    def test_in_folders_of_the_recorder_too_they_go_once_they_are_adopted(
-        self, bag_dir: Path, folder: str, forget: Forget, exits: Program
-    ) -> None:
-        made_moment(bag_dir / "moments" / "x")
-        name = f"{folder}/y_0.mcap"
-        path = left(write_mcap(bag_dir / name, [odom(T0 + 65 * NS_PER_S, 1.0, 0.0)]))
-        before = path.read_bytes()
-        shown = forget(1, 64, 66, "--yes --topic /odom").out
-        assert f"stays: {name}: this recorder did not make it; `ros2-memory adopt`" in shown
-        assert f"`ros2-memory adopt {folder}` first" in forget(1, 65, 65).out
-        assert path.read_bytes() == before
-        exits(0, f"adopt {folder}")
-        forget(0, 64, 66, "--yes --topic /odom")
-        assert McapReader().summarize(path).count == 0
-
-    def test_one_that_took_the_place_of_another_while_it_was_asked_is_kept(
-        self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
-    ) -> None:
-        def meanwhile(*_: object, **__: object) -> None:
-            shutil.copytree(bag_dir / "rec_1", bag_dir / "copy")
-            (bag_dir / "rec_1").rename(bag_dir.parent / "away")
-            (bag_dir / "copy").rename(bag_dir / "rec_1")
-
-        monkeypatch.setattr("typer.confirm", meanwhile)
-        forget(0, 40, 100, "")
-        assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
+def test_foreign_bags_are_kept_and_named_with_what_to_do_and_with_delete_they_go_too(
+    bag_dir: Path, forget: Forget
+) -> None:
+    (bag_dir / "rec_1").rename(bag_dir / "session")
+    (bag_dir / "rec_0" / "rec_1.mcap").rename(bag_dir / "loose.mcap")
+    shown = forget(1, 0, 100).out
+    names = {path.name for path in bag_dir.rglob("*.mcap")}
+    assert names == {"carried.mcap", "loose.mcap", "rec_2.mcap", "rec_3.mcap"}
+    assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in shown
+    assert "`ros2-memory adopt session` first" in shown
+    assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in shown
+    forget(0, 40, 100, "--yes retention.foreign=delete")
+    assert not (bag_dir / "session").exists()
 
 
-class TestUnreadable:
-    def test_a_file_that_cannot_be_read_is_named_wherever_its_mtime_allows_messages(
-        self, bag_dir: Path, forget: Forget
-    ) -> None:
-        path = write_mcap(bag_dir / "session" / "session_0.mcap", [odom(T0, 1.0, 0.0)])
-        own_all(bag_dir)
-        data = bytearray(path.read_bytes())
-        data[0] ^= 1
-        path.write_bytes(data)
-        os.utime(path, (T0 / NS_PER_S + 2 * 86400,) * 2)
-        assert "stays: session/session_0.mcap: " in forget(1, -5, 0.5).out
+def test_without_a_list_nothing_goes_before_it_is_adopted(
+    bag_dir: Path, exits: Program, forget: Forget
+) -> None:
+    # What a recorder embeds, a copy without its list embeds as well.
+    shutil.rmtree(bag_dir / ".episodic")
+    name = "rec_20231114T221320Z"
+    path = embedding(bag_dir / name / f"{name}_0.mcap", start=T0 + 200 * NS_PER_S)
+    left(path)
+    shown = forget(1, 190, 300).out
+    assert path.exists()
+    assert f"`ros2-memory adopt {name}` first" in shown
+    exits(0, f"adopt {name}")
+    forget(0, 190, 300)
+    assert not path.exists()
 
-    def test_the_other_form_of_a_bag_goes_with_it_and_is_not_said_to_stay(
-        self, bag_dir: Path, forget: Forget
-    ) -> None:
-        other = bag_dir / "rec_1" / "rec_2.mcap.zstd"
-        other.write_bytes(b"compressed")
-        left(other)
-        assert "stays" not in forget(0, 39, 55, "--yes storage=mcap").out
-        assert not other.exists()
 
-    def test_a_form_that_cannot_be_deleted_stays_alone(
-        self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
-    ) -> None:
-        bag, other = bag_dir / "rec_1" / "rec_2.mcap", bag_dir / "rec_1" / "rec_2.mcap.zstd"
-        other.write_bytes(b"compressed")
-        left(other)
-        size, unlink = bag.stat().st_size, os.unlink
+@pytest.mark.parametrize("more", ["", "--topic /odom"])
+def test_a_copy_beside_a_bag_is_named_or_goes_too(bag_dir: Path, forget: Forget, more: str) -> None:
+    path = bag_dir / "rec_1" / "rec_3.mcap"
+    copy = path.with_name("rec_3 (copy).mcap")
+    shutil.copy2(path, copy)
+    assert "stays: rec_1/rec_3 (copy).mcap" in forget(1, 55, 100, f"--yes {more}").out
+    forget(0, 55, 100, f"--yes retention.foreign=delete {more}")
+    assert not copy.exists() or not [*McapReader().summarize(copy).of("/odom")]
 
-        def refused(path: str, *, dir_fd: int | None = None) -> None:
-            if path == other.name:
-                raise PermissionError(errno.EPERM, "Operation not permitted", path)
-            unlink(path, dir_fd=dir_fd)
 
-        monkeypatch.setattr(os, "unlink", refused)
-        printed = forget(1, 39, 55, "--yes storage=mcap").out
-        assert f"deleted: 1 bag, {format_size(size)}" in printed
-        assert "stays: rec_1/rec_2.mcap.zstd: Operation not permitted" in printed
-        assert (bag.exists(), other.exists()) == (False, True)
+@pytest.mark.parametrize("folder", ["latched", "moments/x", "moments/x/rec_1"])
+def test_foreign_bags_in_folders_of_the_recorder_go_once_they_are_adopted(
+    bag_dir: Path, folder: str, forget: Forget, exits: Program
+) -> None:
+    made_moment(bag_dir / "moments" / "x")
+    name = f"{folder}/y_0.mcap"
+    path = left(write_mcap(bag_dir / name, [odom(T0 + 65 * NS_PER_S, 1.0, 0.0)]))
+    before = path.read_bytes()
+    shown = forget(1, 64, 66, "--yes --topic /odom").out
+    assert f"stays: {name}: this recorder did not make it; `ros2-memory adopt`" in shown
+    assert f"`ros2-memory adopt {folder}` first" in forget(1, 65, 65).out
+    assert path.read_bytes() == before
+    exits(0, f"adopt {folder}")
+    forget(0, 64, 66, "--yes --topic /odom")
+    assert McapReader().summarize(path).count == 0
 
-    def test_one_that_a_crash_left_open_is_closed_by_recover_also_where_none_counts(
-        self, bag_dir: Path, forget: Forget, exits: Program
-    ) -> None:
-        name = "rec_20231114T221330Z"
-        messages = [odom(T0 + 200 * NS_PER_S + n, 1.0, 0.0) for n in range(30)]
-        layout = McapLayout(finish=False, chunk_size=400)
-        path = left(write_mcap(bag_dir / name / f"{name}_0.mcap", messages, layout))
-        write_handover(bag_dir / name, Handover(state=Counting.VOID, previous="rec_1"))
-        own_all(bag_dir)
-        shown = forget(1, 199, 10**5).out
-        assert f"stays: {name}/{path.name}: a crash left it open" in shown
-        assert "ros2-memory recover closes it" in shown
-        exits(0, f"recover {path}")
-        left(path)
-        forget(0, 199, 10**5)
-        assert not path.exists()
+
+def test_a_bag_that_took_the_place_of_another_while_it_was_asked_is_kept(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    def meanwhile(*_: object, **__: object) -> None:
+        shutil.copytree(bag_dir / "rec_1", bag_dir / "copy")
+        (bag_dir / "rec_1").rename(bag_dir.parent / "away")
+        (bag_dir / "copy").rename(bag_dir / "rec_1")
+
+    monkeypatch.setattr("typer.confirm", meanwhile)
+    forget(0, 40, 100, "")
+    assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
+
+
+def test_a_file_that_cannot_be_read_is_named_wherever_its_mtime_allows_messages(
+    bag_dir: Path, forget: Forget
+) -> None:
+    path = write_mcap(bag_dir / "session" / "session_0.mcap", [odom(T0, 1.0, 0.0)])
+    own_all(bag_dir)
+    data = bytearray(path.read_bytes())
+    data[0] ^= 1
+    path.write_bytes(data)
+    os.utime(path, (T0 / NS_PER_S + 2 * 86400,) * 2)
+    assert "stays: session/session_0.mcap: " in forget(1, -5, 0.5).out
+
+
+def test_the_other_form_of_a_bag_goes_with_it_and_is_not_said_to_stay(
+    bag_dir: Path, forget: Forget
+) -> None:
+    other = bag_dir / "rec_1" / "rec_2.mcap.zstd"
+    other.write_bytes(b"compressed")
+    left(other)
+    assert "stays" not in forget(0, 39, 55, "--yes storage=mcap").out
+    assert not other.exists()
+
+
+def test_a_form_that_cannot_be_deleted_stays_alone(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    bag, other = bag_dir / "rec_1" / "rec_2.mcap", bag_dir / "rec_1" / "rec_2.mcap.zstd"
+    other.write_bytes(b"compressed")
+    left(other)
+    size, unlink = bag.stat().st_size, os.unlink
+
+    def refused(path: str, *, dir_fd: int | None = None) -> None:
+        if path == other.name:
+            raise PermissionError(errno.EPERM, "Operation not permitted", path)
+        unlink(path, dir_fd=dir_fd)
+
+    monkeypatch.setattr(os, "unlink", refused)
+    printed = forget(1, 39, 55, "--yes storage=mcap").out
+    assert f"deleted: 1 bag, {format_size(size)}" in printed
+    assert "stays: rec_1/rec_2.mcap.zstd: Operation not permitted" in printed
+    assert (bag.exists(), other.exists()) == (False, True)
+
+
+def test_a_bag_that_a_crash_left_open_is_closed_by_recover_also_where_none_counts(
+    bag_dir: Path, forget: Forget, exits: Program
+) -> None:
+    name = "rec_20231114T221330Z"
+    messages = [odom(T0 + 200 * NS_PER_S + n, 1.0, 0.0) for n in range(30)]
+    layout = McapLayout(finish=False, chunk_size=400)
+    path = left(write_mcap(bag_dir / name / f"{name}_0.mcap", messages, layout))
+    write_handover(bag_dir / name, Handover(state=Counting.VOID, previous="rec_1"))
+    own_all(bag_dir)
+    shown = forget(1, 199, 10**5).out
+    assert f"stays: {name}/{path.name}: a crash left it open" in shown
+    assert "ros2-memory recover closes it" in shown
+    exits(0, f"recover {path}")
+    left(path)
+    forget(0, 199, 10**5)
+    assert not path.exists()
 
 
 def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
@@ -285,24 +286,25 @@ def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
     assert "stays: rec_a/rec_a_1.mcap: it reaches beyond the window" in shown
 
 
-class TestMetadata:
-    @pytest.fixture
-    def metadata(self, bag_dir: Path) -> Path:
-        """That of the first recording."""
-        return described(bag_dir / "rec_0")
+@pytest.fixture
+def metadata(bag_dir: Path) -> Path:
+    """That of the first recording."""
+    return described(bag_dir / "rec_0")
 
-    def test_it_lists_what_is_left(self, metadata: Path, forget: Forget) -> None:
-        shown = forget(0, 0, 15).out
-        info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
-        assert (info["relative_file_paths"], info["message_count"]) == (["rec_1.mcap"], 11)
-        assert "rec_0/metadata.yaml describes what is left" in shown
 
-    def test_where_that_cannot_be_it_says_so_and_what_to_do(
-        self, metadata: Path, forget: Forget
-    ) -> None:
-        metadata.write_text(metadata.read_text().replace("version: ", "version: -"))
-        before = metadata.read_text()
-        output = forget(0, 0, 15).out
-        assert "rec_0/metadata.yaml still describes what was deleted (it is of version" in output
-        assert f"ros2 bag reindex {metadata.parent}" in output
-        assert metadata.read_text() == before
+def test_metadata_lists_what_is_left(metadata: Path, forget: Forget) -> None:
+    shown = forget(0, 0, 15).out
+    info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+    assert (info["relative_file_paths"], info["message_count"]) == (["rec_1.mcap"], 11)
+    assert "rec_0/metadata.yaml describes what is left" in shown
+
+
+def test_where_metadata_cannot_be_corrected_it_says_so_and_what_to_do(
+    metadata: Path, forget: Forget
+) -> None:
+    metadata.write_text(metadata.read_text().replace("version: ", "version: -"))
+    before = metadata.read_text()
+    output = forget(0, 0, 15).out
+    assert "rec_0/metadata.yaml still describes what was deleted (it is of version" in output
+    assert f"ros2 bag reindex {metadata.parent}" in output
+    assert metadata.read_text() == before

@@ -107,191 +107,198 @@ def test_what_makes_no_sense_is_refused_with_the_reason(
     assert "\x1b" not in refused
 
 
-class TestPaths:
-    @pytest.mark.parametrize(
-        ("path", "bags", "poses"),
-        # The two loose files hold the same messages, and lie in one folder.
-        [(".", 5, 19), ("a", 2, 10), ("a/a_0.mcap", 1, 5), ("loose/red.mcap", 1, 2)],
-    )
-    def test_info_and_topics_take_a_folder_or_a_bag(
-        self, folder: Path, exits: Program, path: str, bags: int, poses: int
-    ) -> None:
-        shown = exits(0, f"info {path} --json").json
-        assert shown["data_time_range"]["bags"] == bags
-        assert shown["memory_status"]["recorder"] is None
-        counts = {row["topic"]: row["count"] for row in exits(0, f"topics {path} --json").json}
-        assert counts["/odom"] == poses
-
-    def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
-        self, folder: Path, exits: Program
-    ) -> None:
-        bag = folder / "a" / "a_0.mcap"
-        bag.write_bytes(bag.read_bytes()[:-20])
-        os.utime(bag, (1.7e9, 1.7e9))
-        shown = exits(0, "topics .").err
-        assert shown.count("readable part is used") == 1
-        assert ": 1 unfinished bag" in shown
-        assert [len(row["notes"]) for row in exits(0, "topics . --json").json] == [1, 1]
-
-    def test_a_deployment_that_records_there_is_looked_at_as_it_is(
-        self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def budget(line: str) -> float | None:
-            most: float | None = exits(0, line).json["memory_status"]["budget"]["max_gb"]
-            return most
-
-        own_all(folder)
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-        assert budget("info --json") == 5.0
-        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-        assert (budget("info . --json"), budget("info a --json")) == (5.0, None)
-
-    def test_topics_without_messages_are_named_and_the_first_of_many_faults_of_clocks(
-        self, tmp_path: Path, exits: Program
-    ) -> None:
-        declared = [("/idle", "std_msgs/msg/Bool"), ("/lost", "std_msgs/msg/Bool")]
-        write_mcap(tmp_path / "a" / "a_0.mcap", seconds(0, 3), declared=declared)
-        for nth in range(12):
-            boot = [odom(nth * 100 * NS_PER_S, 0.0, 0.0)]  # before the clock was set
-            write_mcap(tmp_path / f"r{nth}" / f"r{nth}_0.mcap", boot)
-        words = " ".join(exits(0, f"info {tmp_path}").out.split())
-        assert "topics_without_messages /idle, /lost" in words
-        assert "silent_topics" not in words
-        assert words.count("the clock was not set") == 10
-        assert "2 more clock_faults: --json prints them" in words
-        reply = exits(0, f"info {tmp_path} --json").json
-        assert reply["held"]["topics_without_messages"] == ["/idle", "/lost"]
-        assert len(reply["data_time_range"]["clock_faults"]) == 12
+@pytest.mark.parametrize(
+    ("path", "bags", "poses"),
+    # The two loose files hold the same messages, and lie in one folder.
+    [(".", 5, 19), ("a", 2, 10), ("a/a_0.mcap", 1, 5), ("loose/red.mcap", 1, 2)],
+)
+def test_info_and_topics_take_a_folder_or_a_bag(
+    folder: Path, exits: Program, path: str, bags: int, poses: int
+) -> None:
+    shown = exits(0, f"info {path} --json").json
+    assert shown["data_time_range"]["bags"] == bags
+    assert shown["memory_status"]["recorder"] is None
+    counts = {row["topic"]: row["count"] for row in exits(0, f"topics {path} --json").json}
+    assert counts["/odom"] == poses
 
 
-class TestRecordings:
-    def rows(self, exits: Program, *words: str) -> dict[str, dict[str, JsonValue]]:
-        found = exits(0, "recordings . --json", *words).json
-        return {row["recording"]: row for row in found if "recording" in row}
-
-    def test_it_says_whose_they_are_and_names_what_is_not_read(
-        self, folder: Path, exits: Program
-    ) -> None:
-        own_all(folder)
-        write_mcap(folder / "c" / "c_0.mcap", seconds(300, 2))
-        (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
-        os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
-        rows = self.rows(exits)
-        assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another recorder")
-        assert "c/c_1.mcap" in exits(0, "recordings .").out
-        assert "1 damaged bag file" in " ".join(exits(0, "info .").out.split())
-        (folder / LIST_FILE).unlink()
-        (folder / LIST_FILE).mkdir()  # a list that cannot be read
-        assert {row["whose"] for row in self.rows(exits).values()} == {None}
-
-    def test_one_without_a_message_is_named_too(self, folder: Path, exits: Program) -> None:
-        names = ["b/b_1.mcap", "caught_nothing/caught_nothing_0.mcap", "lies_loose.mcap"]
-        for name in names:
-            write_mcap(folder / name, [])
-        files = [row["file"] for row in exits(0, "recordings . --json").json if "file" in row]
-        assert files == names
-        assert "no message was recorded" in exits(0, "recordings .").out
-        assert exits(0, "info . --json").json["held"]["empty_bags"] == 3
-        # Where there is nothing else, one line says so.
-        for line in ("recordings caught_nothing", "recordings empty", "topics empty", "info empty"):
-            [told] = exits(1, line).out.splitlines()
-            assert str(folder / line.split()[1]) in told
-
-    @pytest.mark.parametrize(("name", "count"), [("a", 10), ("b", 4), ("loose/blue", 3)])
-    def test_each_can_be_looked_at_alone(
-        self, folder: Path, exits: Program, name: str, count: int
-    ) -> None:
-        lines = exits(0, f"cat /odom . --recording {name} --json").out.splitlines()
-        assert len(lines) == count
-        assert [*self.rows(exits, "--recording", name)] == [name]
-
-    def test_what_is_forgotten_is_forgotten_of_one_recording_too(
-        self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        own_all(folder)
-        for bag in folder.rglob("*.mcap"):  # one that changed just now is not stored yet
-            os.utime(bag, (1_700_000_000,) * 2)
-        monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-        monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
-        counts = {"bags": 2, "stored": 2, "refused": 0}
-        assert exits(0, "index data.recording=a --json").json == counts
-        (store,) = folder.rglob("columns.sqlite")
-        with closing(sqlite3.connect(store)) as base:
-            assert base.execute("SELECT count(*) FROM bag").fetchone() == (2,)
-        forgetting = ["forget", "--last", "9000", "--topic", "/chatter", "--yes", "--json"]
-        assert exits(0, *forgetting).json["stays"] == []
-        # Without the bag that had some of it, and what has a part in common with that.
-        with closing(sqlite3.connect(store)) as base:
-            assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
+def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
+    folder: Path, exits: Program
+) -> None:
+    bag = folder / "a" / "a_0.mcap"
+    bag.write_bytes(bag.read_bytes()[:-20])
+    os.utime(bag, (1.7e9, 1.7e9))
+    shown = exits(0, "topics .").err
+    assert shown.count("readable part is used") == 1
+    assert ": 1 unfinished bag" in shown
+    assert [len(row["notes"]) for row in exits(0, "topics . --json").json] == [1, 1]
 
 
-class TestIndex:
-    def test_where_no_store_can_be_written_it_says_so(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
-    ) -> None:
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
-        (tmp_path / OWN_FOLDER).write_text("a file where a folder should be")
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / OWN_FOLDER))
-        assert "XDG_CACHE_HOME" in exits(2, "index").err
+def test_a_deployment_that_records_there_is_looked_at_as_it_is(
+    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def budget(line: str) -> float | None:
+        most: float | None = exits(0, line).json["memory_status"]["budget"]["max_gb"]
+        return most
+
+    own_all(folder)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    assert budget("info --json") == 5.0
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    assert (budget("info . --json"), budget("info a --json")) == (5.0, None)
 
 
-class TestCat:
-    def test_no_text_commands_a_terminal_nor_a_reply_and_letters_that_it_has_not_are_spelled_out(
-        self, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        write_mcap(tmp_path / "rec_0.mcap", [text(T0, "\x1b[2J\x9b31m k\u00fcche", "/speech")])
-        with monkeypatch.context() as terminal:
-            terminal.setattr(sys.stdout, "isatty", lambda: True)
-            for option in ("--csv", "--json"):
-                assert not {"\x1b", "\x9b"} & {*exits(0, "cat /speech", option, tmp_path).out}
-        shown = exits(0, f"ask {tmp_path} get_topic_in_last topic=/speech seconds=4000").out
-        assert "\x1b" not in shown
-        assert "\\x1b[2J" in shown
-        written = BytesIO()
-        monkeypatch.setattr(sys, "stdout", TextIOWrapper(written, encoding="ascii"))
-        assert cli.main(["cat", "/speech", str(tmp_path)]) == 0
-        assert written.getvalue().endswith(b" k\\xfcche\n")
+def test_topics_without_messages_are_named_and_the_first_of_many_faults_of_clocks(
+    tmp_path: Path, exits: Program
+) -> None:
+    declared = [("/idle", "std_msgs/msg/Bool"), ("/lost", "std_msgs/msg/Bool")]
+    write_mcap(tmp_path / "a" / "a_0.mcap", seconds(0, 3), declared=declared)
+    for nth in range(12):
+        boot = [odom(nth * 100 * NS_PER_S, 0.0, 0.0)]  # before the clock was set
+        write_mcap(tmp_path / f"r{nth}" / f"r{nth}_0.mcap", boot)
+    words = " ".join(exits(0, f"info {tmp_path}").out.split())
+    assert "topics_without_messages /idle, /lost" in words
+    assert "silent_topics" not in words
+    assert words.count("the clock was not set") == 10
+    assert "2 more clock_faults: --json prints them" in words
+    reply = exits(0, f"info {tmp_path} --json").json
+    assert reply["held"]["topics_without_messages"] == ["/idle", "/lost"]
+    assert len(reply["data_time_range"]["clock_faults"]) == 12
 
-    def test_csv_has_a_column_for_each_field(self, folder: Path, exits: Program) -> None:
-        words = ("--csv", "--field", "position.y", "--field", "header.frame_id")
-        rows = [*csv.reader(exits(0, "cat /odom b", *words).out.splitlines())]
-        assert rows[0] == ["time", "position.y", "header.frame_id"]
-        assert rows[1:] == [[f"1700000{100 + n}.000000000", f"{n}.0", "odom"] for n in range(4)]
 
-    def test_levels_of_a_log_have_their_names(self, tmp_path: Path, exits: Program) -> None:
-        lines = [log_entry(T0 + level, level, "nav", "said") for level in (30, 35)]
-        write_mcap(tmp_path / "rec" / "rec_0.mcap", lines)
-        shown = exits(0, f"cat /rosout {tmp_path}").out
-        assert re.findall("level: ([^;]*);", shown) == ["WARN (30)", "35"]
-        shown = exits(0, f"cat /rosout {tmp_path} --field level --limit 1").out
-        assert shown.endswith("level: WARN (30)\n")
+def rows(exits: Program, *words: str) -> dict[str, dict[str, JsonValue]]:
+    found = exits(0, "recordings . --json", *words).json
+    return {row["recording"]: row for row in found if "recording" in row}
 
-    @pytest.mark.parametrize(
-        ("words", "expected"),
-        [
-            ("--limit 2", [0, 1]),
-            ("--tail 2", [8, 9]),
-            ("--last 1.5", [8, 9]),
-            ("--last 1.5s", [8, 9]),
-            ("--start 3s --end 2s", [6, 7]),
-        ],
-    )
-    def test_some_can_be_chosen(
-        self, folder: Path, exits: Program, words: str, expected: list[int]
-    ) -> None:
-        lines = exits(0, f"cat /odom a --json {words}").out.splitlines()
-        times = [json.loads(line)["time_ns"] for line in lines]
-        assert times == [T0 + n * NS_PER_S for n in expected]
 
-    def test_a_reader_that_ends_early_is_no_error(self, folder: Path, tmp_path: Path) -> None:
-        write_command(tmp_path)
-        program = [str(tmp_path / "ros2-memory"), "cat", "/odom", str(folder / "a")]
-        reading, writing = os.pipe()
-        os.close(reading)  # as `head` does once it has its lines
-        done = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, check=False)
-        os.close(writing)
-        assert (done.returncode, done.stderr) == (1, b"")
+def test_recordings_says_whose_they_are_and_names_what_is_not_read(
+    folder: Path, exits: Program
+) -> None:
+    own_all(folder)
+    write_mcap(folder / "c" / "c_0.mcap", seconds(300, 2))
+    (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
+    os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
+    found = rows(exits)
+    assert (found["a"]["whose"], found["c"]["whose"]) == ("this recorder", "another recorder")
+    assert "c/c_1.mcap" in exits(0, "recordings .").out
+    assert "1 damaged bag file" in " ".join(exits(0, "info .").out.split())
+    (folder / LIST_FILE).unlink()
+    (folder / LIST_FILE).mkdir()  # a list that cannot be read
+    assert {row["whose"] for row in rows(exits).values()} == {None}
+
+
+def test_a_recording_without_a_message_is_named_too(folder: Path, exits: Program) -> None:
+    names = ["b/b_1.mcap", "caught_nothing/caught_nothing_0.mcap", "lies_loose.mcap"]
+    for name in names:
+        write_mcap(folder / name, [])
+    files = [row["file"] for row in exits(0, "recordings . --json").json if "file" in row]
+    assert files == names
+    assert "no message was recorded" in exits(0, "recordings .").out
+    assert exits(0, "info . --json").json["held"]["empty_bags"] == 3
+    # Where there is nothing else, one line says so.
+    for line in ("recordings caught_nothing", "recordings empty", "topics empty", "info empty"):
+        [told] = exits(1, line).out.splitlines()
+        assert str(folder / line.split()[1]) in told
+
+
+@pytest.mark.parametrize(("name", "count"), [("a", 10), ("b", 4), ("loose/blue", 3)])
+def test_each_recording_can_be_looked_at_alone(
+    folder: Path, exits: Program, name: str, count: int
+) -> None:
+    lines = exits(0, f"cat /odom . --recording {name} --json").out.splitlines()
+    assert len(lines) == count
+    assert [*rows(exits, "--recording", name)] == [name]
+
+
+def test_what_is_forgotten_is_forgotten_of_one_recording_too(
+    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own_all(folder)
+    for bag in folder.rglob("*.mcap"):  # one that changed just now is not stored yet
+        os.utime(bag, (1_700_000_000,) * 2)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
+    counts = {"bags": 2, "stored": 2, "refused": 0}
+    assert exits(0, "index data.recording=a --json").json == counts
+    (store,) = folder.rglob("columns.sqlite")
+    with closing(sqlite3.connect(store)) as base:
+        assert base.execute("SELECT count(*) FROM bag").fetchone() == (2,)
+    forgetting = ["forget", "--last", "9000", "--topic", "/chatter", "--yes", "--json"]
+    assert exits(0, *forgetting).json["stays"] == []
+    # Without the bag that had some of it, and what has a part in common with that.
+    with closing(sqlite3.connect(store)) as base:
+        assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
+
+
+def test_where_no_store_can_be_written_index_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+) -> None:
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    (tmp_path / OWN_FOLDER).write_text("a file where a folder should be")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / OWN_FOLDER))
+    assert "XDG_CACHE_HOME" in exits(2, "index").err
+
+
+def test_no_text_commands_a_terminal_nor_a_reply_and_letters_that_it_has_not_are_spelled_out(
+    tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mcap(tmp_path / "rec_0.mcap", [text(T0, "\x1b[2J\x9b31m k\u00fcche", "/speech")])
+    with monkeypatch.context() as terminal:
+        terminal.setattr(sys.stdout, "isatty", lambda: True)
+        for option in ("--csv", "--json"):
+            assert not {"\x1b", "\x9b"} & {*exits(0, "cat /speech", option, tmp_path).out}
+    shown = exits(0, f"ask {tmp_path} get_topic_in_last topic=/speech seconds=4000").out
+    assert "\x1b" not in shown
+    assert "\\x1b[2J" in shown
+    written = BytesIO()
+    monkeypatch.setattr(sys, "stdout", TextIOWrapper(written, encoding="ascii"))
+    assert cli.main(["cat", "/speech", str(tmp_path)]) == 0
+    assert written.getvalue().endswith(b" k\\xfcche\n")
+
+
+def test_csv_has_a_column_for_each_field(folder: Path, exits: Program) -> None:
+    words = ("--csv", "--field", "position.y", "--field", "header.frame_id")
+    rows = [*csv.reader(exits(0, "cat /odom b", *words).out.splitlines())]
+    assert rows[0] == ["time", "position.y", "header.frame_id"]
+    assert rows[1:] == [[f"1700000{100 + n}.000000000", f"{n}.0", "odom"] for n in range(4)]
+
+
+def test_levels_of_a_log_have_their_names(tmp_path: Path, exits: Program) -> None:
+    lines = [log_entry(T0 + level, level, "nav", "said") for level in (30, 35)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", lines)
+    shown = exits(0, f"cat /rosout {tmp_path}").out
+    assert re.findall("level: ([^;]*);", shown) == ["WARN (30)", "35"]
+    shown = exits(0, f"cat /rosout {tmp_path} --field level --limit 1").out
+    assert shown.endswith("level: WARN (30)\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("--limit 2", [0, 1]),
+        ("--tail 2", [8, 9]),
+        ("--last 1.5", [8, 9]),
+        ("--last 1.5s", [8, 9]),
+        ("--start 3s --end 2s", [6, 7]),
+    ],
+)
+def test_some_messages_can_be_chosen(
+    folder: Path, exits: Program, words: str, expected: list[int]
+) -> None:
+    lines = exits(0, f"cat /odom a --json {words}").out.splitlines()
+    times = [json.loads(line)["time_ns"] for line in lines]
+    assert times == [T0 + n * NS_PER_S for n in expected]
+
+
+def test_a_reader_that_ends_early_is_no_error(folder: Path, tmp_path: Path) -> None:
+    write_command(tmp_path)
+    program = [str(tmp_path / "ros2-memory"), "cat", "/odom", str(folder / "a")]
+    reading, writing = os.pipe()
+    os.close(reading)  # as `head` does once it has its lines
+    done = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 @given(st.integers(946_684_800_000_000, 4_102_444_800_000_000))
@@ -360,46 +367,45 @@ def test_where_something_is_recorded_info_says_for_how_long_the_budget_lasts(
     assert "full in" in shown
 
 
-class TestConfig:
-    def test_it_is_shown_as_yaml_that_a_program_would_take_but_no_token_is(
-        self, exits: Program, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("MEMORY_BAG_DIR", "/bags")
-        monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
-        text = exits(0, "config show server.port=9300").out
-        shown = yaml.safe_load(text)
-        assert shown["server"]["port"] == 9300
-        assert shown["recording"]["bag_dir"] == "/bags"
-        assert shown["storage"]["_target_"].startswith("ros2_memory.")
-        assert "MEMORY_API_TOKEN is set" in text
-        assert "a-secret" not in text
+def test_config_is_shown_as_yaml_that_a_program_would_take_but_no_token_is(
+    exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEMORY_BAG_DIR", "/bags")
+    monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
+    text = exits(0, "config show server.port=9300").out
+    shown = yaml.safe_load(text)
+    assert shown["server"]["port"] == 9300
+    assert shown["recording"]["bag_dir"] == "/bags"
+    assert shown["storage"]["_target_"].startswith("ros2_memory.")
+    assert "MEMORY_API_TOKEN is set" in text
+    assert "a-secret" not in text
 
-    def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
-        self, monkeypatch: pytest.MonkeyPatch, exits: Program
-    ) -> None:
-        monkeypatch.setenv("MEMORY_BAG_DIR", "/bags")
-        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot_live")
-        monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "recorder=none")
-        monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", "/")
-        head, *rows = exits(0, "config show --sources server.port=9300").out.splitlines()
-        assert head.startswith("# files are those of ")
-        told = {
-            key: f"{rest} "
-            for key, _, rest in (" ".join(row.split()).partition(" ") for row in rows)
-        }
-        for key, who in (
-            ("deployment", "by MEMORY_DEPLOYMENT "),
-            ("storage", "deployment/robot.yaml "),
-            ("recorder", "by MEMORY_CONFIG_OVERRIDES "),
-            ("server.port", "on the command line "),
-            ("server.name", "config.yaml "),
-            ("server.transport", "deployment/robot.yaml "),
-            ("reader.include_active", "deployment/robot_live.yaml "),
-            ("reader.custom_msg_paths", "config.yaml, and by ROS_VISION_INTERFACES_PATH "),
-            ("recording.bag_dir", "by MEMORY_BAG_DIR "),
-            ("recorder._target_", "recorder/none.yaml "),
-        ):
-            assert told[key].startswith(who), key
+
+def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
+    monkeypatch: pytest.MonkeyPatch, exits: Program
+) -> None:
+    monkeypatch.setenv("MEMORY_BAG_DIR", "/bags")
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot_live")
+    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "recorder=none")
+    monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", "/")
+    head, *rows = exits(0, "config show --sources server.port=9300").out.splitlines()
+    assert head.startswith("# files are those of ")
+    told = {
+        key: f"{rest} " for key, _, rest in (" ".join(row.split()).partition(" ") for row in rows)
+    }
+    for key, who in (
+        ("deployment", "by MEMORY_DEPLOYMENT "),
+        ("storage", "deployment/robot.yaml "),
+        ("recorder", "by MEMORY_CONFIG_OVERRIDES "),
+        ("server.port", "on the command line "),
+        ("server.name", "config.yaml "),
+        ("server.transport", "deployment/robot.yaml "),
+        ("reader.include_active", "deployment/robot_live.yaml "),
+        ("reader.custom_msg_paths", "config.yaml, and by ROS_VISION_INTERFACES_PATH "),
+        ("recording.bag_dir", "by MEMORY_BAG_DIR "),
+        ("recorder._target_", "recorder/none.yaml "),
+    ):
+        assert told[key].startswith(who), key
 
 
 def test_warnings_are_one_sentence_and_with_v_the_events(folder: Path, exits: Program) -> None:

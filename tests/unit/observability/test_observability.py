@@ -66,42 +66,42 @@ def at(found: Samples, name: str, **labels: str) -> float:
     return found[f"ros2_memory_{name}", frozenset(labels.items())]
 
 
-class TestMetrics:
-    async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
-        metrics = Metrics(lambda: (), "1")
-        full = tool("full", partial(asking, "full"))
-        dispatcher = served(full, telemetry=Telemetry((metrics,))).dispatcher
-        hostile = ['a"} 1\nup 0\n#', "\\", "\x00", "\ud800", "x" * 100_000, "full\n", "", "{"]
-        await dispatcher.answer("full", {})
-        for n in range(200):
-            name = hostile[n % len(hostile)] + str(n)
-            await dispatcher.answer(name, {name: name})
-        shown = await metrics.exposition()
-        assert len(shown.body) < 20_000
-        found = await scraped(metrics)
-        tool_labels = {dict(labels).get("tool") for _, labels in found}
-        assert tool_labels == {None, "full", UNKNOWN_TOOL}
-        asked = {"tool": UNKNOWN_TOOL, "outcome": "invalid_arguments", "reason": ""}
-        assert at(found, "answers_total", **asked) == 200
-        dispatcher.stop()
+async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole() -> None:
+    metrics = Metrics(lambda: (), "1")
+    full = tool("full", partial(asking, "full"))
+    dispatcher = served(full, telemetry=Telemetry((metrics,))).dispatcher
+    hostile = ['a"} 1\nup 0\n#', "\\", "\x00", "\ud800", "x" * 100_000, "full\n", "", "{"]
+    await dispatcher.answer("full", {})
+    for n in range(200):
+        name = hostile[n % len(hostile)] + str(n)
+        await dispatcher.answer(name, {name: name})
+    shown = await metrics.exposition()
+    assert len(shown.body) < 20_000
+    found = await scraped(metrics)
+    tool_labels = {dict(labels).get("tool") for _, labels in found}
+    assert tool_labels == {None, "full", UNKNOWN_TOOL}
+    asked = {"tool": UNKNOWN_TOOL, "outcome": "invalid_arguments", "reason": ""}
+    assert at(found, "answers_total", **asked) == 200
+    dispatcher.stop()
 
-    async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone(self) -> None:
-        freed = threading.Event()
 
-        def hanging() -> list[Metric]:
-            freed.wait()
-            return [GaugeMetricFamily("ros2_memory_bags", "Bags.", 3)]
+async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone() -> None:
+    freed = threading.Event()
 
-        metrics = Metrics(hanging, "1", timeout_s=0.01)
-        metrics.answered(call())
-        try:
-            for _ in range(2):
-                found = await scraped(metrics)
-                assert at(found, "answers_total", tool="ask", outcome="ok", reason="") == 1
-                assert "ros2_memory_bags" not in {name for name, _ in found}
-        finally:
-            freed.set()
-            metrics.stop()
+    def hanging() -> list[Metric]:
+        freed.wait()
+        return [GaugeMetricFamily("ros2_memory_bags", "Bags.", 3)]
+
+    metrics = Metrics(hanging, "1", timeout_s=0.01)
+    metrics.answered(call())
+    try:
+        for _ in range(2):
+            found = await scraped(metrics)
+            assert at(found, "answers_total", tool="ask", outcome="ok", reason="") == 1
+            assert "ros2_memory_bags" not in {name for name, _ in found}
+    finally:
+        freed.set()
+        metrics.stop()
 
 
 def measured(gauges: MemoryGauges) -> dict[str, float]:
@@ -192,95 +192,95 @@ def reply(exporter: InMemorySpanExporter, outcome: str) -> ReadableSpan:
     return span
 
 
-class TestTraces:
-    @pytest.mark.parametrize("over_mcp", [True, False])
-    async def test_a_call_has_one_span_of_its_length_with_its_outcome_and_stages(
-        self, spans: InMemorySpanExporter, over_mcp: bool
-    ) -> None:
-        server, given = traced(), {"secret": "s3cret"}
-        if over_mcp:
-            async with Client(server) as client:
-                await client.call_tool("full", {})
-                await client.call_tool("empty", given)
-        else:
-            await server.dispatcher.answer("full", {})
-            await server.dispatcher.answer("other", given)
-        full = reply(spans, "ok")
-        attributes = full.attributes or {}
-        assert full.name == "tools/call full"
-        assert full.start_time is not None
-        assert full.end_time is not None
-        assert full.end_time > full.start_time
-        assert full.status.status_code is trace.StatusCode.UNSET
-        assert float(cast("float", attributes["ros2_memory.stage.read_ms"])) >= 0
-        assert attributes["ros2_memory.reply_chars"]
-        assert attributes["ros2_memory.correlation_id"]
-        if over_mcp:
-            assert attributes["gen_ai.tool.name"] == "full"
-            assert attributes["mcp.method.name"] == "tools/call"
-            assert reply(spans, "no_data: gap").name == "tools/call empty"
-        else:
-            refused = reply(spans, "invalid_arguments")
-            assert refused.status.status_code is trace.StatusCode.ERROR
-        assert "s3cret" not in "".join(each.to_json() for each in spans.get_finished_spans())
+@pytest.mark.parametrize("over_mcp", [True, False])
+async def test_a_call_has_one_span_of_its_length_with_its_outcome_and_stages(
+    spans: InMemorySpanExporter, over_mcp: bool
+) -> None:
+    server, given = traced(), {"secret": "s3cret"}
+    if over_mcp:
+        async with Client(server) as client:
+            await client.call_tool("full", {})
+            await client.call_tool("empty", given)
+    else:
+        await server.dispatcher.answer("full", {})
+        await server.dispatcher.answer("other", given)
+    full = reply(spans, "ok")
+    attributes = full.attributes or {}
+    assert full.name == "tools/call full"
+    assert full.start_time is not None
+    assert full.end_time is not None
+    assert full.end_time > full.start_time
+    assert full.status.status_code is trace.StatusCode.UNSET
+    assert float(cast("float", attributes["ros2_memory.stage.read_ms"])) >= 0
+    assert attributes["ros2_memory.reply_chars"]
+    assert attributes["ros2_memory.correlation_id"]
+    if over_mcp:
+        assert attributes["gen_ai.tool.name"] == "full"
+        assert attributes["mcp.method.name"] == "tools/call"
+        assert reply(spans, "no_data: gap").name == "tools/call empty"
+    else:
+        refused = reply(spans, "invalid_arguments")
+        assert refused.status.status_code is trace.StatusCode.ERROR
+    assert "s3cret" not in "".join(each.to_json() for each in spans.get_finished_spans())
 
-    @pytest.mark.parametrize("spans", [False], indirect=True)
-    async def test_without_arguments_nothing_that_a_client_chose_is_in_a_span(
-        self, spans: InMemorySpanExporter
-    ) -> None:
-        async with Client(traced()) as client:
-            await client.call_tool("full", {"s3cret": "s3cret"})
-            await client.call_tool("s3cret", {"s3cret": "s3cret"})
-            for ask in (client.get_prompt, client.read_resource):
-                with pytest.raises(MCPError):
-                    await ask("file:///s3cret")
-        served = [each for each in spans.get_finished_spans() if each.kind is trace.SpanKind.SERVER]
-        assert "s3cret" not in "".join(each.to_json() for each in served)
-        names = {each.name for each in served}
-        assert {"tools/call full", "tools/call unknown", "prompts/get", "resources/read"} <= names
 
-    async def test_whatever_a_client_sends_spans_stay_small(
-        self, spans: InMemorySpanExporter
-    ) -> None:
-        long = "x" * 100_000
-        async with Client(traced()) as client:
-            await client.call_tool(long, {long: long})
-            for ask in (client.get_prompt, client.read_resource):
-                with pytest.raises(MCPError):
-                    await ask(f"file:///{long}")
-        sizes = [len(each.to_json()) for each in spans.get_finished_spans()]
-        assert len(sizes) >= 3
-        assert max(sizes) < 4000
+@pytest.mark.parametrize("spans", [False], indirect=True)
+async def test_without_arguments_nothing_that_a_client_chose_is_in_a_span(
+    spans: InMemorySpanExporter,
+) -> None:
+    async with Client(traced()) as client:
+        await client.call_tool("full", {"s3cret": "s3cret"})
+        await client.call_tool("s3cret", {"s3cret": "s3cret"})
+        for ask in (client.get_prompt, client.read_resource):
+            with pytest.raises(MCPError):
+                await ask("file:///s3cret")
+    served = [each for each in spans.get_finished_spans() if each.kind is trace.SpanKind.SERVER]
+    assert "s3cret" not in "".join(each.to_json() for each in served)
+    names = {each.name for each in served}
+    assert {"tools/call full", "tools/call unknown", "prompts/get", "resources/read"} <= names
 
-    @pytest.mark.parametrize(
-        ("variable", "text", "name"),
-        [
-            ("OTEL_NOTHING", "", SERVICE),
-            ("OTEL_SERVICE_NAME", "r2", "r2"),
-            ("OTEL_RESOURCE_ATTRIBUTES", "service.name=r3", "r3"),
-        ],
-    )
-    def test_the_service_has_the_name_that_the_environment_gives_or_its_own(
-        self, monkeypatch: pytest.MonkeyPatch, variable: str, text: str, name: str
-    ) -> None:
-        monkeypatch.setenv(variable, text)
-        provider = provider_to(SimpleSpanProcessor(InMemorySpanExporter()))
-        assert provider.resource.attributes["service.name"] == name
-        provider.shutdown()
 
-    def test_an_environment_that_cannot_be_used_is_refused(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("OTEL_SPAN_EVENT_COUNT_LIMIT", "many")
-        with pytest.raises(ConfigError, match=r"server\.traces: .* OTEL_SPAN_EVENT_COUNT_LIMIT"):
-            traces_from_environment(arguments=True)
+async def test_whatever_a_client_sends_spans_stay_small(spans: InMemorySpanExporter) -> None:
+    long = "x" * 100_000
+    async with Client(traced()) as client:
+        await client.call_tool(long, {long: long})
+        for ask in (client.get_prompt, client.read_resource):
+            with pytest.raises(MCPError):
+                await ask(f"file:///{long}")
+    sizes = [len(each.to_json()) for each in spans.get_finished_spans()]
+    assert len(sizes) >= 3
+    assert max(sizes) < 4000
 
-    def test_stopping_does_not_wait_for_an_exporter_that_hangs(self) -> None:
-        freed = threading.Event()
 
-        class Hanging(InMemorySpanExporter):
-            def shutdown(self) -> None:
-                freed.wait()
+@pytest.mark.parametrize(
+    ("variable", "text", "name"),
+    [
+        ("OTEL_NOTHING", "", SERVICE),
+        ("OTEL_SERVICE_NAME", "r2", "r2"),
+        ("OTEL_RESOURCE_ATTRIBUTES", "service.name=r3", "r3"),
+    ],
+)
+def test_the_service_has_the_name_that_the_environment_gives_or_its_own(
+    monkeypatch: pytest.MonkeyPatch, variable: str, text: str, name: str
+) -> None:
+    monkeypatch.setenv(variable, text)
+    provider = provider_to(SimpleSpanProcessor(InMemorySpanExporter()))
+    assert provider.resource.attributes["service.name"] == name
+    provider.shutdown()
 
-        Traces(provider_to(SimpleSpanProcessor(Hanging()))).stop()
-        freed.set()
+
+def test_an_environment_that_cannot_be_used_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OTEL_SPAN_EVENT_COUNT_LIMIT", "many")
+    with pytest.raises(ConfigError, match=r"server\.traces: .* OTEL_SPAN_EVENT_COUNT_LIMIT"):
+        traces_from_environment(arguments=True)
+
+
+def test_stopping_does_not_wait_for_an_exporter_that_hangs() -> None:
+    freed = threading.Event()
+
+    class Hanging(InMemorySpanExporter):
+        def shutdown(self) -> None:
+            freed.wait()
+
+    Traces(provider_to(SimpleSpanProcessor(Hanging()))).stop()
+    freed.set()
