@@ -115,7 +115,7 @@ def test_a_number_is_written_as_everywhere_else(
 @each_way
 def test_the_size_of_a_long_array_is_no_value_of_it(tmp_path: Path, *, recalls: bool) -> None:
     said = [octets((BEGIN + n) * S, [n] * 60) for n in range(10)]
-    write_mcap(tmp_path / "a" / "a_0.mcap", said)
+    write_splits(tmp_path, said)
     memory = memory_of(tmp_path, recalls=recalls)
     given = {"topic": "/octets", "start": BEGIN, "end": BEGIN + 9}
     for how in ({"changes": True}, {"by": "value"}):

@@ -132,7 +132,7 @@ def found_in(
 def test_a_search_of_a_window_finds_what_ended_in_it_by_a_status_that_there_is(
     tmp_path: Path,
 ) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+    write_splits(tmp_path, DAY)
     found = found_in(memory_of(tmp_path), "equals", "failed", begin=35, end=55)
     assert found == [(2, "aborted", 42, 42, False)]
     with pytest.raises(InvalidArgumentsError, match=r"aborted \(0 to 6\), or failed"):
@@ -177,7 +177,7 @@ def test_a_goal_that_goes_on_lasts_as_far_as_something_is_recorded(tmp_path: Pat
     goes_on = history((10, {1: 2}), (30, {1: 4}), (50, {1: 4, 2: 2}))
     beats = [odom(BEGIN + at * S, 0.0, 0.0) for at in range(100)]
     messages = sorted([*goes_on, *beats], key=lambda message: message.log_time)
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    write_splits(tmp_path, messages)
     executing = {"topic": TOPIC, "condition_type": "equals", "value": "executing"}
     for later in (0, 1):
         for nth in range(later):

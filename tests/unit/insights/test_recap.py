@@ -43,9 +43,7 @@ def over(memory: Memory, begin: float, end: float) -> Recap:
 def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:
     type_name = "px4_msgs/msg/ManyFlags"
     body = make(type_name, **{f"flag_{nth:03}": False for nth in range(600)})
-    write_mcap(
-        tmp_path / "bag.mcap", [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)]
-    )
+    write_splits(tmp_path, [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)])
     memory = memory_of(tmp_path)
     [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
     more = 600 - MOST[FLAG]
@@ -157,7 +155,7 @@ def test_how_long_a_robot_stood_that_publishes_poses_only_while_it_moves_is_not_
     body += [
         odom(BEGIN + n * S // 10, n * 0.05, 0.0, 0.0) for n in range(1200) if n // 200 % 2 == 0
     ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", body)
+    write_splits(tmp_path, body)
 
     def stood(memory: Memory, end_s: int) -> object:
         given = {"start": BEGIN / S, "end": BEGIN / S + end_s}

@@ -39,7 +39,7 @@ OBJECTS = "/vision/scene/scene_objects"
 
 
 def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["cup"], score=0.2)])
+    write_splits(tmp_path, [detections(BEGIN, ["cup"], score=0.2)])
     memory = memory_of(tmp_path, limits=QuerySettings(min_score=0.5))
     note = "detections with a score below 0.5 do not count here, unless min_score is given"
     asked = (memory, Call(), OBJECTS, "contains", "cup")
@@ -49,7 +49,7 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
 
 
 def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["scissors"])])
+    write_splits(tmp_path, [detections(BEGIN, ["scissors"])])
     note = f'"the scissors" was not found, but "scissors" was, last at {BEGIN / S:.6f}'
     found = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "the scissors")
     assert found.notes == (note,)
@@ -57,7 +57,7 @@ def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> 
 
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
     moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
-    write_mcap(tmp_path / "bag.mcap", [moved, odom(BEGIN, 1.0, 2.0)])
+    write_splits(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
     memory = memory_of(tmp_path)
     place: JsonValue = {"x": 1.0, "y": 2.0, "frame_id": "odom"}
     asked = (memory, Call(), "/odom", "near_position")
@@ -98,7 +98,6 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
         assert sighting.thing is not None
         assert sighting.thing.frame_id == (frame_id or "map")
         assert not any("is in base_link" in note for note in answer.notes)
-    (tmp_path / "bag.mcap").unlink()
     far = [detections(late + at * S, ["cup"]) for at in range(6, 8)]
     write_mcap(tmp_path / "bag.mcap", [*placed, *poses, *far])
     answer = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "cup")
@@ -121,7 +120,7 @@ def test_the_place_of_a_sighting_is_where_the_thing_was_at_the_stamp_of_its_mess
         turning.append(tf(at, turn))
     shown = detections(BEGIN + shown_s * S, ["cup"], at=(3.0, 0.0, 0.0))
     seen = [replace(shown, log_time=BEGIN + at * S) for at in logged_s]
-    write_mcap(tmp_path / "bag.mcap", [*turning, *seen])
+    write_splits(tmp_path, [*turning, *seen])
     memory = memory_of(tmp_path)
     [row] = asked(
         memory, tmp_path, "find_matches", topic=OBJECTS, condition_type="contains", value="cup"
@@ -135,7 +134,7 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
         return {"label": label, "score": score, "position": {"x": x, "y": 1.0, "z": 0.0}}
 
     things = [seen("headphones", 0.4, 1.0), seen("phone", 0.8, 2.0), seen("mug", 0.9, 3.0)]
-    write_mcap(tmp_path / "bag.mcap", [text(BEGIN, json.dumps(things), topic="/seen")])
+    write_splits(tmp_path, [text(BEGIN, json.dumps(things), topic="/seen")])
     [sighting] = find_matches(memory_of(tmp_path), Call(), "/seen", "contains", "phone").sightings
     assert sighting.thing is not None
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
@@ -155,7 +154,7 @@ def test_letters_that_json_escapes_are_found(tmp_path: Path, *, recalls: bool) -
 
 def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path) -> None:
     driven = [odom(BEGIN + t * S, float(t), 0.0, 0.0, vx=0.1 * t) for t in range(10)]
-    write_mcap(tmp_path / "bag.mcap", [*driven, boolean(BEGIN + 9 * S, True)])
+    write_splits(tmp_path, [*driven, boolean(BEGIN + 9 * S, True)])
     memory = memory_of(tmp_path)
     fast = {"condition_type": "above", "value": 0.45, "field": "linear_velocity.x"}
     reply = asked(memory, tmp_path, "find_matches", topic="/odom", fields=["position.x"], **fast)
@@ -254,7 +253,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
     lines = [(20, "begins"), (30, "slow"), (40, "lost"), (30, "slow"), (20, "ends")]
     logged = [log_entry(BEGIN + n * S, level, "nav", said) for n, (level, said) in enumerate(lines)]
     state = diagnostics(BEGIN + 5 * S, motor=(1, "hot"))
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*logged, state])
+    write_splits(tmp_path, [*logged, state])
     memory = memory_of(tmp_path)
 
     def texts(kind: str, value: JsonValue) -> list[object]:
@@ -321,7 +320,7 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
 def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
     tmp_path: Path, name: str, more: dict[str, str]
 ) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(BEGIN, 0.0, 0.0), boolean(BEGIN, True)])
+    write_splits(tmp_path, [odom(BEGIN, 0.0, 0.0), boolean(BEGIN, True)])
     memory = memory_of(tmp_path)
     asks = {"condition_type": "above", "field": "level", "value": "WARN", **more}
     topic = "condition_topic" if "value_topic" in more else "topic"

@@ -15,11 +15,11 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.storage.base import Batch, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.build import build_tools
-from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.bags import detections, odom, tf, transform, write_splits
 from tests.support.memories import memory_of
 
 S: Final = 10**9
-BEGIN_S: Final = 1_700_000_000
+BEGIN_S: Final = 1_784_000_000
 BAGS: Final = 6
 MESSAGES: Final = 700
 """Of each topic in each bag."""
@@ -53,16 +53,9 @@ LONG: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
 
 
 class Watched(BagDirReader):
-    """Counts the messages that are read, and has the client leave after so many."""
+    """Counts the messages that are read."""
 
-    def __init__(self, bag_dir: Path, leaves_after: int) -> None:
-        super().__init__(McapReader(), bag_dir)
-        self.read = 0
-        self.leaves_after = leaves_after
-
-    @property
-    def is_left(self) -> bool:
-        return self.read >= self.leaves_after
+    read = 0
 
     def records(self, *args: Any, **named: Any) -> Iterator[Record]:
         for record in super().records(*args, **named):
@@ -77,15 +70,12 @@ class Watched(BagDirReader):
 
 @pytest.fixture(scope="module")
 def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("bags")
-    for bag in range(BAGS):
-        messages = []
-        for n in range(MESSAGES):
-            at = BEGIN_S * S + (bag * MESSAGES + n) * S // 10
-            messages.append(odom(at, n / 10, float(n % 7)))
-            messages.append(tf(at, transform(at, "odom", "base_link", (n / 10, 0.0, 0.0))))
-            messages.append(detections(at, ["cup"]))
-        write_mcap(folder / "rec" / f"rec_{bag}.mcap", messages)
+    folder, messages = tmp_path_factory.mktemp("bags"), []
+    for n in range(BAGS * MESSAGES):
+        at = BEGIN_S * S + n * S // 10
+        moved = transform(at, "odom", "base_link", (n / 10, 0.0, 0.0))
+        messages += [odom(at, n / 10, float(n % 7)), tf(at, moved), detections(at, ["cup"])]
+    write_splits(folder, messages, MESSAGES / 10)
     return folder
 
 
@@ -94,9 +84,9 @@ def test_a_query_that_nobody_waits_for_reads_no_further(
     bag_dir: Path, name: str, given: dict[str, Any]
 ) -> None:
     def read(leaves_after: int, ending: AbstractContextManager[object]) -> int:
-        reader = Watched(bag_dir, leaves_after)
+        reader = Watched(McapReader(), bag_dir)
         memory = memory_of(bag_dir, reader=reader)
-        call = Call(Deadline.after(25.0, lambda: math.inf if reader.is_left else 0.0))
+        call = Call(Deadline.after(25.0, lambda: math.inf if reader.read >= leaves_after else 0.0))
         with ending:
             TOOLS[name].question(given)(memory, call)
         return reader.read

@@ -114,7 +114,7 @@ def test_a_span_asked_for_again_keeps_its_ends_and_what_it_holds(tmp_path: Path)
     """Totals are those of `recap` and of pictures: the first pose, inside a millisecond, counts."""
     at = BEGIN + 700_400
     poses = [odom(at + n * S // 10, n / 2, 0.0, vx=5.0) for n in range(8)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*poses, detections(at, ["cup"])])
+    write_splits(tmp_path, [*poses, detections(at, ["cup"])])
     memory = memory_of(tmp_path)
     first = shown(memory, "last=1000")
     again = shown(memory, f"start={first['start']:.3f}&end={first['end']:.3f}")
@@ -165,7 +165,7 @@ def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
     draw = Random(7)
     positions = [draw.uniform(-9, 9) for _ in range(60)]
     poses = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    write_splits(tmp_path, poses)
     plain = memory_of(tmp_path)
     for asked_of in (plain, replace(plain, scanner=stored_columns(plain, tmp_path))):
         signal = "/odom:pose.pose.position.x"
@@ -389,7 +389,7 @@ def test_topics_have_their_rate_when_they_spoke_and_their_numbers(memory: Memory
 def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_path: Path) -> None:
     """Whatever time is looked at, the origin is the same."""
     messages = [fix(BEGIN + n * S, n * 1e-5, 0.0) for n in range(20)]
-    write_mcap(tmp_path / "bag.mcap", messages)
+    write_splits(tmp_path, messages)
     plain = memory_of(tmp_path)
     memory = replace(plain, limits=replace(plain.limits, pose_topic="/fix"))
     whole = shown(memory, "last=1000")
@@ -453,7 +453,7 @@ def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
     angles = np.arange(126 * 8) * 0.05  # eight laps of a circle of 1 m
     poses = np.stack([np.sin(angles), 1 - np.cos(angles)], axis=1)
     messages = [odom(BEGIN + n * S // 20, x, y) for n, (x, y) in enumerate(poses.tolist())]
-    write_mcap(tmp_path / "bag.mcap", messages)
+    write_splits(tmp_path, messages)
     memory = memory_of(tmp_path)
     window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
     found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.002))
