@@ -169,37 +169,40 @@ def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("zone", "month", "days", "hours", "expected"),
+    ("zone", "days", "hours", "expected"),
     [
-        ("Europe/Berlin", 10, (25, 26), "02:15-02:45", "02:15-02:45 02:15-02:45"),
-        ("Europe/Berlin", 10, (25, 26), "01:00-02:30", "01:00-02:30 02:00-02:30"),
-        ("Europe/Berlin", 10, (25, 26), "02:15-04:00", "02:15-02:00 02:15-04:00"),
-        ("Europe/Berlin", 10, (25, 26), "01:00-04:00", "01:00-04:00"),
-        ("Europe/Berlin", 10, (25, 26), "03:00-02:30", "00:00-02:30 02:00-02:30 03:00-00:00"),
+        ("Europe/Berlin", "2026-10-25/2026-10-26", "02:15-02:45", "02:15-02:45 02:15-02:45"),
+        ("Europe/Berlin", "2026-10-25/2026-10-26", "01:00-02:30", "01:00-02:30 02:00-02:30"),
+        ("Europe/Berlin", "2026-10-25/2026-10-26", "02:15-04:00", "02:15-02:00 02:15-04:00"),
+        ("Europe/Berlin", "2026-10-25/2026-10-26", "01:00-04:00", "01:00-04:00"),
         (
-            *("Europe/Berlin", 3, (28, 31), "22:00-04:00"),
-            "00:00-04:00 22:00-04:00 22:00-04:00 22:00-00:00",
+            *("Europe/Berlin", "2026-10-25/2026-10-26"),
+            *("03:00-02:30", "00:00-02:30 02:00-02:30 03:00-00:00"),
         ),
-        ("Europe/Berlin", 3, (29, 30), "02:30-03:30", "03:00-03:30"),
-        ("Europe/Berlin", 3, (29, 30), "01:30-02:15", "01:30-03:00"),
-        ("Europe/Berlin", 3, (29, 30), "02:10-02:50", ""),
-        ("Europe/Berlin", 3, (29, 30), "03:00-02:30", "00:00-03:00 03:00-00:00"),
-        ("Europe/Berlin", 3, (29, 30), "22:00-24:00", "22:00-00:00"),
-        ("Europe/Berlin", 3, (29, 30), "00:00 - 24:00", "00:00-00:00"),
+        (
+            *("Europe/Berlin", "2026-03-28/2026-03-31"),
+            *("22:00-04:00", "00:00-04:00 22:00-04:00 22:00-04:00 22:00-00:00"),
+        ),
+        ("Europe/Berlin", "2026-03-29/2026-03-30", "02:30-03:30", "03:00-03:30"),
+        ("Europe/Berlin", "2026-03-29/2026-03-30", "01:30-02:15", "01:30-03:00"),
+        ("Europe/Berlin", "2026-03-29/2026-03-30", "02:10-02:50", ""),
+        ("Europe/Berlin", "2026-03-29/2026-03-30", "03:00-02:30", "00:00-03:00 03:00-00:00"),
+        ("Europe/Berlin", "2026-03-29/2026-03-30", "22:00-24:00", "22:00-00:00"),
+        ("Europe/Berlin", "2026-03-29/2026-03-30", "00:00 - 24:00", "00:00-00:00"),
         # Days that begin in an hour that clocks repeat.
         (
-            *("Atlantic/Azores", 10, (25, 26), "00:30-00:30"),
-            "00:00-00:30 00:30-00:00 00:00-00:30 00:30-00:00",
+            *("Atlantic/Azores", "2026-10-25/2026-10-26"),
+            *("00:30-00:30", "00:00-00:30 00:30-00:00 00:00-00:30 00:30-00:00"),
         ),
     ],
 )
 def test_hours_that_clocks_repeat_count_twice_and_those_that_they_skip_are_left_out(
-    zone: str, month: int, days: tuple[int, int], hours: str, expected: str
+    zone: str, days: str, hours: str, expected: str
 ) -> None:
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("TZ", zone)
         time.tzset()
-        begin, end = (int(datetime(2026, month, at).timestamp()) for at in days)  # noqa: DTZ001
+        begin, end = (int(datetime.fromisoformat(at).timestamp()) for at in days.split("/"))
         found = hours_of_days(TimeWindow(begin * S, end * S), *_as_hours(hours))  # type: ignore[misc]
         shown = [
             "-".join(

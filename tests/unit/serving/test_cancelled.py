@@ -21,7 +21,7 @@ from tests.support.memories import memory_of
 S: Final = 10**9
 BEGIN_S: Final = 1_784_000_000
 BAGS: Final = 6
-MESSAGES: Final = 700
+MESSAGES: Final = 300
 """Of each topic in each bag."""
 AT_MOST: Final = 2 * MESSAGES
 """Messages that may still be read: those of a bag that is gone through at once."""
