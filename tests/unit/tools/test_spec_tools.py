@@ -56,7 +56,7 @@ def refusal(name: str, **given: Any) -> str:
     return str(caught.value)
 
 
-def test_the_seventeen_tools_of_the_specification_come_first_and_others_can_be_left_out() -> None:
+def test_the_seventeen_tools_of_the_specification_come_first_and_in_its_order() -> None:
     assert list(TOOLS) == NAMES
     assert len(SPECIFIED) == 17
     assert [tool.name for tool in build_tools(QuerySettings())] == [*SPECIFIED, *ADDED]
