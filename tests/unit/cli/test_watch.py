@@ -11,22 +11,20 @@ import pytest
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, assessment
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import boolean, log_entry, odom, text, write_mcap
+from tests.support.bags import boolean, log_entry, odom, text, write_mcap, write_splits
 from tests.support.program import Program
 
 
 @pytest.fixture(autouse=True)
 def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A minute at 10 Hz, in which one topic falls silent and another becomes slow."""
-    now = time.time_ns()
-    for number in range(6):
-        start = now - (60 - number * 10) * NS_PER_S
-        messages = [odom(start + n * NS_PER_S // 10, 0.0, 0.0) for n in range(100)]
-        words = range(0, 100, 10) if number < 3 else ()
-        messages += [text(start + n * NS_PER_S // 10, "x") for n in words]
-        bumps = range(0, 100, 10 if number < 5 else 50)
-        messages += [boolean(start + n * NS_PER_S // 10, data=True) for n in bumps]
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    now, messages = time.time_ns(), []
+    for n in range(600):
+        at = now - (600 - n) * NS_PER_S // 10
+        messages.append(odom(at, 0.0, 0.0))
+        messages += [text(at, "x")] * (n < 300 and n % 10 == 0)
+        messages += [boolean(at, data=True)] * (n % (10 if n < 500 else 50) == 0)
+    write_splits(tmp_path, messages)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "query_only")
     return tmp_path

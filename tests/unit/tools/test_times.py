@@ -1,6 +1,5 @@
 """Times in replies: local beside Unix time over days, and as text that finds its message again."""
 
-import json
 import re
 import time
 from collections.abc import Iterator
@@ -9,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory import cli
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of
+from tests.support.program import Program, exits
 from tests.support.rooms import BEGIN, asked_of, draw, write
+
+__all__ = ["exits"]
 
 DAY_S = 86_400
 
@@ -106,30 +107,24 @@ def test_at_a_text_is_up_to_the_end_of_its_last_decimal(drive: Memory, tmp_path:
 
 @pytest.mark.usefixtures("berlin")
 def test_in_the_hour_that_clocks_repeat_printed_times_have_their_offset(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
 ) -> None:
     write_drive(tmp_path, AUTUMN)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "replay")
     monkeypatch.setenv("COLUMNS", "200")
-
-    def printed(*words: str) -> str:
-        assert cli.main([*words]) == 0
-        return capsys.readouterr().out
-
-    by = ("topic=/odom", "fields=position.x", "by=hour", f"start={AUTUMN}", f"end={AUTUMN + 30}")
-    for words in (
-        ("info",),
-        ("cat", "/odom"),
-        ("ask", "get_position_seconds_ago", "seconds_ago=3"),
-        ("ask", "get_topic_in_range", *by),
+    by = f"topic=/odom fields=position.x by=hour start={AUTUMN} end={AUTUMN + 30}"
+    for line in (
+        "info",
+        "cat /odom",
+        "ask get_position_seconds_ago seconds_ago=3",
+        f"ask get_topic_in_range {by}",
     ):
-        times = re.findall(r"2026-10-25[T ]02:29:[0-9.]{9}\S*", printed(*words))
-        assert times, words
+        times = re.findall(r"2026-10-25[T ]02:29:[0-9.]{9}\S*", exits(0, line).out)
+        assert times, line
         for each in {times[0], times[-1]}:
-            assert each.endswith("+01:00"), words
-            reply = printed("ask", "get_position_at", f"timestamp={each}", "--json")
-            assert json.loads(reply)["timestamp"] >= AUTUMN
-    assert (
-        printed("cat", "/odom", "--end", times[0]).splitlines()[-1].startswith("2026-10-25T02:29")
-    )
+            assert each.endswith("+01:00"), line
+            reply = exits(0, "ask get_position_at --json", f"timestamp={each}").json
+            assert reply["timestamp"] >= AUTUMN
+    last = exits(0, "cat /odom --end", times[0]).out.splitlines()[-1]
+    assert last.startswith("2026-10-25T02:29")
