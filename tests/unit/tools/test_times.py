@@ -13,24 +13,8 @@ from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.program import Program, exits
-from tests.support.rooms import BEGIN, asked_of, draw, write
 
 __all__ = ["exits"]
-
-DAY_S = 86_400
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    bags = tmp_path_factory.mktemp("days")
-    for day in range(2):
-        write(draw(3, 120), bags / f"day_{day}", begin=BEGIN + day * DAY_S)
-    return bags
-
-
-@pytest.fixture(scope="module")
-def memory(folder: Path) -> Memory:
-    return asked_of(folder, stored=False)
 
 
 def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does_not(
