@@ -5,13 +5,13 @@ may run scripts and nothing else, under the policy for a resource that declares 
 view asks is answered by the test.
 """
 
-import http.server
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler
 from typing import Any, Final
 
 from tests.integration.browser import Browser
+from tests.support.processes import http_server
 
 POLICY: Final = (
     "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
@@ -74,9 +74,9 @@ addEventListener("DOMContentLoaded", () => parent.postMessage(ready, "*"));
 class ChatHost:
     """A window of the browser in which one view is shown; `asked` are the paths that it served."""
 
-    def __init__(self, browser: Browser, ports: tuple[int, int], asked: list[str]) -> None:
+    def __init__(self, browser: Browser, url: str, sandbox: str, asked: list[str]) -> None:
         self._browser = browser
-        self.url, self._sandbox = (f"http://127.0.0.1:{port}" for port in ports)
+        self.url, self._sandbox = url, sandbox
         self.asked = asked
 
     def show(
@@ -141,7 +141,7 @@ def chat_host(browser: Browser) -> Iterator[ChatHost]:
     pages = {"/host": HOST, "/sandbox": PROXY.replace("POLICY", POLICY)}
     pages["/lax"] = PROXY.replace("POLICY", LAX)
 
-    class Handler(http.server.BaseHTTPRequestHandler):
+    class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             asked.append(self.path)
             page = pages.get(self.path)
@@ -154,16 +154,5 @@ def chat_host(browser: Browser) -> Iterator[ChatHost]:
         def log_message(self, *_: object) -> None:
             pass
 
-    servers = [http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) for _ in range(2)]
-    threads = [threading.Thread(target=server.serve_forever) for server in servers]
-    for thread in threads:
-        thread.start()
-    try:
-        host, sandbox = (server.server_address[1] for server in servers)
-        yield ChatHost(browser, (host, sandbox), asked)
-    finally:
-        for server in servers:
-            server.shutdown()
-            server.server_close()
-        for thread in threads:
-            thread.join()
+    with http_server(Handler) as host, http_server(Handler) as sandbox:
+        yield ChatHost(browser, host, sandbox, asked)

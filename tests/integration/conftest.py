@@ -1,4 +1,4 @@
-"""A machine with the real recorder, for each test that asks for one."""
+"""A machine with the real recorder, and the bags of a short run, for each test that asks."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,10 +7,16 @@ import pytest
 
 from tests.support.live_recorder import Machine, machine
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import ros_environment
+from tests.support.robot_run import write_run
 
 
 @pytest.fixture
 def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
+    with machine(tmp_path, real_recorder) as found:
         yield found
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    write_run(tmp_path / "bags")
+    return tmp_path / "bags"

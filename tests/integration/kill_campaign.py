@@ -37,7 +37,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import end, publishing_robot, ros_environment
+from tests.support.ros_processes import end, publishing_robot
 from tests.support.served import Served
 
 KINDS: Final = ("child", "daemon", "both")
@@ -155,12 +155,12 @@ def run_campaign(terms: Terms, folder: Path, real: RealRecorder) -> Campaign:
     """Records a robot, kills `terms.kills` times, and looks at what is left."""
     folder.mkdir()
     campaign, chance = Campaign(terms), random.Random(terms.seed)
-    with ros_environment(folder, real=real) as env, machine(folder, env) as site:
+    with machine(folder, real) as site:
         recorder = _record(site, terms)
         options = ("--hz", f"{terms.hz:g}", "--subscribers", "1")
         with (
             answering(recorder.bag_dir, folder / "server.log") as served,
-            publishing_robot(env, folder / "truth.json", *options) as robot,
+            publishing_robot(site.env, folder / "truth.json", *options) as robot,
         ):
             campaign.t0 = robot.t0
             for kind in _kinds(terms.kills, chance):

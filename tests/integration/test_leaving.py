@@ -57,6 +57,15 @@ async def none_left(dispatcher: Dispatcher) -> None:
             await asyncio.sleep(0.001)
 
 
+async def began(stream: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
+    """Begins an event stream; returns the path to post its messages to."""
+    writer.write(head("GET", "/sse"))
+    async with asyncio.timeout(BOUND_S):
+        await stream.readuntil(b"session_id=")
+        session = (await stream.readuntil(b"\r\n")).strip().decode()
+    return f"/messages/?session_id={session}"
+
+
 @pytest.mark.parametrize("is_modern", [False, True])
 async def test_leaving_a_request_ends_its_query(is_modern: bool) -> None:
     query = Endless()
@@ -75,16 +84,12 @@ async def test_leaving_a_request_ends_its_query(is_modern: bool) -> None:
 async def test_a_client_that_cancels_a_call_ends_its_query_and_stays() -> None:
     query = Endless()
     async with serving(query) as (port, dispatcher), connected(port) as (stream, writer):
-        writer.write(head("GET", "/sse"))
-        async with asyncio.timeout(BOUND_S):
-            await stream.readuntil(b"session_id=")
-            session = (await stream.readuntil(b"\r\n")).strip().decode()
+        to = await began(stream, writer)
         cancelled = {
             "jsonrpc": "2.0",
             "method": "notifications/cancelled",
             "params": {"requestId": 7, "reason": "the person asked something else"},
         }
-        to = f"/messages/?session_id={session}"
         for body in (*opening(), call("endless", "{}", 7)):
             assert (await posted(port, body, to))[0] == 202
         await set_in_time(query.begun)
@@ -98,14 +103,10 @@ async def test_leaving_an_event_stream_ends_its_queries_and_those_that_wait() ->
     query = Endless()
     async with serving(query) as (port, dispatcher):
         async with connected(port) as (stream, writer):
-            writer.write(head("GET", "/sse"))
-            async with asyncio.timeout(BOUND_S):
-                await stream.readuntil(b"session_id=")
-                session = (await stream.readuntil(b"\r\n")).strip().decode()
+            to = await began(stream, writer)
             calls = [call("endless", "{}", number) for number in range(1, 11)]
             for body in (*opening(), *calls):
-                status, _ = await posted(port, body, f"/messages/?session_id={session}")
-                assert status == 202
+                assert (await posted(port, body, to))[0] == 202
             await set_in_time(query.begun)
             async with asyncio.timeout(BOUND_S):
                 while dispatcher.blocking.running + dispatcher.blocking.waiting < len(calls):

@@ -12,7 +12,7 @@ from typing import Final
 
 import pytest
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
+from ros2_memory.bag_dir.heartbeat import RecorderState
 from tests.integration.another_user import NOBODY, as_nobody, needs_another_user, own_network
 from tests.support.live_recorder import (
     NS_PER_S,
@@ -28,7 +28,6 @@ from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import (
     Robot,
     publishing_robot,
-    ros_environment,
     wait_for,
 )
 from tests.timing import in_time
@@ -44,7 +43,7 @@ def site(
     real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Machine]:
     folder = tmp_path_factory.mktemp("conditions")
-    with ros_environment(folder, real=real_recorder) as env, machine(folder, env) as site:
+    with machine(folder, real_recorder) as site:
         yield site
 
 
@@ -116,18 +115,6 @@ def fill_up(site: Machine, robot: Robot, folder: Path, least: str) -> None:
             recorder.discard()
 
 
-def test_while_the_disk_is_full_the_server_says_that_recording_is_paused(
-    site: Machine, robot: Robot, tmp_path: Path
-) -> None:
-    recorder = site.record("paused", "retention.min_free_gb=1e9")
-    with answering(recorder.bag_dir, tmp_path / "server.log") as served:
-        recorder.wait_for_state(RecorderState.PAUSED)
-        health = json.loads(served.get("/health")[1])
-    assert health["status"] == "degraded"
-    assert any("paused" in problem for problem in health["problems"])
-    recorder.stop()
-
-
 @needs_another_user
 def test_a_recorder_under_another_user_than_the_publishers_records(
     site: Machine, tmp_path: Path
@@ -183,12 +170,10 @@ def test_what_is_amiss_with_publishers_shows_in_the_heartbeat_and_in_health(
         wait_for_warnings(recorder, "/bumper", "/px4/position")
         recorder.wait_for("split_closed")
 
-        def is_told() -> bool:
-            status = beat(recorder)
-            return set(status.silent) == {"/bumper", "/clock"} and status.last_error is not None
-
-        wait_for(is_told, "it in the heartbeat", alive=recorder.process)
-        status = beat(recorder)
+        status = recorder.wait_for_beat(
+            lambda beat: {*beat.silent} == {"/bumper", "/clock"} and beat.last_error is not None,
+            "it in the heartbeat",
+        )
         health = json.loads(served.get("/health")[1])["recorder"]
         recorder.stop()
     assert set(status.subscribed) == HEARD
@@ -202,12 +187,6 @@ def wait_for_warnings(recorder: LiveRecorder, *topics: str) -> None:
         return set(topics) <= {reason.partition(":")[0] for reason in reasons}
 
     wait_for(are_told, f"warnings of {', '.join(topics)}", alive=recorder.process)
-
-
-def beat(recorder: LiveRecorder) -> Heartbeat:
-    heartbeat = recorder.heartbeat.heartbeat
-    assert heartbeat is not None
-    return heartbeat
 
 
 def wait_for_error(recorder: LiveRecorder) -> dict[str, object]:

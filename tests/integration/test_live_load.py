@@ -6,8 +6,7 @@ Seconds of each; EPISODIC_LONG=1 makes it an hour of 10 topics at 200 Hz, and tw
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -19,14 +18,13 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import LONG
 from tests.support.live_recorder import (
     NS_PER_S,
-    Machine,
     bag_files,
     machine,
     number_of,
     publishing,
 )
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import ros_environment, wait_for
+from tests.support.ros_processes import wait_for
 from tests.timing import each_in_time
 
 LOAD_S: Final = 3600 if LONG else 8
@@ -63,18 +61,11 @@ def missing(found: Counter[int]) -> int:
     return max(found) - min(found) + 1 - len(found)
 
 
-@contextmanager
-def site_in(folder: Path, real_recorder: RealRecorder) -> Iterator[Machine]:
-    """A robot's machine. Where no program runs for seconds there is a gap, and no loss."""
-    with ros_environment(folder, real=real_recorder) as env, machine(folder, env) as found:
-        yield found
-
-
 @each_in_time
 def test_what_is_lost_under_load_is_counted(real_recorder: RealRecorder, tmp_path: Path) -> None:
     """Publishers keep what waits, as what they overwrite is lost before anybody can count it."""
     with (
-        site_in(tmp_path, real_recorder) as site,
+        machine(tmp_path, real_recorder) as site,
         publishing(site.env, *(f"{topic}:{HZ}:reliable:deep" for topic in LOAD)),
     ):
         recorder = site.record(
@@ -108,7 +99,7 @@ def test_simulated_time_is_recorded_by_its_clock(
     """Rotations and losses among it: the wall clock that paces them runs at another speed."""
     topics = ("/odom:1:reliable:deep", "/rare:0.1:reliable:deep")
     with (
-        site_in(tmp_path, real_recorder) as site,
+        machine(tmp_path, real_recorder) as site,
         publishing(site.env, "--speed", f"{SPEED:g}", *topics),
     ):
         recorder = site.record(

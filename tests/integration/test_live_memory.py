@@ -37,7 +37,6 @@ from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import (
     Robot,
     publishing_robot,
-    ros_environment,
 )
 from tests.support.served import Served
 from tests.timing import Watch, driven
@@ -87,10 +86,9 @@ def judge(drive: Drive) -> None:
 def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
     options = ("--hz", f"{HZ:g}", "--subscribers", "3")
     with (
-        ros_environment(folder, real=real) as env,
-        machine(folder, env) as site,
+        machine(folder, real) as site,
         # It is there, and silent, before any of them rotates.
-        publishing_robot(env, folder / "truth.json", *options) as robot,
+        publishing_robot(site.env, folder / "truth.json", *options) as robot,
         ExitStack() as stack,
     ):
         # Once the robot drives nothing else should be busy starting.

@@ -24,7 +24,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import publishing_robot, ros_environment
+from tests.support.ros_processes import publishing_robot
 
 ROTATIONS: Final = 100 if LONG else 3
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "13"))
@@ -44,9 +44,10 @@ class Rotated(NamedTuple):
 def rotated(real_recorder: RealRecorder, tmp_path_factory: pytest.TempPathFactory) -> Rotated:
     folder = tmp_path_factory.mktemp("stalls")
     with (
-        ros_environment(folder, real=real_recorder) as env,
-        machine(folder, env) as site,
-        publishing_robot(env, folder / "truth.json", "--topics", "/odom", "--hz", str(HZ)) as robot,
+        machine(folder, real_recorder) as site,
+        publishing_robot(
+            site.env, folder / "truth.json", "--topics", "/odom", "--hz", str(HZ)
+        ) as robot,
     ):
         t0 = robot.t0
         recorder = site.record(

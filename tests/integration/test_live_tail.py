@@ -30,7 +30,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import publishing_robot, ros_environment
+from tests.support.ros_processes import publishing_robot
 from tests.timing import Watch, driven
 
 HZ: Final = 50.0
@@ -76,9 +76,8 @@ def judge(drive: Drive) -> None:
 def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
     options = ("--hz", f"{HZ:g}", "--subscribers", "2")
     with (
-        ros_environment(folder, real=real) as env,
-        machine(folder, env) as site,
-        publishing_robot(env, folder / "truth.json", *options) as robot,
+        machine(folder, real) as site,
+        publishing_robot(site.env, folder / "truth.json", *options) as robot,
         ExitStack() as stack,
     ):
         live = "reader.include_active=true"

@@ -18,7 +18,7 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.live_recorder import LiveRecorder, Machine
 from tests.support.processes import PATIENCE_S
-from tests.support.ros_processes import end, wait_for
+from tests.support.ros_processes import running, wait_for
 
 RULES = """
 rules:
@@ -30,14 +30,9 @@ TOPICS = ("/odom", "/privacy_mode")
 @pytest.fixture
 def robot(site: Machine, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     truth = tmp_path / "truth"
-    argv = [site.env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.integration.private_robot", str(truth)]
-    known = {**site.env, "PYTHONPATH": site.env["ROS2_LIVE_PYTHONPATH"]}
-    process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
-    try:
+    with running(site.env, "tests.integration.private_robot", str(truth)) as process:
         wait_for(truth.exists, "the robot", alive=process)
         yield process
-    finally:
-        end(process)
 
 
 def numbers(path: Path, topic: str = "/odom") -> AbstractSet[int]:

@@ -4,15 +4,14 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.live_recorder import LiveRecorder, Machine, bag_files, machine, ticks
+from tests.support.live_recorder import Machine, bag_files, machine, ticks
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import Robot, publishing_robot, ros_environment, wait_for
+from tests.support.ros_processes import Robot, publishing_robot
 from tests.timing import each_in_time
 
 TOPICS = ("/odom", "/tf", "/cmd_vel", "/px4/position")
@@ -22,19 +21,10 @@ TOPICS = ("/odom", "/tf", "/cmd_vel", "/px4/position")
 def recorded_robot(folder: Path, real_recorder: RealRecorder) -> Iterator[tuple[Machine, Robot]]:
     options = ("--topics", *TOPICS, "--hz", "50")
     with (
-        ros_environment(folder, real=real_recorder) as env,
-        machine(folder, env) as site,
+        machine(folder, real_recorder) as site,
         publishing_robot(site.env, folder / "truth.json", *options) as robot,
     ):
         yield site, robot
-
-
-def wait_until(recorder: LiveRecorder, says: Callable[[Heartbeat], bool], what: str) -> None:
-    def is_so() -> bool:
-        beat = recorder.heartbeat.heartbeat
-        return beat is not None and says(beat)
-
-    wait_for(is_so, what, alive=recorder.process)
 
 
 @each_in_time
@@ -53,11 +43,11 @@ def test_a_changed_list_loses_nothing_of_topics_that_stay(
         [changed] = recorder.wait_for("topics_changed")
         assert (changed["added"], changed["dropped"]) == (["/cmd_vel"], ["/tf"])
         recorder.wait_for("rotated", before + 1)
-        wait_until(
-            recorder, lambda beat: {*beat.subscribed} == {"/odom", "/cmd_vel"}, "the new list"
+        recorder.wait_for_beat(
+            lambda beat: {*beat.subscribed} == {"/odom", "/cmd_vel"}, "the new list"
         )
         file.write_text("topics: nonsense\n")
-        wait_until(recorder, lambda beat: beat.list_refused is not None, "a refusal")
+        recorder.wait_for_beat(lambda beat: beat.list_refused is not None, "a refusal")
         recorder.wait_for("split_closed", len(recorder.events("split_closed")) + 2)
         recorder.stop()
         robot.stop()
@@ -89,9 +79,9 @@ def test_a_child_that_lives_and_writes_nothing_is_replaced(
             assert recorder.children()[-1].pid != stuck.pid
             # Until the next heartbeat /odom is missing, too: the stuck child got nothing of it.
             missing = ("/px4/position: ros2 bag record does not know its type",)
-            wait_until(recorder, lambda beat: beat.required_missing == missing, "what is required")
-            beat = recorder.heartbeat.heartbeat
-            assert beat is not None
+            beat = recorder.wait_for_beat(
+                lambda beat: beat.required_missing == missing, "what is required"
+            )
             assert (beat.unknown_types, beat.missing) == (("/px4/position",), ())
         finally:
             with suppress(ProcessLookupError):

@@ -5,7 +5,6 @@
 
 import hashlib
 import json
-import os
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
@@ -36,7 +35,6 @@ from tests.support.memories import memory_of
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ask_everything, write_run
 from tests.support.served import serving
-from tests.unit.core.test_deep_directories import DEEP, within
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 SPLITS: Final = 200 if LONG else 20
@@ -226,21 +224,6 @@ def test_a_clock_that_stepped_forward_deletes_nothing_before_it_is_synchronised(
     assert [path.exists() for path in kept] == [True] * 9 + [False] * 10
     until(lambda: age_held(site.bag_dir) is None)
     daemon.stop()
-
-
-def test_folders_nested_without_end_are_cleared_and_it_records(site: Site) -> None:
-    bag = write_mcap(site.folder / "a.mcap", [odom(NS_PER_S, 1.0, 2.0)])
-    site.bag_dir.mkdir()
-    with within(site.bag_dir, DEEP, "d") as inner:
-        os.link(bag, "deep.mcap", dst_dir_fd=inner)
-    try:
-        daemon = site.run("recording.clear_on_startup=true", "retention.foreign=delete")
-        (cleared,) = daemon.wait_for("bags_cleared")
-        assert (cleared["files"], daemon.events("not_cleared")) == (1, [])
-        daemon.stop()
-    finally:
-        # pytest would recurse.
-        subprocess.run(["rm", "-rf", str(site.bag_dir / "d")], check=True)
 
 
 def state(folder: Path) -> dict[str, tuple[object, ...]]:

@@ -1,7 +1,6 @@
 """The memory of a server over small bags that decompress to gigabytes, asked by a real client."""
 
 import asyncio
-import json
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -90,27 +89,3 @@ def test_a_small_bag_of_large_messages_takes_no_more_memory_than_promised(
         asyncio.run(ask_alone_and_at_once(served, count))
         until(lambda: memory_mb(served, "VmRSS") < before + CACHED_MB)
         assert memory_mb(served, "VmHWM") < PROMISED_MB, "afterwards"
-
-
-def test_only_the_message_above_the_bound_is_refused_and_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sizes = {1: 10, 2: 80 * MB, 3: 40 * MB}
-    said = (text(n * 10**9, f"{n:04d}" + "a" * size) for n, size in sizes.items())
-    bag = tmp_path / "bags" / "rec" / "rec_0.mcap"
-    write_mcap(bag, said, McapLayout(chunk_size=1, compression=CompressionType.ZSTD))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-    async def ask(served: Served) -> Any:
-        transport = sse_client(served.url("/sse"), timeout=PATIENCE_S)
-        async with Client(transport, read_timeout_seconds=PATIENCE_S) as client:
-            given = {"topic": "/chatter", "start": 0, "end": 9}
-            return json.loads(await asked(client, "get_topic_in_range", given))
-
-    with serving(bag.parent.parent, tmp_path / "log", program=PROGRAM) as served:
-        reply = asyncio.run(ask(served))
-        assert memory_mb(served, "VmHWM") < PROMISED_MB
-    assert [sample["value"]["value"][:4] for sample in reply["samples"]] == ["0001", "0003"]
-    [note] = [each for each in reply["notes"] if "reader.max_chunk_mb" in each]
-    assert "rec_0.mcap" in note
-    assert "64 MiB" in note

@@ -2,18 +2,15 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
-from tests.support.processes import PATIENCE_S
+from tests.support.processes import PATIENCE_S, service_manager
 
 
 def test_it_is_ready_when_it_listens_and_says_when_it_stops(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(PATIENCE_S)
+    with service_manager(tmp_path / "notify") as manager:
         env = {
             **os.environ,
             "NOTIFY_SOCKET": str(tmp_path / "notify"),

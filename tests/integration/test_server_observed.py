@@ -1,11 +1,9 @@
 """The query server as its own process, scraped as Prometheus does, and sending spans."""
 
-import http.server
-import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import httpx2
@@ -13,12 +11,11 @@ import pytest
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
 
-from tests.support.processes import PATIENCE_S
-from tests.support.robot_run import ask, write_run
+from tests.support.processes import PATIENCE_S, http_server
+from tests.support.robot_run import ask
 from tests.support.served import (
     Served,
     command,
-    environment,
     refusal,
     serving,
 )
@@ -28,18 +25,12 @@ SHOWN = {"Authorization": f"Bearer {GOOD}"}
 SWITCHES = {"server.metrics": "prometheus_client", "server.traces": "opentelemetry.sdk"}
 
 
-@pytest.fixture
-def bag_dir(tmp_path: Path) -> Path:
-    write_run(tmp_path / "bags")
-    return tmp_path / "bags"
-
-
 @contextmanager
 def collector() -> Iterator[tuple[str, list[bytes]]]:
     """Where spans are sent to, and the bodies that came."""
     bodies: list[bytes] = []
 
-    class Handler(http.server.BaseHTTPRequestHandler):
+    class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             bodies.append(self.rfile.read(int(self.headers["content-length"])))
             self.send_response(200)
@@ -48,15 +39,8 @@ def collector() -> Iterator[tuple[str, list[bytes]]]:
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - its name
             """Tests have no log."""
 
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}", bodies
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with http_server(Handler) as address:
+        yield address, bodies
 
 
 async def asked(served: Served) -> None:
@@ -152,24 +136,3 @@ def test_there_are_no_metrics_over_stdio(bag_dir: Path) -> None:
     output = refusal(command("server.metrics=true"), bag_dir)
     assert len(output.splitlines()) == 2
     assert "server.transport=sse" in output
-
-
-def test_a_server_that_is_not_observed_loads_nothing_for_it(bag_dir: Path) -> None:
-    """And so runs without the extra."""
-    loaded = (
-        "import sys; from ros2_memory.config import load_settings; "
-        "from ros2_memory.bootstrap import build_memory, build_telemetry; "
-        "import ros2_memory.server; settings = load_settings(); "
-        "build_telemetry(settings, build_memory(settings)); "
-        "print([name for name in sys.modules if name.startswith("
-        "('prometheus_client', 'opentelemetry.sdk', 'ros2_memory.observability'))])"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", loaded],
-        env=environment(bag_dir),
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=PATIENCE_S,
-    )
-    assert ended.stdout == "[]\n"

@@ -17,19 +17,13 @@ from ros2_memory.server import _show_page, main
 from tests.support.examples import LONG
 from tests.support.forked_commands import write_command
 from tests.support.processes import PATIENCE_S
-from tests.support.robot_run import CALLS, T0_S, ask, ask_everything, write_run
+from tests.support.robot_run import CALLS, T0_S, ask, ask_everything
 from tests.support.served import PROGRAM, Served, command, environment, refusal, serving
 from tests.timing import in_time
 
 BETWEEN_ATTEMPTS_S = 0.05
 ENDS_WITHIN_S = 5.0
 """Far above the second that it should take; more would be a service manager's patience."""
-
-
-@pytest.fixture
-def bag_dir(tmp_path: Path) -> Path:
-    write_run(tmp_path / "bags")
-    return tmp_path / "bags"
 
 
 def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> None:

@@ -4,24 +4,17 @@ import json
 from pathlib import Path
 
 import httpx2
-import pytest
 from mcp import Client
 from mcp.client.sse import sse_client
 from mcp.client.streamable_http import streamable_http_client
 
 from tests.support.processes import PATIENCE_S
-from tests.support.robot_run import ask, write_run
+from tests.support.robot_run import ask
 from tests.support.served import Served, command, refusal, serving
 
 GOOD = "kJ7-x._~+/0123456789=="
 SHOWN = {"Authorization": f"Bearer {GOOD}"}
 EVERYWHERE = ".".join("0000")
-
-
-@pytest.fixture
-def bag_dir(tmp_path: Path) -> Path:
-    write_run(tmp_path / "bags")
-    return tmp_path / "bags"
 
 
 def test_it_does_not_start_without_a_token_where_others_can_reach_it(bag_dir: Path) -> None:

@@ -1,6 +1,7 @@
 """Bags written by the test that reads them: MCAP and sqlite3, as rosbag2 lays them out."""
 
 import math
+import os
 import sqlite3
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -201,14 +202,23 @@ def write_splits(
     split_s: float = 10.0,
     name: str = "rec",
     layout: McapLayout | None = None,
+    *,
+    dated: bool = False,
 ) -> None:
-    """Writes a recording in splits of so many seconds, numbered from 1,784,000,000 s on."""
+    """Writes a recording in splits of so many seconds; `dated`: each file as its last message."""
+    for number, some in splits_of(messages, split_s).items():
+        path = write_mcap(bag_dir / name / f"{name}_{number}.mcap", some, layout)
+        if dated:
+            os.utime(path, ns=(some[-1].log_time,) * 2)
+
+
+def splits_of(messages: Iterable[Msg], split_s: float) -> dict[int, list[Msg]]:
+    """The messages of each split, in order, numbered from 1,784,000,000 s on."""
     splits: dict[int, list[Msg]] = {}
     for each in sorted(messages, key=lambda each: each.log_time):
         number = int((each.log_time / 1e9 - 1_784_000_000) // split_s)
         splits.setdefault(number, []).append(each)
-    for number, some in splits.items():
-        write_mcap(bag_dir / name / f"{name}_{number}.mcap", some, layout)
+    return splits
 
 
 def write_db3(
@@ -443,19 +453,22 @@ def detections(
     score: float = 0.9,
 ) -> Msg:
     """A VisionDetectionArray in base_link with one detection for each label."""
-    body = make(
-        "ros2_vision_interfaces/msg/VisionDetectionArray",
-        header=header(ns, "base_link"),
-        skill="scene",
-        detections=[
-            make(
-                "ros2_vision_interfaces/msg/VisionDetection",
-                label=label,
-                score=score,
-                point=point(*at),
-                bbox=np.array([10, 20, 100, 120], dtype=np.int32),
-            )
-            for label in labels
-        ],
-    )
-    return Msg(topic, "ros2_vision_interfaces/msg/VisionDetectionArray", ns, body)
+    return detected(ns, [(label, score, at) for label in labels], topic=topic)
+
+
+def detected(
+    ns: int,
+    things: Iterable[tuple[str, float, tuple[float, float, float]]],
+    *,
+    topic: str = "/vision/scene/scene_objects",
+    frame: str = "base_link",
+) -> Msg:
+    """A VisionDetectionArray with a label, a score and a place for each detection."""
+    kind = "ros2_vision_interfaces/msg/VisionDetection"
+    bbox = np.array([10, 20, 100, 120], dtype=np.int32)
+    found = [
+        make(kind, label=label, score=score, point=point(*at), bbox=bbox)
+        for label, score, at in things
+    ]
+    body = make(f"{kind}Array", header=header(ns, frame), skill="scene", detections=found)
+    return Msg(topic, f"{kind}Array", ns, body)

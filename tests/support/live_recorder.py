@@ -13,7 +13,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -25,20 +25,16 @@ from mcp import Client
 from mcp.client.sse import sse_client
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.heartbeat import (
-    HeartbeatReading,
-    RecorderState,
-    read_heartbeat,
-)
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
-from tests.support.real_recorder import env_without_ros
+from tests.support.real_recorder import RealRecorder, env_without_ros
 from tests.support.robot_run import ask
-from tests.support.ros_processes import end, wait_for
+from tests.support.ros_processes import ros_environment, running, wait_for
 from tests.support.served import Served, serving
 
 RECORDED_TOPICS: Final = (
@@ -101,11 +97,19 @@ class LiveRecorder:
         return until(come)
 
     def wait_for_state(self, state: RecorderState) -> None:
-        def is_so() -> bool:
-            beat = self.heartbeat.heartbeat
-            return beat is not None and beat.state is state and beat.pid == self.process.pid
+        self.wait_for_beat(
+            lambda beat: beat.state is state and beat.pid == self.process.pid, f"state {state}"
+        )
 
-        wait_for(is_so, f"state {state}", alive=self.process)
+    def wait_for_beat(self, says: Callable[[Heartbeat], bool], what: str) -> Heartbeat:
+        """The first heartbeat that says so."""
+
+        def said() -> Heartbeat | None:
+            assert self.process.poll() is None, f"it ended before {what}"
+            beat = read_heartbeat(self.bag_dir).heartbeat
+            return beat if beat is not None and says(beat) else None
+
+        return until(said, what)
 
     def wait_for_subscriptions(self) -> None:
         """Returns once its newest recorder runs and has subscribed to everything."""
@@ -128,8 +132,10 @@ class LiveRecorder:
         }
 
     @property
-    def heartbeat(self) -> HeartbeatReading:
-        return read_heartbeat(self.bag_dir)
+    def heartbeat(self) -> Heartbeat:
+        beat = read_heartbeat(self.bag_dir).heartbeat
+        assert beat is not None
+        return beat
 
     def children(self) -> list[Child]:
         """Its recorders that run, the newest last."""
@@ -252,30 +258,25 @@ class Machine:
 
 
 @contextmanager
-def machine(folder: Path, env: Mapping[str, str]) -> Iterator[Machine]:
-    """A machine on which no recorder is left running."""
-    site = Machine(folder, env)
-    try:
-        yield site
-    finally:
-        for recorder in site.recorders:
-            recorder.discard()
-            # Shown where a test failed: the files of a machine that runs tests are soon gone.
-            sys.stdout.write(recorder.log.read_text(errors="replace")[-20_000:])
+def machine(folder: Path, real: RealRecorder) -> Iterator[Machine]:
+    """A machine with the real recorder, on which none is left running."""
+    with ros_environment(folder, real=real) as env:
+        site = Machine(folder, env)
+        try:
+            yield site
+        finally:
+            for recorder in site.recorders:
+                recorder.discard()
+                # Shown where a test failed: the files of a machine that runs tests are soon gone.
+                sys.stdout.write(recorder.log.read_text(errors="replace")[-20_000:])
 
 
 @contextmanager
 def publishing(env: Mapping[str, str], *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """Publishers of numbered messages, with arguments of `integration/counting_publishers.py`."""
-    module = "tests.integration.counting_publishers"
-    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", module, *arguments]
-    known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
-    process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
-    try:
+    with running(env, "tests.integration.counting_publishers", *arguments) as process:
         yield process
-    finally:
         sys.stdout.write(f"publishers: {process.poll()} (None: they ran)\n")
-        end(process)
 
 
 def number_of(payload: bytes) -> int:

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from random import Random
 
-from tests.support.bags import Msg, detections, mcap_content, odom, tf, transform
+from tests.support.bags import Msg, detections, mcap_content, odom, splits_of, tf, transform
 
 S = 10**9
 MS = 10**6
@@ -99,10 +99,7 @@ def write_moving_map(
 def _recorded(seed: int, seconds: int, split_s: float) -> tuple[MovingMap, dict[str, bytes]]:
     """What is true, and the content of each file: many tests ask about the same drive."""
     truth, messages = moving_map(Random(seed), seconds)
-    splits: dict[int, list[Msg]] = {}
-    for each in messages:
-        splits.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
     return truth, {
-        f"rec_{number}.mcap": mcap_content(sorted(some, key=lambda each: each.log_time))
-        for number, some in splits.items()
+        f"rec_{number}.mcap": mcap_content(some)
+        for number, some in splits_of(messages, split_s).items()
     }

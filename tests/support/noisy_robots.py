@@ -1,6 +1,5 @@
 """Robots as they are: noisy poses, a map that moves, a detector that errs, and many changes."""
 
-import os
 from pathlib import Path
 from random import Random
 from typing import Final
@@ -14,7 +13,7 @@ from tests.support.bags import (
     diagnostics,
     goals,
     log_entry,
-    write_mcap,
+    write_splits,
 )
 from tests.support.moving_map import BEGIN, MS, S, moving_map
 
@@ -30,12 +29,7 @@ def write_noisy_robot(name: str, bag_dir: Path, *, split_s: int = 12) -> Path:
     draw = Random(name)
     _, messages = moving_map(draw, LENGTH_S, noise_m=_NOISE_M, drift_m=_DRIFT_M, rate=10)
     messages += [*_seen(draw), *_changes(draw)]
-    splits: dict[int, list[Msg]] = {}
-    for each in sorted(messages, key=lambda each: each.log_time):
-        splits.setdefault((each.log_time - BEGIN) // (split_s * S), []).append(each)
-    for number, some in splits.items():
-        path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", some)
-        os.utime(path, ns=(some[-1].log_time,) * 2)
+    write_splits(bag_dir, messages, split_s, dated=True)
     return bag_dir
 
 

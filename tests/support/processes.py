@@ -2,9 +2,12 @@
 
 import asyncio
 import socket
+import threading
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import uvicorn
@@ -50,6 +53,28 @@ def until(what: Callable[[], T | None], name: str = "", *, timeout_s: float = PA
 
 BOUND_S: Final = PATIENCE_S
 """No test waits longer for what it expects."""
+
+
+@contextmanager
+def http_server(handler: Callable[..., BaseHTTPRequestHandler]) -> Iterator[str]:
+    """Serves what a handler answers; yields the address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
+def service_manager(address: Path) -> Iterator[socket.socket]:
+    """The socket of a service manager, from which what it is told can be received."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(address))
+        manager.settimeout(PATIENCE_S)
+        yield manager
 
 
 @asynccontextmanager

@@ -5,13 +5,15 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 from pyiceberg.catalog.rest import CreateTableRequest
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.exceptions import CommitFailedException, NoSuchTableError
 from pyiceberg.table import CommitTableRequest
+
+from tests.support.processes import http_server
 
 
 class _Requests(BaseHTTPRequestHandler):
@@ -91,12 +93,8 @@ def rest_catalogue(folder: Path) -> Iterator[str]:
     folder.mkdir(parents=True, exist_ok=True)
     catalog = SqlCatalog("rest", uri=f"sqlite:///{folder}/rest.sqlite", warehouse=folder.as_uri())
     answers = partial(_Requests, catalog, threading.Lock())
-    with ThreadingHTTPServer(("127.0.0.1", 0), answers) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()
-            catalog.close()
+    try:
+        with http_server(answers) as address:
+            yield address
+    finally:
+        catalog.close()

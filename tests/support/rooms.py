@@ -11,11 +11,9 @@ from pathlib import Path
 from random import Random
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import Memory
-from tests.support.bags import Msg, header, make, odom, point, text, write_mcap
+from tests.support.bags import Msg, detected, odom, text, write_splits
 from tests.support.memories import memory_of, with_store
 
 S: Final = 10**9
@@ -94,31 +92,12 @@ def draw(seed: int, seconds: int) -> World:
 
 def write(world: World, folder: Path, *, begin: int = BEGIN) -> None:
     """Writes a pose, a text and a message of the detector for each second, in splits of 20."""
-    splits: dict[int, list[Msg]] = {}
+    messages: list[Msg] = []
     for nth, x in enumerate(world.x):
         at = (begin + nth) * S
-        messages = [odom(at, x, 0.0), text(at, "hello")]
-        messages.append(_detected(at, world.seen[nth]))
-        splits.setdefault(nth // 20, []).extend(messages)
-    for nth, some in splits.items():
-        write_mcap(folder / "rec" / f"rec_{nth:03}.mcap", some)
-
-
-def _detected(ns: int, seen: Iterable[tuple[str, float]]) -> Msg:
-    """A message of the detector: labels with their scores, each at its place in odom."""
-    found = [
-        make(
-            "ros2_vision_interfaces/msg/VisionDetection",
-            label=label,
-            score=score,
-            point=point(*PLACES[label], 0.0),
-            bbox=np.array([10, 20, 100, 120], dtype=np.int32),
-        )
-        for label, score in seen
-    ]
-    kind = "ros2_vision_interfaces/msg/VisionDetectionArray"
-    body = make(kind, header=header(ns, "odom"), skill="scene", detections=found)
-    return Msg(SEEN, kind, ns, body)
+        things = [(label, score, (*PLACES[label], 0.0)) for label, score in world.seen[nth]]
+        messages += [odom(at, x, 0.0), text(at, "hello"), detected(at, things, frame="odom")]
+    write_splits(folder, messages, 20)
 
 
 def rooms_named(memory: Memory) -> Memory:

@@ -116,14 +116,23 @@ def publishing_robot(
         through: a program that becomes the robot, given as the end of its arguments.
     """
     assert not truth.exists(), f"{truth} is the truth of another drive"
-    argv = [*through, env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.support.robot_publishers"]
-    argv += ["--truth", str(truth), *options]
+    given = ["--truth", str(truth), *options]
     if duration_s is not None:
-        argv += ["--duration", str(duration_s)]
+        given += ["--duration", str(duration_s)]
+    with running(env, "tests.support.robot_publishers", *given, through=through) as process:
+        yield Robot(process, truth)
+
+
+@contextmanager
+def running(
+    env: Mapping[str, str], module: str, *arguments: str, through: Sequence[str] = ()
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A module that publishes, as a program under the Python of ROS."""
+    argv = [*through, env["ROS2_LIVE_PYTHON"], "-P", "-m", module, *arguments]
     known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
     process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
     try:
-        yield Robot(process, truth)
+        yield process
     finally:
         end(process)
 

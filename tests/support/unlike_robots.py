@@ -9,7 +9,17 @@ from typing import Final
 
 import numpy as np
 
-from tests.support.bags import Msg, battery, detections, header, make, odom, point, text, write_mcap
+from tests.support.bags import (
+    Msg,
+    battery,
+    detections,
+    header,
+    make,
+    odom,
+    point,
+    text,
+    write_splits,
+)
 from tests.support.moving_map import BEGIN, S, moving_map
 from tests.support.noisy_robots import write_noisy_robot
 
@@ -19,14 +29,7 @@ SPLIT_S: Final = 12
 
 
 def _write(bag_dir: Path, messages: list[Msg]) -> Path:
-    splits: dict[int, list[Msg]] = {}
-    for message in sorted(messages, key=lambda message: message.log_time):
-        splits.setdefault((message.log_time - messages[0].log_time) // (SPLIT_S * S), []).append(
-            message
-        )
-    for number, some in splits.items():
-        path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", some)
-        os.utime(path, ns=(some[-1].log_time,) * 2)
+    write_splits(bag_dir, messages, SPLIT_S, dated=True)
     return bag_dir
 
 
@@ -79,10 +82,7 @@ def underwater(bag_dir: Path) -> Path:
 def a_year_behind(bag_dir: Path) -> Path:
     """Its clock, or its use, is of a year ago; all else is as of others."""
     _, messages = moving_map(Random("behind"), LENGTH_S, noise_m=0.01)
-    return _write(
-        bag_dir,
-        [replace(message, log_time=message.log_time - YEAR_NS) for message in messages],
-    )
+    return _write(bag_dir, [replace(each, log_time=each.log_time - YEAR_NS) for each in messages])
 
 
 def without_transforms(bag_dir: Path) -> Path:

@@ -12,6 +12,7 @@ from ros2_memory.bootstrap import build_memory, reading_of
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
+from ros2_memory.retention.clear import clear_bags
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import keeper_of
 
@@ -53,7 +54,7 @@ def bags(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["rm", "-rf", str(folder)], check=True)
 
 
-def test_they_are_scanned_repaired_read_for_definitions_and_removed(
+def test_they_are_scanned_repaired_read_for_definitions_cleared_and_removed(
     bags: Path, bag: Path, tmp_path: Path
 ) -> None:
     put(bags, bag)
@@ -67,6 +68,7 @@ def test_they_are_scanned_repaired_read_for_definitions_and_removed(
     assert len(build_memory(settings).index.snapshot().bags) == 1
     keeper_of(bags).apply()
     assert recover_files(bags).whole == 1
+    assert clear_bags(bags).files == 1
     put(bags, bag, 3, "shallow")
     (bags / "link").symlink_to(tmp_path)
     directories.remove(bags)

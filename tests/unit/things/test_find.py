@@ -8,7 +8,6 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import numpy as np
 import pytest
 
 from ros2_memory.analysis import sights
@@ -16,22 +15,11 @@ from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.core.text import abbreviate
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.things import unseen
-from tests.support.bags import (
-    Msg,
-    header,
-    make,
-    odom,
-    point,
-    text,
-    tf,
-    transform,
-    write_splits,
-)
+from tests.support.bags import Msg, detected, odom, text, tf, transform, write_splits
 from tests.support.memories import asked, memory_of, replied
 
 S = 10**9
 BEGIN = 1_784_000_000
-TYPE = "ros2_vision_interfaces/msg/VisionDetectionArray"
 KITCHEN = Place("kitchen", "map", Rectangle(0, 6, -2, 2))
 NAMED = QuerySettings(places=(KITCHEN,), labels={"mug": ["coffee mug"]})
 OFF = (3.0, -2.0, 0.5)
@@ -68,18 +56,8 @@ def scene(
     things = []
     for label, thing_x, thing_y in seen:
         dx, dy = thing_x - x, thing_y - y
-        place = point(dx * cos - dy * sin, dx * sin + dy * cos, 0.7)
-        things.append(
-            make(
-                "ros2_vision_interfaces/msg/VisionDetection",
-                label=label,
-                score=score,
-                point=place,
-                bbox=np.array([0, 0, 1, 1], np.int32),
-            )
-        )
-    body = make(TYPE, header=header(at, "base_link"), skill="scene", detections=things)
-    return [*messages, Msg("/vision/scene/scene_objects", TYPE, at, body)]
+        things.append((label, score, (dx * cos - dy * sin, dx * sin + dy * cos, 0.7)))
+    return [*messages, detected(at, things)]
 
 
 def base(at: int, x: float, y: float, yaw: float) -> object:
@@ -454,7 +432,7 @@ def test_detections_that_cannot_be_decoded_are_no_silence_of_the_detector(
 ) -> None:
     """All of them, or every other one, have lost their ends."""
     messages = [one for at in range(30) for one in scene(at, (0, 0, 0), [("cup", 1, 0)])]
-    for nth in [nth for nth, one in enumerate(messages) if one.type == TYPE][::every]:
+    for nth in [nth for nth, one in enumerate(messages) if "vision" in one.topic][::every]:
         one = messages[nth]
         messages[nth] = Msg(one.topic, one.type, one.log_time, one.payload[:-20])
     write_splits(tmp_path, messages, 30, "rec")
