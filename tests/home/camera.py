@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ros2_memory.core.arrays import Floats
+from tests.home.days import Person
 from tests.home.flat import clear_lines
 from tests.home.paths import Pose
-from tests.home.people import Person
 from tests.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS, Thing
 
 CAMERA: Final = (0.15, 0.0, 0.40)

@@ -45,6 +45,7 @@ def _trust(asked: Asked) -> Iterator[Question]:
     # Silence is known between messages of a recorded time: as far as that reaches.
     recorded = [(a, b) for a, b in truth.recorded if a < stop and b > start]
     first, last = max(start, recorded[0][0]), min(stop, recorded[-1][1])
+    silent_s = sum(min(b, stop) - max(a, start) for a, b in recorded)
     gap_from = max(b for _, b in truth.recorded if b <= truth.outage[0] + 1.0)
     gap_to = min(a for a, _ in truth.recorded if a >= truth.outage[1] - 1.0)
     middle = sum(truth.outage) / 2
@@ -73,6 +74,8 @@ def _trust(asked: Asked) -> Iterator[Question]:
             "data_time_range",
             (between(min(start, first) - 150.0, first + 10.0), lambda reply: today(reply)["start"]),
             (between(last - 10.0, until), lambda reply: today(reply)["end"]),
+            (Number(silent_s, 2.0), lambda reply: today(reply)["silent_s"]),
+            (Number(1), lambda reply: len(reply["silences"])),
         ),
         (
             "Did your detector fall silent on any day before today?",
@@ -88,7 +91,7 @@ def _trust(asked: Asked) -> Iterator[Question]:
         (
             "Was your clock ever set, when, and by how many seconds?",
             "data_time_range",
-            (Number(CLOCK_STEP_S, 1.0), lambda reply: step(reply)["step_s"]),
+            (Number(CLOCK_STEP_S, 0.2), lambda reply: step(reply)["step_s"]),
             (
                 between(truth.clock_step - 10.0, truth.clock_step + CLOCK_STEP_S + 10.0),
                 lambda reply: step(reply)["at"],

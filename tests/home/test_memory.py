@@ -32,8 +32,15 @@ def missed(world: Path) -> dict[str, object]:
 
 def test_questions_are_answered_alike_when_bags_are_gone(home: Path, thinned_home: Path) -> None:
     whole = sum(path.stat().st_size for path in home.rglob("*.mcap"))
-    thinned = [path for path in thinned_home.rglob("*.mcap") if is_thinned(path)]
+    thinned, left = [], set()
+    for path in thinned_home.rglob("*.mcap"):
+        if is_thinned(path):
+            thinned.append(path)
+        else:
+            left.add(path.relative_to(thinned_home))
     assert sum(path.stat().st_size for path in thinned) < whole / 12
+    newest = max(path.relative_to(home) for path in home.rglob("*.mcap")).parent
+    assert {path.parent for path in left} == {newest}
     assert missed(thinned_home) == {}
 
 
@@ -52,3 +59,6 @@ def test_questions_are_answered_alike_for_a_year(
             wrong = missed(world)
             # Where one of two messages a second stays, what a detector mistakes may weigh too much.
             assert len(wrong.keys() - OF_ALL_DAYS) <= 2, (day, wrong)
+
+
+S = 10**9

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from ros2_memory.core.arrays import Floats
 from tests.home import camera, days, drift, things
 from tests.home.camera import Sights
-from tests.home.days import Life, Scale
+from tests.home.days import Life, Person, Scale, people
 from tests.home.drift import Drift
 from tests.home.paths import Pose
-from tests.home.people import Person, people
 from tests.home.things import Thing
 
 START_S: Final = 1_772_409_600

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
@@ -14,9 +13,7 @@ from unittest.mock import patch
 
 import pytest
 
-from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.__main__ import main
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
@@ -25,6 +22,7 @@ from tests.support.bags import odom, write_mcap
 from tests.support.forked_commands import Forked
 from tests.support.live_recorder import LiveRecorder
 from tests.support.processes import PATIENCE_S, service_manager, until
+from tests.support.simulated_recorders import published
 from tests.timing import each_in_time
 
 PERIOD_NS = 10_000_000
@@ -115,19 +113,8 @@ def site(tmp_path: Path) -> Iterator[Site]:
         yield site
 
 
-def published(bag_dir: Path, *, counting: bool) -> Counter[int]:
-    """How often each publish time of `/odom` stands in the bags, or counts in them."""
-    reader = BagDirReader(McapReader()) if counting else McapReader()
-    found: Counter[int] = Counter()
-    for path in sorted(bag_dir.glob("*/*.mcap")):
-        if path.stat().st_size:
-            records = reader.records(path, ["/odom"], TimeWindow.everything())
-            found.update(record.publish_time for record in records)
-    return found
-
-
 def assert_nothing_lost_or_doubled(bag_dir: Path) -> None:
-    stands, counts = published(bag_dir, counting=False), published(bag_dir, counting=True)
+    stands, counts = (published(bag_dir, "/odom", counting=each) for each in (False, True))
     assert counts == dict.fromkeys(stands, 1)
     assert len(stands) == (max(stands) - min(stands)) // PERIOD_NS + 1
 
@@ -140,7 +127,9 @@ def test_over_rotations_no_message_is_lost_or_counts_twice(tmp_path: Path) -> No
         daemon.wait_for("rotated", 3)
         daemon.stop()
     assert_nothing_lost_or_doubled(site.bag_dir)
-    twice = [times for times in published(site.bag_dir, counting=False).values() if times > 1]
+    twice = [
+        times for times in published(site.bag_dir, "/odom", counting=False).values() if times > 1
+    ]
     assert len(twice) > 3 * 100
     beat = read_heartbeat(site.bag_dir).heartbeat
     assert beat is not None

@@ -1,11 +1,15 @@
-"""The query server as its own process, asked by the SDK's real client over each transport."""
+"""The query server as its own process: its start, each transport, and its end."""
 
 import json
+import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import IO
 
 import anyio
 import pytest
@@ -14,10 +18,12 @@ from mcp.client.sse import sse_client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from ros2_memory.server import _show_page, main
+from tests.soak.clients import hostile_bodies, opening
+from tests.soak.wire import call
 from tests.support.examples import LONG
 from tests.support.forked_commands import write_command
-from tests.support.processes import PATIENCE_S
-from tests.support.robot_run import CALLS, T0_S, ask, ask_everything
+from tests.support.processes import PATIENCE_S, service_manager
+from tests.support.robot_run import CALLS, T0_S, ask, ask_everything, write_run
 from tests.support.served import PROGRAM, Served, command, environment, refusal, serving
 from tests.timing import in_time
 
@@ -239,3 +245,119 @@ def _end_while_waiting(bag_dir: Path, number: signal.Signals) -> None:
     assert process.wait(timeout=ENDS_WITHIN_S) == 0
     rest, _ = process.communicate()
     assert rest == b""
+
+
+def test_it_is_ready_when_it_listens_and_says_when_it_stops(tmp_path: Path) -> None:
+    with service_manager(tmp_path / "notify") as manager:
+        env = {
+            **os.environ,
+            "NOTIFY_SOCKET": str(tmp_path / "notify"),
+            "MEMORY_BAG_DIR": str(tmp_path),
+            "MCP_TRANSPORT": "sse",
+            "MCP_PORT": "0",
+        }
+        argv = [sys.executable, "-m", "ros2_memory.server", "recorder=none"]
+        with subprocess.Popen(argv, env=env, stderr=subprocess.DEVNULL) as server:
+            assert manager.recv(100) == b"READY=1"
+            server.send_signal(signal.SIGTERM)
+            assert manager.recv(100) == b"STOPPING=1"
+            assert server.wait(PATIENCE_S) == 0
+
+
+INTERRUPTING = """
+import os, signal, sys
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == os.environ["INTERRUPTED_AT"]:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "module"),
+    [
+        pytest.param("ros2-memory", "typer", id="ros2-memory"),
+        pytest.param("ros2-memory-recorder", "structlog", id="recorder"),
+        pytest.param("ros2-memory-server", "structlog", id="server"),
+    ],
+)
+def test_ctrl_c_while_a_program_imports_ends_it_without_a_traceback(
+    tmp_path: Path, program: str, module: str
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPTING, encoding="utf-8")
+    path = shutil.which(program, path=Path(sys.executable).parent)
+    assert path is not None
+    ended = subprocess.run(
+        [path, "--help"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path), "INTERRUPTED_AT": module},
+        capture_output=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, b"", b"")
+
+
+GARBAGE = (b"", b"\x00", b"\xff\xff", b'"x"', b"[]", b"7", b"{", b"[" * 100_000)
+DEEP = '{"timestamp": ' + "[" * 500 + "]" * 500 + "}"
+UNPARSED = (
+    call("find_things", '{"label": "\\ud800 \\"id\\": 7"}', 50),
+    call("get_position_at", DEEP, 51),
+    b'{"method": "ping", "params": {"name": "\\ud800", "id": 7}, "jsonrpc": "2.0", "id": "a"}',
+    b'{"jsonrpc": "2.0", "id": 52, "method": "tools/call", "params": [1]}',
+)
+LAST = 99
+
+
+def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
+    write_run(tmp_path / "bags")
+    ours = ("MEMORY_", "MCP_", "ROS_")
+    env = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
+    bodies = (*opening(), *(body for body, _ in hostile_bodies()), *GARBAGE, *UNPARSED)
+    lines = (*bodies, call("data_time_range", "{}", LAST))
+    write_command(tmp_path)
+    process = subprocess.Popen(
+        [str(tmp_path / "ros2-memory-server"), "data.now=latest"],
+        env=env | {"MEMORY_BAG_DIR": str(tmp_path / "bags")},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        # Beside reading: neither pipe takes in all of it at once.
+        written = b"".join(line + b"\n" for line in lines)
+        writer = threading.Thread(target=_write, args=(process.stdin, written))
+        writer.start()
+        replies = []
+        for line in process.stdout:
+            replies.append(json.loads(line))
+            if replies[-1]["id"] == LAST:
+                break
+        assert process.poll() is None
+        writer.join()
+        process.stdin.close()
+        assert process.wait(timeout=PATIENCE_S) == 0
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    reply = json.loads(replies[-1]["result"]["content"][0]["text"])
+    assert reply["earliest"] == T0_S
+    errors = [
+        json.loads(each["result"]["content"][0]["text"])["error"]
+        for each in replies[1:-1]
+        if "content" in each.get("result", {})
+    ]
+    refused = {each["id"]: each["error"]["message"] for each in replies if "error" in each}
+    assert {50, 51, "a", 52} <= refused.keys()
+    assert "hex escape" in refused[50]
+    assert "recursion limit" in refused[51]
+    assert len(errors) >= 15
+    assert set(errors) == {"invalid_arguments"}
+
+
+def _write(pipe: IO[bytes], data: bytes) -> None:
+    pipe.write(data)
+    pipe.flush()

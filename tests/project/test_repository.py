@@ -1,5 +1,10 @@
-"""What the repository promises about itself: the wheel, its dependencies, the examples."""
+"""What the repository promises about itself: the wheel, its dependencies, its registration.
 
+`server.json`, by which the MCP registry lists the server, is validated against the registry's
+schema (2025-12-11, in tests/data/mcp_registry), and by what it demands of packages of PyPI.
+"""
+
+import json
 import re
 import subprocess
 import sys
@@ -7,7 +12,9 @@ import tomllib
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
@@ -99,3 +106,29 @@ def test_the_environment_example_names_every_variable_that_is_read_and_sets_none
     assert named == set(re.findall(r'"((?:MCP|MEMORY|ROS)_[A-Z_]+)"', source))
     # As EnvironmentFile= an empty value overrides what a unit sets.
     assert not [line for line in lines if line and line[0] != "#"]
+
+
+SERVER: Any = json.loads((ROOT / "server.json").read_text(encoding="utf-8"))
+[PACKAGE] = SERVER["packages"]
+SCHEMA = "https://static.modelcontextprotocol.io/schemas/2025-12-11/server.schema.json"
+VALID = jsonschema.Draft7Validator(
+    json.loads((ROOT / "tests/data/mcp_registry/server.schema.json").read_text(encoding="utf-8"))
+)
+
+
+def test_it_is_valid_by_the_schema_that_it_names() -> None:
+    assert VALID.schema["$id"] == SERVER["$schema"] == SCHEMA
+    assert [each.message for each in VALID.iter_errors(SERVER)] == []
+
+
+def test_it_names_this_release_of_this_package_on_pypi_whose_readme_names_it() -> None:
+    assert (PACKAGE["registryType"], PACKAGE["identifier"]) == ("pypi", PROJECT["name"])
+    assert SERVER["version"] == PACKAGE["version"] == PROJECT["version"]
+    readme = (ROOT / PROJECT["readme"]).read_text(encoding="utf-8")
+    assert re.findall(r"mcp-name: (\S+)", readme) == [SERVER["name"]]
+
+
+def test_every_variable_is_one_that_the_programs_read() -> None:
+    example = (ROOT / ".env.example").read_text(encoding="utf-8")
+    known = set(re.findall(r"^#([A-Z_]+)=", example, re.MULTILINE))
+    assert {variable["name"] for variable in PACKAGE["environmentVariables"]} <= known

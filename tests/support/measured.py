@@ -54,7 +54,6 @@ UNMEASURED: Final = (
     "test_gaps_within.py",
     "test_hostile_*.py",
     "test_latched_carry.py",
-    "test_map_placement.py",
     "test_mcap_reader.py::test_of_uncompressed_files",
     "test_no_data.py::test_no_reply_about_a_memory_from_time_zero",
     "test_outline.py",
@@ -70,7 +69,6 @@ UNMEASURED: Final = (
     "test_unlike_robots.py",
     "test_visits.py",
     "things/test_compare.py",
-    "things/test_seen.py",
 )
 """Files, or tests of a file by how their names begin, that are not measured.
 

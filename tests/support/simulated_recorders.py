@@ -278,13 +278,18 @@ class World:
 
     def published(self, *, counting: bool) -> Counter[int]:
         """How often each publish time of `/bumper` stands in the bags, or counts in them."""
-        reader = BagDirReader(self.reader) if counting else self.reader
-        found: Counter[int] = Counter()
-        for path in sorted(self.bag_dir.glob("*/*.mcap")):
-            if path.stat().st_size:
-                records = reader.records(path, ["/bumper"], TimeWindow.everything())
-                found.update(record.publish_time for record in records)
-        return found
+        return published(self.bag_dir, "/bumper", counting=counting)
+
+
+def published(bag_dir: Path, topic: str, *, counting: bool) -> Counter[int]:
+    """How often each publish time of a topic stands in the bags, or counts in them."""
+    reader = BagDirReader(McapReader()) if counting else McapReader()
+    found: Counter[int] = Counter()
+    for path in sorted(bag_dir.glob("*/*.mcap")):
+        if path.stat().st_size:
+            records = reader.records(path, [topic], TimeWindow.everything())
+            found.update(record.publish_time for record in records)
+    return found
 
 
 def rotating(bag_dir: Path, run_s: float = 0.0, **given: Any) -> World:

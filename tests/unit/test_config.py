@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -20,10 +21,33 @@ from ros2_memory.config import (
 )
 from ros2_memory.config_sources import Sources
 from ros2_memory.core.errors import ConfigError
-from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, copied, refusal
 from tests.support.examples import examples
 from tests.support.fleets import reply
 from tests.support.robot_run import write_run
+
+ROOT = Path(__file__).resolve().parents[2]
+MCAP = "ros2_memory.storage.mcap_reader.McapReader"
+ROSBAG2 = "ros2_memory.storage.rosbag2_reader.Rosbag2Reader"
+ROS2BAG = "ros2_memory.recorder.ros2bag.Ros2BagRecorder"
+NONE = "ros2_memory.recorder.null.NullRecorder"
+
+
+def refusal(*overrides: str, **env: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_settings(overrides, env)
+    return str(caught.value)
+
+
+def copied(folder: Path) -> Path:
+    """The shipped configuration, copied into a folder."""
+    return shutil.copytree(ROOT / "config", folder / "config")
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
     codec="utf-8", exclude_characters="\0"

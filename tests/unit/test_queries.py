@@ -1,17 +1,27 @@
-"""Questions whose honest answer takes care."""
+"""Questions whose honest answer takes care, and a recorded circle in its closed form.
 
+Its header stamps are T0 + t exactly; log times lie some milliseconds later.
+"""
+
+import math
 from pathlib import Path
 
+import pytest
+from rosbags.rosbag2 import Reader
+
 from ros2_memory import queries
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.history.view import TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import (
     command,
     detections,
     odom,
     write_mcap,
 )
-from tests.support.memories import asked, memory_of
+from tests.support.closed_form import TURN_RATE, position
+from tests.support.memories import ROOT, asked, memory_of
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9
@@ -58,3 +68,47 @@ def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: P
         "the memory begins",
         "the memory ends",
     ]
+
+
+SPEED = 0.5  # m/s
+LASER, CAMERA = (0.10, 0.20), (0.15, 0.30)  # x and z in base_link, m
+COMMITTED = ROOT / "tests" / "data" / "session_zstd", 1795144023.536, "mcap"
+SESSIONS = (
+    (RECORDED / "session_mcap", 1795144003.095, "mcap"),
+    (RECORDED / "session_sqlite3", 1795144003.086, "rosbag2"),
+    (RECORDED / "session_zstd_file", 1795144044.072, "rosbag2"),
+)
+
+
+@pytest.mark.parametrize(
+    ("folder", "t0", "storage"),
+    [COMMITTED, *(pytest.param(*session, marks=needs_recorded) for session in SESSIONS)],
+    ids=lambda value: value.name if isinstance(value, Path) else "",
+)
+def test_a_recorded_circle_is_answered_in_its_closed_form(
+    folder: Path, t0: float, storage: str
+) -> None:
+    with Reader(folder) as reader:
+        connections = [each for each in reader.connections if each.topic == "/odom"]
+        times = sorted(time for _, time, _ in reader.messages(connections))
+    memory, begin, end = memory_of(folder, storage=storage), times[0] / 1e9, times[-1] / 1e9
+    for nth in range(1, 40):
+        asked = begin + 0.2 + (end - begin - 0.4) * nth / 40
+        t = asked - t0
+        answer = queries.position(memory, Call(), AtTime(at_s=asked))
+        assert answer.time == max(time for time in times if time <= asked * 1e9)
+        there = position(unix_from_ns(answer.time) - t0)
+        assert math.dist(answer.pose.position[:2], there) < 0.005
+        for sensor, (ahead, height) in {"laser": LASER, "camera": CAMERA}.items():
+            placed = queries.transform(memory, Call(), "odom", sensor, AtTime(at_s=asked))
+            (x, y), angle = position(t), TURN_RATE * t
+            there = x + ahead * math.cos(angle), y + ahead * math.sin(angle)
+            assert math.dist(placed.transform.translation, (*there, height)) < 0.005
+            *_, z, w = placed.transform.rotation
+            assert math.remainder(2 * math.atan2(z, w) - angle, math.tau) == pytest.approx(
+                0, abs=math.radians(0.2)
+            )
+    driven = queries.trajectory_summary(memory, Call(), TimeRange(begin - 1, end + 1)).trajectory
+    steps = round((end - begin) * 20)
+    assert driven.totals.distance_m == pytest.approx(SPEED * steps / 20, rel=1e-3)
+    assert driven.max_speed == pytest.approx(SPEED, abs=1e-6)

@@ -1,19 +1,21 @@
-"""Visits to places of any shape, in a map that moves under odometry."""
+"""Visits to places of any shape, in a map that moves under odometry or is not known yet."""
 
 import math
 from dataclasses import replace
 from functools import partial
-from itertools import chain, repeat
+from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.places.visits import visits
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap, write_splits
@@ -142,3 +144,18 @@ def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
             assert known.track.x.max() == 5.0
     assert len(known_since) > 10
     assert None in known_since
+
+
+def test_a_map_of_which_it_is_not_known_whether_transforms_lead_there_is_not_denied(
+    tmp_path: Path,
+) -> None:
+    write_moving_map(tmp_path, 1, seconds=100, split_s=2.0)
+    outcomes = set()
+    for looks in range(1, 40, 4):  # how often the clock may be looked at before the time is over
+        # A memory of its own each time: what one call found out, the next knows.
+        view = View(memory_of(tmp_path), Call(Deadline.after(looks, map(float, count()).__next__)))
+        try:
+            outcomes.add(map_placement(view, "/odom", "map").frame_id)
+        except QueryTimeoutError:
+            outcomes.add("timeout")
+    assert outcomes == {"map", "timeout"}
