@@ -31,16 +31,11 @@ def missed(world: Path) -> dict[str, object]:
 
 
 def test_questions_are_answered_alike_when_bags_are_gone(home: Path, thinned_home: Path) -> None:
-    whole = sum(path.stat().st_size for path in home.rglob("*.mcap"))
-    thinned, left = [], set()
-    for path in thinned_home.rglob("*.mcap"):
-        if is_thinned(path):
-            thinned.append(path)
-        else:
-            left.add(path.relative_to(thinned_home))
-    assert sum(path.stat().st_size for path in thinned) < whole / 12
-    newest = max(path.relative_to(home) for path in home.rglob("*.mcap")).parent
-    assert {path.parent for path in left} == {newest}
+    bags = {path.relative_to(home): path.stat().st_size for path in home.rglob("*.mcap")}
+    left = [path for path in bags if (thinned_home / path).exists()]
+    assert left == [path for path in bags if path.parent == max(bags).parent]
+    thinned = [path for path in thinned_home.rglob("*.mcap") if is_thinned(path)]
+    assert sum(path.stat().st_size for path in thinned) < sum(bags.values()) / 12
     assert missed(thinned_home) == {}
 
 

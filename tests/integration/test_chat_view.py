@@ -15,7 +15,7 @@ from mcp.types import TextResourceContents
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
 from ros2_memory.serving.mcp_server import VIEW_URI, EpisodicServer
-from tests.integration.browser import Browser, browsing, needs_chromium
+from tests.integration.browser import Browser, needs_chromium
 from tests.integration.test_page import ATTACK, painted, write_history
 from tests.support.demo_bags import ASKED_AT_S, recorded
 from tests.support.processes import http_server
@@ -226,26 +226,15 @@ class Robot:
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("chat")
-
-
-@pytest.fixture(scope="module")
 def robot(scratch: Path) -> Iterator[Robot]:
     with recorded(scratch / "demo"):
         yield Robot(scratch / "demo")
 
 
-@pytest.fixture(scope="module")
-def chromium(scratch: Path) -> Iterator[Browser]:
-    with browsing(scratch) as browser:
-        browser.looks(width=720, height=1400)
-        yield browser
-
-
 @pytest.fixture
 def host(chromium: Browser) -> Iterator[ChatHost]:
     """A host; what the browser complains of fails the test, and so does a request that leaves."""
+    chromium.looks(width=720, height=1400)
     chromium.complaints()
     with chat_host(chromium) as shown:
         yield shown

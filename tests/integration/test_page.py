@@ -13,7 +13,7 @@ import pytest
 
 from ros2_memory.bag_dir.heartbeat import write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
-from tests.integration.browser import ENTER, RIGHT, TAB, Browser, browsing, needs_chromium
+from tests.integration.browser import ENTER, RIGHT, TAB, Browser, needs_chromium
 from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.documented_history import heartbeat
 from tests.support.processes import until
@@ -59,21 +59,10 @@ def write_history(bag_dir: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("page")
-
-
-@pytest.fixture(scope="module")
 def served(scratch: Path) -> Iterator[Served]:
     write_history(scratch / "bags")
     with serving(scratch / "bags", scratch / "log", "storage=mcap") as server:
         yield server
-
-
-@pytest.fixture(scope="module")
-def chromium(scratch: Path) -> Iterator[Browser]:
-    with browsing(scratch) as browser:
-        yield browser
 
 
 @pytest.fixture

@@ -117,7 +117,6 @@ class Asker:
     bag_dir: Path
     begin: int
     rounds: int = 0
-    no_data: int = 0
     wrong: list[str] = field(default_factory=list)
     _stop: threading.Event = field(default_factory=threading.Event)
     _round: threading.Condition = field(default_factory=threading.Condition)
@@ -167,7 +166,6 @@ class Asker:
         try:
             question()
         except NoDataError as error:
-            self.no_data += 1
             if not may_lack:
                 self.wrong.append(error.detail)
         except Exception as error:

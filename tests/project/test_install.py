@@ -214,14 +214,14 @@ PROMISED: dict[str, dict[str, list[str]]] = {
         "KillMode": ["control-group"],
         # A child's patience is 15 s, and two of them are ended at once.
         "TimeoutStopSec": ["40"],
-        "ReadWritePaths": [BAGS],
+        "ReadWritePaths": [f"/{BAGS}"],
         # Not below the mount point of a disk that is not there.
-        "RequiresMountsFor": [BAGS],
+        "RequiresMountsFor": [f"/{BAGS}"],
         "MemoryDenyWriteExecute": ["yes"],
     },
     "server": {
         "IPAddressAllow": ["localhost"],
-        "ReadWritePaths": [f"-{BAGS}/{REQUESTS_FOLDER}"],
+        "ReadWritePaths": [f"-/{BAGS}/{REQUESTS_FOLDER}"],
         "ReadOnlyPaths": ["-/var/lib/ros2-memory"],
     },
     "query": {"Conflicts": ["ros2-memory-server.service"]},
@@ -271,7 +271,7 @@ def test_a_unit_keeps_its_promises(name: str) -> None:
     assert settings["MemoryMax"]
     assert settings["TasksMax"]
     if name == "recorder":  # it hears publishers of another user, too
-        given = {"FASTDDS_BUILTIN_TRANSPORTS=UDPv4", f"MEMORY_BAG_DIR={BAGS}"}
+        given = {"FASTDDS_BUILTIN_TRANSPORTS=UDPv4", f"MEMORY_BAG_DIR=/{BAGS}"}
         assert given <= {*settings["Environment"]}
     lines = unit_of(name).read_text().splitlines()
     own = max(n for n, line in enumerate(lines) if line.startswith("Environment="))

@@ -313,44 +313,61 @@ class TestRefusals:
             assert re.search("secret|shell|token", str(caught.value))
 
 
-def labels(text: str, tmp_path: Path) -> object:
-    path = tmp_path / "labels.yaml"
-    path.write_text(text)
+def labels(path: Path) -> object:
     return load_labels(load_settings([f"data.labels_file='{path}'"], {}))
 
 
-def schemas(text: str, tmp_path: Path) -> object:
-    path = tmp_path / "schemas.yaml"
-    path.write_text(text)
+def schemas(path: Path) -> object:
     return load_message_schemas(load_settings([f"reader.schemas_file='{path}'"], {}))
 
 
-def require_refused(
-    load: Callable[[str, Path], object], tmp_path: Path, text: str, *fragments: str
+@pytest.mark.parametrize(
+    ("load", "key", "text", "fragment"),
+    [
+        *(
+            (schemas, "reader.schemas_file", *row)
+            for row in (
+                ("schemas: {nav_msgs/Odometry: {position: pose}}", "nav_msgs/msg/Odometry"),
+                ("schemas: {a/msg/B: {position: pose..position}}", "schemas.a/msg/B.position"),
+                ("schemas: {a/msg/B: position}", "schemas.a/msg/B: 'position'"),
+                ("schemas:\n  a/msg/C: {x: y}\n  a/msg/B:\n    x.y: 3", "wrong.yaml, line 4,"),
+                ("schemas: {a/msg/B: {x: y}, a/msg/B: {x: z}}", "duplicate key a/msg/B"),
+                ("- a list", "['a list'] is not allowed"),
+                ("", "schemas: missing"),
+            )
+        ),
+        *(
+            (labels, "data.labels_file", *row)
+            for row in (
+                (
+                    "labels: {mug: [cup], Glass: [CUP]}",
+                    "'CUP' is under 'mug' (as 'cup') and 'Glass'",
+                ),
+                (
+                    "labels: {mug: [tea_cup], cup: [Tea cup]}",
+                    "is under 'mug' (as 'tea_cup') and 'cup'",
+                ),
+                ("labels: {mug: [cups], glass: [cup]}", "is under 'mug' (as 'cups') and 'glass'"),
+                ("labels: {sofa: [couches], seat: [Couch]}", "plurals do not count"),
+                ("labels: {mug: [cup], cup: []}", "'cup' is under 'mug' and 'cup'"),
+                ("labels: {mug: cup}", "labels.mug: 'cup' is not allowed; must be a list"),
+                ("labels: {mug: [' ']}", "empty spelling, as under 'mug'"),
+                ("labels: {mug: [], mug: [cup]}", "duplicate key mug"),
+                ("labels: [mug]", "labels: ['mug'] is not allowed; must hold keys"),
+                ("labels: " + "[" * 3000, "maximum recursion depth"),
+                ("", "labels: missing"),
+            )
+        ),
+    ],
+)
+def test_a_wrong_file_is_refused_by_file_and_key(
+    tmp_path: Path, load: Callable[[Path], object], key: str, text: str, fragment: str
 ) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        load(text, tmp_path)
-    assert [each for each in fragments if each not in str(caught.value)] == []
-
-
-class TestMessageSchemas:
-    @pytest.mark.parametrize(
-        ("text", "fragment"),
-        [
-            ("schemas: {nav_msgs/Odometry: {position: pose}}", "nav_msgs/msg/Odometry"),
-            ("schemas: {a/msg/B: {position: pose..position}}", "schemas.a/msg/B.position"),
-            ("schemas: {a/msg/B: position}", "schemas.a/msg/B: 'position'"),
-            ("schemas:\n  a/msg/C: {x: y}\n  a/msg/B:\n    x.y: 3", "schemas.yaml, line 4,"),
-            ("schemas: {a/msg/B: {x: y}, a/msg/B: {x: z}}", "duplicate key a/msg/B"),
-            ("- a list", "['a list'] is not allowed"),
-            ("", "schemas: missing"),
-        ],
-    )
-    def test_a_wrong_file_is_refused_by_file_and_key(
-        self, text: str, fragment: str, tmp_path: Path
-    ) -> None:
-        named = str(tmp_path / "schemas.yaml"), "reader.schemas_file"
-        require_refused(schemas, tmp_path, text, fragment, *named)
+        load(path)
+    assert [each for each in (fragment, str(path), key) if each not in str(caught.value)] == []
 
 
 class TestLabels:
@@ -362,33 +379,13 @@ class TestLabels:
         assert limits.labels == {"mug": ("coffee mug", "Mug")}
         assert limits.min_score == 0.3
 
-    @pytest.mark.parametrize(
-        ("text", "fragment"),
-        [
-            ("labels: {mug: [cup], Glass: [CUP]}", "'CUP' is under 'mug' (as 'cup') and 'Glass'"),
-            ("labels: {mug: [tea_cup], cup: [Tea cup]}", "is under 'mug' (as 'tea_cup') and 'cup'"),
-            ("labels: {mug: [cups], glass: [cup]}", "is under 'mug' (as 'cups') and 'glass'"),
-            ("labels: {sofa: [couches], seat: [Couch]}", "plurals do not count"),
-            ("labels: {mug: [cup], cup: []}", "'cup' is under 'mug' and 'cup'"),
-            ("labels: {mug: cup}", "labels.mug: 'cup' is not allowed; must be a list"),
-            ("labels: {mug: [' ']}", "empty spelling, as under 'mug'"),
-            ("labels: {mug: [], mug: [cup]}", "duplicate key mug"),
-            ("labels: [mug]", "labels: ['mug'] is not allowed; must hold keys"),
-            ("labels: " + "[" * 3000, "maximum recursion depth"),
-            ("", "labels: missing"),
-        ],
-    )
-    def test_a_wrong_file_is_refused_by_file_and_key(
-        self, text: str, fragment: str, tmp_path: Path
-    ) -> None:
-        named = str(tmp_path / "labels.yaml"), "data.labels_file"
-        require_refused(labels, tmp_path, text, fragment, *named)
-
     def test_the_shipped_examples_are_valid(self, tmp_path: Path) -> None:
         shipped = (ROOT / "config/labels.yaml").read_text()
         _, commented = shipped.split("labels: {}\n\n")
         uncommented = "".join(line.removeprefix("# ") for line in commented.splitlines(True))
-        assert labels(uncommented, tmp_path) == {
+        path = tmp_path / "labels.yaml"
+        path.write_text(uncommented)
+        assert labels(path) == {
             "mug": ("coffee mug", "tea cup"),
             "sofa": ("couch", "settee"),
             "remote control": ("remote", "tv controller"),

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.clock_steps import ClockStep, step_over
 from ros2_memory.analysis.motion.trajectory import Trajectory
 from ros2_memory.analysis.poses import Poses
 from ros2_memory.core.model import Vector3
@@ -132,7 +131,6 @@ def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
 def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     positions: list[Vector3], at_most: int
 ) -> None:
-    poses = driven(positions)
     found = way_of(poses, 10.0).trajectory(at_most)
     assert farthest_off(positions, found) <= found.waypoint_error_m + 1e-7
     assert len(found.waypoints) <= at_most
@@ -151,20 +149,3 @@ def poses(begin: float, x: float, speed_mps: float) -> Poses:
     return posed(
         (round((begin + at / 10) * S), (x + speed_mps * at / 10, 0.0, 0.0)) for at in tenths
     )
-
-
-def over(moved_m: float, *, length: float = 8.0, before: float = 0.5, after: float = 0.5) -> object:
-    first = poses(99.0, 0.0, before)
-    second = poses(100 + length, float(first.positions[-1, 0]) + moved_m, after)
-    return step_over((100 * S, round((100 + length) * S)), first, second)
-
-
-@given(
-    by=st.floats(2.5, 86_400),
-    speed=st.floats(0.2, 2.0),
-    period=st.floats(0.01, 0.4),
-)
-def test_a_step_is_as_long_as_the_clock_was_set(by: float, speed: float, period: float) -> None:
-    found = over(speed * period, length=by + period, before=speed, after=speed)
-    assert isinstance(found, ClockStep)
-    assert abs(found.by - round(by * S)) < S / 100
