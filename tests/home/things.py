@@ -135,7 +135,7 @@ class _Hand:
         there = free[int(self.chance.integers(len(free)))]
         self.stays.setdefault(label, []).append((t, there))
 
-    def move(self, label: str, t: float, *, room: str | None = None) -> None:
+    def move(self, label: str, t: float) -> None:
         history = self.stays[label]
         here = history[-1][1]
         taken = {other[-1][1] for other in self.stays.values()}
@@ -144,7 +144,6 @@ class _Hand:
             for place in SURFACES
             if place not in taken
             and (here is None or abs(place.x - here.x) + abs(place.y - here.y) > 1.5)
-            and (room is None or place.room == room)
         ]
         if free:
             history.append((t, free[int(self.chance.integers(len(free)))]))

@@ -123,9 +123,9 @@ class Browser:
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._devtools("Emulation.setEmulatedMedia", {"features": [scheme]})
 
-    def screenshot(self, *, whole: bool = False) -> bytes:
-        """As PNG; `whole`: also what lies below the window."""
-        taken = self._devtools("Page.captureScreenshot", {"captureBeyondViewport": whole})
+    def screenshot(self) -> bytes:
+        """As PNG."""
+        taken = self._devtools("Page.captureScreenshot", {})
         return base64.b64decode(taken["data"])
 
     def _devtools(self, command: str, params: dict[str, Any]) -> Any:

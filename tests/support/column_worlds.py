@@ -49,12 +49,11 @@ class World:
         limits: StoreLimits | None = None,
         file: Path | None = None,
         clock: Clock | None = None,
-        definitions: str = "",
     ) -> "World":
         reader = BagDirReader(Rosbag2Reader(), bag_dir)
         memory = memory_of(bag_dir, clock=clock, reader=reader)
         paths = [file or store_file(bag_dir)]
-        store = ColumnStore(paths, reader.definition, definitions=definitions)
+        store = ColumnStore(paths, reader.definition)
         memory = replace(memory, scanner=Scanner(store, bag_dir))
         assert memory.scanner is not None
         filling = Filling(memory.scanner, reader, bag_dir, memory.clock, limits or StoreLimits())
@@ -105,10 +104,10 @@ class World:
         return sorted({topic.topic for bag in timeline.bags for topic in bag.summary.topics})
 
 
-def times(world: World, topic: str, window: TimeWindow = EVERYTHING) -> list[int]:
+def times(world: World, topic: str) -> list[int]:
     """The log times of what a scan yields, sorted."""
     view = View(world.memory, Call())
-    return sorted(time for rows in scan(view, topic, window) for time in rows.times.tolist())
+    return sorted(time for rows in scan(view, topic, EVERYTHING) for time in rows.times.tolist())
 
 
 def check_rows(

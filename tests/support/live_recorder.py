@@ -206,13 +206,11 @@ class Machine:
         *overrides: str,
         topics: Sequence[str] = RECORDED_TOPICS,
         bag_dir: Path | None = None,
-        env: Mapping[str, str] | None = None,
         through: Sequence[str] = (),
     ) -> LiveRecorder:
         """Starts the recorder that keeps `name`'s bags; it may be the next one to do so.
 
-        `env` is None for an environment that knows no ROS: the recorder then has that from a
-        setup file. `through` is a program that becomes the recorder.
+        It has ROS from a setup file. `through` is a program that becomes the recorder.
         """
         shelf = self.folder / name
         shelf.mkdir(exist_ok=True)
@@ -223,11 +221,11 @@ class Machine:
         given = [
             f"recording.bag_dir={bags}",
             f"recording.topics_file={listed}",
-            *([f"recorder.setup_files=[{self.env['ROS2_LIVE_SETUP']}]"] * (env is None)),
+            f"recorder.setup_files=[{self.env['ROS2_LIVE_SETUP']}]",
             "retention.min_free_gb=0",
             *overrides,
         ]
-        known = dict(self.plain_env if env is None else env)
+        known = self.plain_env
         with log.open("wb") as stream:
             if through:
                 program = shutil.which("ros2-memory-recorder", path=Path(sys.executable).parent)
@@ -359,7 +357,6 @@ class Tick(NamedTuple):
     number: int
     publish_time: int
     log_time: int
-    payload_bytes: int
 
 
 def ticks(files: Sequence[Path], t0: int, hz: float, *, counting: bool = True) -> list[Tick]:
@@ -375,8 +372,7 @@ def ticks(files: Sequence[Path], t0: int, hz: float, *, counting: bool = True) -
             for record in reader.records(path, ["/odom"], TimeWindow.everything()):
                 at = stamp_of(reader.decode(record))
                 number = round((at - t0) * hz / NS_PER_S)
-                size = len(record.payload)
-                found.append(Tick(number, record.publish_time, record.log_time, size))
+                found.append(Tick(number, record.publish_time, record.log_time))
     return sorted(found, key=lambda tick: tick.publish_time)
 
 

@@ -19,9 +19,9 @@ RECORD: Final = struct.Struct("<BQ")
 FOOTER: Final = struct.Struct("<BQQQI")
 
 
-def chatter(count: int, size: int = 100, start: int = 0) -> list[Msg]:
-    """Messages of one topic, at 0, 1, 2 ... ns by default, each with a text of `size`."""
-    return [text(time, f"{time:0{size}d}") for time in range(start, start + count)]
+def chatter(count: int, start: int = 0) -> list[Msg]:
+    """Messages of one topic, at 0, 1, 2 ... ns by default, each with a text of 100 letters."""
+    return [text(time, f"{time:0100d}") for time in range(start, start + count)]
 
 
 def raw_mcap(path: Path, fill: Callable[[Writer], None], *, profile: str = "", **how: Any) -> Path:

@@ -24,12 +24,12 @@ _DRIFT_M: Final = 0.0005
 _RUNNING, _SUCCEEDED, _ABORTED = 2, 4, 6
 
 
-def write_noisy_robot(name: str, bag_dir: Path, *, split_s: int = 12) -> Path:
+def write_noisy_robot(name: str, bag_dir: Path) -> Path:
     """Writes a minute from `BEGIN` on; all that is random is drawn by the name."""
     draw = Random(name)
     _, messages = moving_map(draw, LENGTH_S, noise_m=_NOISE_M, drift_m=_DRIFT_M, rate=10)
     messages += [*_seen(draw), *_changes(draw)]
-    write_splits(bag_dir, messages, split_s, dated=True)
+    write_splits(bag_dir, messages, 12, dated=True)
     return bag_dir
 
 

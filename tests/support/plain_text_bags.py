@@ -19,14 +19,13 @@ def plain(
     times: Iterable[int] = (),
     *,
     topic: str = "/odom",
-    type_name: str = "nav_msgs/msg/Odometry",
     silent: Iterable[str] = (),
     closed: bool = True,
 ) -> Path:
     """Writes one bag; without `closed` as a recorder leaves it that was killed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = ["BAG", *(f"{topic} {type_name} {time}" for time in times)]
-    lines += [f"{name} {type_name} -" for name in silent]
+    lines = ["BAG", *(f"{topic} nav_msgs/msg/Odometry {time}" for time in times)]
+    lines += [f"{name} nav_msgs/msg/Odometry -" for name in silent]
     path.write_text("\n".join([*lines, "END" if closed else ""]), encoding="utf-8")
     return path
 

@@ -37,7 +37,7 @@ from typing import Final
 import numpy as np
 import rclpy
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
 from tests.support.bags import (
@@ -152,14 +152,13 @@ class Messages:
 class Robot:
     """The node with its publishers."""
 
-    def __init__(self, topics: list[str], best_effort: bool, truth: Path) -> None:
+    def __init__(self, topics: list[str], truth: Path) -> None:
         self._node = rclpy.create_node("robot", enable_rosout=False, start_parameter_services=False)
         self._truth = truth
         self._stop = False
         self._bump = False
         self._matched = [(0, 0)]
         self._late_s = 0.0
-        reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         self._publishers = {}
         for topic in topics:
             durability = (
@@ -167,7 +166,7 @@ class Robot:
                 if topic == "/tf_static"
                 else DurabilityPolicy.VOLATILE
             )
-            profile = QoSProfile(depth=DEPTH, reliability=reliability, durability=durability)
+            profile = QoSProfile(depth=DEPTH, durability=durability)
             kind = (TYPES[topic], typestore().hash_rihs01(TYPES[topic]))
             self._publishers[topic] = publisher(self._node, topic, kind, profile)
 
@@ -183,8 +182,8 @@ class Robot:
         while not self._stop and any(p.get_subscription_count() < count for p in waiting):
             time.sleep(0.02)
 
-    def drive(self, hz: float, duration_s: float, bumps_s: float) -> None:
-        """Publishes for `duration_s` of the robot's time, or until a signal, and leaves."""
+    def drive(self, hz: float, bumps_s: float) -> None:
+        """Publishes until a signal, and leaves."""
         for topic in self._publishers:
             # The first of its type is slow to make.
             Messages(0).payload(topic, 0.0)
@@ -194,7 +193,7 @@ class Robot:
         self._tell(t0, published, 0)
         tick = 0
         first = next(iter(self._publishers.values()))
-        while tick / hz < duration_s and not self._stop:
+        while not self._stop:
             time.sleep(max(0.0, begin + tick / hz - time.monotonic()))
             if first.get_subscription_count() != self._matched[-1][1]:
                 self._matched.append((time.time_ns(), first.get_subscription_count()))
@@ -229,22 +228,20 @@ class Robot:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--duration", type=float, default=math.inf, help="s")
     parser.add_argument("--bump", type=float, default=25.0, help="when it does untold; s")
     parser.add_argument("--hz", type=float, default=20.0, help="ticks a second")
     default = [topic for topic in TYPES if topic not in UNASKED]
     parser.add_argument("--topics", nargs="+", default=default, choices=list(TYPES))
-    parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--subscribers", type=int, default=0, help="to wait for, on each topic")
     parser.add_argument("--truth", type=Path, required=True, help="JSON file to write")
     given = parser.parse_args()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    robot = Robot(given.topics, given.best_effort, given.truth)
+    robot = Robot(given.topics, given.truth)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, robot.stop)
     signal.signal(signal.SIGUSR1, robot.bump)
     robot.await_subscribers(given.subscribers)
-    robot.drive(given.hz, given.duration, given.bump)
+    robot.drive(given.hz, given.bump)
     rclpy.shutdown()
 
 

@@ -77,17 +77,13 @@ class Robot:
         matched = [(int(at), int(count)) for at, count in self._truth()["matched"]]
         return [at for (_, before), (at, count) in pairwise(matched) if count > before]
 
-    def finish(self) -> dict[str, int]:
-        """How many messages were published on each topic; waits for the end of the drive."""
+    def stop(self) -> dict[str, int]:
+        """Ends the drive, once it has begun; returns how many messages were published by topic."""
+        wait_for(self.truth_file.is_file, "the robot's start", alive=self.process)
+        self.process.send_signal(signal.SIGINT)
         code = self.process.wait(timeout=PATIENCE_S)
         assert code == 0, f"the robot's publishers ended with {code}"
         return {str(topic): int(count) for topic, count in self._truth()["published"].items()}
-
-    def stop(self) -> dict[str, int]:
-        """Ends the drive, once it has begun, and tells as `finish` does."""
-        wait_for(self.truth_file.is_file, "the robot's start", alive=self.process)
-        self.process.send_signal(signal.SIGINT)
-        return self.finish()
 
     def bump(self) -> None:
         """It bumps into something, now instead of at its own time."""
@@ -103,7 +99,6 @@ def publishing_robot(
     env: Mapping[str, str],
     truth: Path,
     *options: str,
-    duration_s: float | None = None,
     through: Sequence[str] = (),
 ) -> Iterator[Robot]:
     """A robot that publishes (`tests/support/robot_publishers.py`, whose options these are).
@@ -112,13 +107,10 @@ def publishing_robot(
         env: what `ros_environment` yielded.
         truth: file that is to hold T0 and the counts; it must not exist.
         options: such as `--hz 1`, `--topics /odom`, `--subscribers 1`.
-        duration_s: seconds after which it stops by itself; None: never.
         through: a program that becomes the robot, given as the end of its arguments.
     """
     assert not truth.exists(), f"{truth} is the truth of another drive"
-    given = ["--truth", str(truth), *options]
-    if duration_s is not None:
-        given += ["--duration", str(duration_s)]
+    given = ("--truth", str(truth), *options)
     with running(env, "tests.support.robot_publishers", *given, through=through) as process:
         yield Robot(process, truth)
 

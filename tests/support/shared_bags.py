@@ -1,14 +1,8 @@
 """The recorded and the public bags, on machines that have them."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    pass
 
 BAGS = Path(__file__).resolve().parents[3] / "shared" / "bags"
 RECORDED = BAGS / "recorded"

@@ -6,8 +6,7 @@ that run side by side record the same messages, with the same publish times and 
 two real recorders do. It splits when a message comes, closes a split after opening the next, writes
 metadata.yaml at a clean end, and refuses a directory that exists.
 
-Environment: STUB_PERIOD_MS, STUB_SUBSCRIBE_S (when topics are subscribed to), STUB_OPTIONS (what
-the help lists besides the common ones).
+Environment: STUB_PERIOD_MS, STUB_OPTIONS (what the help lists besides the common ones).
 """
 
 import argparse
@@ -87,7 +86,7 @@ def record(directory: Path, split_s: float, pattern: str) -> None:
     sys.stderr.write("stdin is not a terminal device. Keyboard handling disabled.")
     say("INFO", "Press SPACE for pausing/resuming")
     say("INFO", "Recording...")
-    time.sleep(float(os.environ.get("STUB_SUBSCRIBE_S", "0.2")))
+    time.sleep(0.2)
     done = time.time_ns() // period
     for topic in topics:
         say("INFO", f"Subscribed to topic '{topic}'")

@@ -27,21 +27,12 @@ def decoded(message: bags.Msg) -> object:
     return bags.typestore().deserialize_cdr(message.payload, message.type)
 
 
-def odometry(yaw: float = 0.5) -> object:
-    return decoded(bags.odom(NS, 1.23456, -2.0, yaw, vx=0.3, wz=0.1))
+def odometry() -> object:
+    return decoded(bags.odom(NS, 1.23456, -2.0, 0.5, vx=0.3, wz=0.1))
 
 
 def detections(*labels: str) -> object:
     return decoded(bags.detections(NS, labels, at=(1.23456, 2.0, 3.0)))
-
-
-def pose_stamped(orientation: object, position: object | None = None) -> object:
-    pose = bags.make(
-        "geometry_msgs/msg/Pose",
-        position=position or bags.point(1.0, 2.0, 3.0),
-        orientation=orientation,
-    )
-    return bags.make("geometry_msgs/msg/PoseStamped", header=bags.header(NS, "map"), pose=pose)
 
 
 def shown(message: object, type_name: str, *fields: str) -> Any:
@@ -110,11 +101,12 @@ def test_an_element_of_an_array_is_found_by_the_name_beside_it() -> None:
 
 
 def test_the_full_path_to_the_quaternions_of_a_list_gives_their_components() -> None:
-    path = bags.make(
-        "nav_msgs/msg/Path",
-        header=bags.header(NS, "map"),
-        poses=[pose_stamped(bags.quaternion(0.0))],
+    pose = bags.make(
+        "geometry_msgs/msg/Pose", position=bags.point(1.0, 2.0), orientation=bags.quaternion(0.0)
     )
+    header = bags.header(NS, "map")
+    stamped = bags.make("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
+    path = bags.make("nav_msgs/msg/Path", header=header, poses=[stamped])
     both = shown(path, "nav_msgs/msg/Path", "poses.orientation", "poses.pose.orientation")
     assert both["poses.orientation"] == [{"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 0}]
     assert both["poses.pose.orientation"] == [{"x": 0, "y": 0, "z": 0, "w": 1}]

@@ -16,10 +16,10 @@ from tests.support.memories import ROOT
 BUMPER: Final = "topic: /bumper, condition_type: equals, value: true"
 
 
-def rules(tmp_path: Path, text: str, moments_bytes: int = 10**9) -> tuple[Rule, ...]:
+def rules(tmp_path: Path, text: str) -> tuple[Rule, ...]:
     path = tmp_path / "triggers.yaml"
     path.write_text(text)
-    return rules_of(load_settings([f"recording.keep_when={path}"]), moments_bytes)
+    return rules_of(load_settings([f"recording.keep_when={path}"]), 10**9)
 
 
 def test_the_ready_rules_are_valid_and_none_is_on(tmp_path: Path) -> None:

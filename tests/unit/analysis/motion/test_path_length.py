@@ -131,6 +131,7 @@ def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
 def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     positions: list[Vector3], at_most: int
 ) -> None:
+    poses = driven(positions)
     found = way_of(poses, 10.0).trajectory(at_most)
     assert farthest_off(positions, found) <= found.waypoint_error_m + 1e-7
     assert len(found.waypoints) <= at_most
@@ -141,11 +142,3 @@ def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     times = [each.time for each in found.waypoints]
     assert times == sorted(set(times))
     assert (times[0], times[-1]) == (poses.times[0], poses.times[-1])
-
-
-def poses(begin: float, x: float, speed_mps: float) -> Poses:
-    """Poses of one second."""
-    tenths = range(11)
-    return posed(
-        (round((begin + at / 10) * S), (x + speed_mps * at / 10, 0.0, 0.0)) for at in tenths
-    )
