@@ -1,34 +1,58 @@
 """When a thing is missed, and which name it has, by its sights alone."""
 
+import math
 import tracemalloc
 from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pytest
 
-from ros2_memory.analysis.sights import Sights, fixes_of
+from ros2_memory.analysis.sights import DetectorMessages, Sights, fixes_of, sights_of
+from ros2_memory.columns.sights import JoinedSights, joined, packed
+from ros2_memory.columns.table import Texts
+from ros2_memory.core.model import Vector3
 from ros2_memory.things.instances import estimate
 from ros2_memory.things.labels import Labels, moves_by_itself
-from tests.support.sights import (
-    Message,
-    PlacedDetection,
-    sights_of_messages,
-    whole,
-)
 
 LABELS = Labels({"mug": ["coffee mug"]})
 HERE = (0.0, 0.0, 0.0)
 
 
-def bag_of(
-    *messages: tuple[tuple[float, float, float], list[PlacedDetection]], start: int = 0
-) -> Sights:
-    return sights_of_messages(
-        [
-            Message("/detections", (start + nth) * 10**9, robot, things)
-            for nth, (robot, things) in enumerate(messages)
-        ]
+class PlacedDetection(NamedTuple):
+    """A detection in the frame of the sights (m)."""
+
+    label: str
+    place: Vector3 | None
+
+
+Seen: TypeAlias = "tuple[tuple[float, float, float], list[PlacedDetection]]"
+"""From where (x, y, yaw) a detector published, and what it had."""
+
+
+def bag_of(*messages: Seen, start: int = 0) -> Sights:
+    """The sights of a message each second."""
+    nowhere = (math.nan, math.nan, math.nan)
+    robots = [(x, y, 0.0, yaw, 0.0) for (x, y, yaw), _ in messages]
+    every = [(row, one) for row, (_, things) in enumerate(messages) for one in things]
+    labels = Texts.of([one.label for _, one in every])
+    seen = DetectorMessages(
+        np.arange(start, start + len(messages)) * 10**9,
+        np.array(robots, np.float64).reshape(-1, 5),
+        np.array([row for row, _ in every], np.int64),
+        labels.codes.astype(np.int64),
+        labels.words,
+        np.array([one.place or nowhere for _, one in every], np.float64).reshape(-1, 3),
+        np.full(len(every), math.nan),
     )
+    return sights_of("/detections", seen)
+
+
+def whole(parts: Sequence[Sights]) -> JoinedSights:
+    """The sights of all parts, which are in one coordinate system."""
+    zeros = [0] * len(parts)
+    return joined([packed(part) for part in parts], zeros, zeros)
 
 
 def seen_at(x: float, y: float) -> list[PlacedDetection]:
@@ -100,7 +124,7 @@ def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place(
     seen = [(HERE, [PlacedDetection(label, first)]) for label in called]
     elsewhere = [(beside, [PlacedDetection("mug", other)])] * 120
     gone = [(before, [PlacedDetection("mug", back)])] * 120 + [(before, [])] * 120
-    nothing: list[tuple[tuple[float, float, float], list[PlacedDetection]]] = [(away, [])] * 30
+    nothing: list[Seen] = [(away, [])] * 30
     bag = bag_of(*gone, *seen, *nothing, *elsewhere, *nothing, *seen)
     [mug] = estimate(whole([bag]), LABELS).instances
     assert len(mug.stays) == 4

@@ -19,7 +19,7 @@ from ros2_memory.things.presence import (
     looks_without,
     stays_at,
 )
-from tests.support.sights import whole
+from tests.unit.things.test_instances import whole
 
 _looks = st.lists(
     st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(1, 16), st.integers(-6, 3)),
