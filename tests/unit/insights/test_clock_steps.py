@@ -54,22 +54,24 @@ def each_known(memory: Memory) -> Iterator[Memory]:
         yield with_store(memory, memory.index.bag_dir, share=share)
 
 
-@pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
+@pytest.mark.parametrize(
+    ("when", "by"), [(54.95, 8.0), (59.95, 2.95)], ids=["in a split", "between two"]
+)
 def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
-    tmp_path: Path, when: float
+    tmp_path: Path, when: float, by: float
 ) -> None:
-    for memory in each_known(recorded(tmp_path, shown=lambda t: t + 8.0 * (t > when))):
+    for memory in each_known(recorded(tmp_path, shown=lambda t: t + by * (t > when))):
         at = BEGIN + round(when - 0.05, 1)
-        expected = [{"at": pytest.approx(at, abs=1e-5), "step_s": pytest.approx(8.0, abs=0.01)}]
+        expected = [{"at": pytest.approx(at, abs=1e-5), "step_s": pytest.approx(by, abs=0.01)}]
         assert asked(memory, tmp_path, "data_time_range")["clock_steps"] == expected
         status = asked(memory, tmp_path, "memory_status")
         assert status["clock_steps"] == expected
-        assert status["doubts"].endswith("the clock was set 8 s ahead")
+        assert status["doubts"].endswith(f"the clock was set {by:g} s ahead")
         reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 100)
         [event] = [each for each in reply["events"] if "clock" in each["text"]]
-        assert event["text"] == "the clock was set forward by 8 s"
+        assert event["text"] == f"the clock was set forward by {by:g} s"
         assert reply["counts"]["clock steps"] == 1
-        assert reply["duration_s"] == pytest.approx(92.0, abs=0.05)
+        assert reply["duration_s"] == pytest.approx(100 - by, abs=0.05)
         later = asked(memory, tmp_path, "recap", start=BEGIN + 100, end=BEGIN + 150)
         assert "clock steps" not in later["counts"]
 
