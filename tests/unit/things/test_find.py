@@ -252,9 +252,6 @@ def alternating(*labels: str, y: float = 0.5, begin: int = 0) -> list[Msg]:
     ]
 
 
-PLAIN = QuerySettings()
-
-
 MUG, COFFEE_MUG = ("mug", 3.0, 0.5), ("coffee mug", 3.1, 0.5)
 
 
@@ -296,7 +293,7 @@ def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> 
     for each in ("coffee mug", "red mug"):
         [thing] = [thing for thing in reply["things"] if thing["label"] == each]
         assert "moved" not in thing
-    assert ask(tmp_path / "moved", PLAIN)["labels"] == {"mug": 1}
+    assert ask(tmp_path / "moved", QuerySettings())["labels"] == {"mug": 1}
 
 
 def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -> None:
