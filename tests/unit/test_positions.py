@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.core.regions import Circle, Place
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
     Msg,
     header,
     make,
+    odom,
     tf,
     transform,
     write_mcap,
@@ -237,3 +239,18 @@ def test_a_path_by_transforms_goes_on_from_hour_to_hour(tmp_path: Path) -> None:
     path = ask(tmp_path, False, "trajectory_summary", **whole)
     assert (path["distance_m"], path["poses"]) == (pytest.approx(129.9), 1300)
     assert ask(tmp_path, False, "visits", x=0.0, y=0.0)["total"] == 1
+
+
+def test_a_position_is_in_places_of_several_frames_the_smallest_first(tmp_path: Path) -> None:
+    messages = [tf(T0, transform(T0, "map", "odom", (10.0, 0.0, 0.0)), topic="/tf_static")]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, odom(T0 + S, 1.0, 0.0, 0.0)])
+    places = (
+        Place("pen", "odom", Circle(0.0, 0.0, 3.0)),
+        Place("dock", "map", Circle(11.0, 0.0, 0.5)),
+        Place("yard", "map", Circle(11.0, 0.0, 9.0)),
+        Place("hall", "map", Circle(1.0, 0.0, 0.5)),
+        Place("lab", "site", Circle(1.0, 0.0, 0.5)),
+    )
+    memory = memory_of(tmp_path, limits=QuerySettings(places=places))
+    reply = asked(memory, tmp_path, "get_position_at", timestamp=T0_S + 1)
+    assert (reply["in"], reply["also_in"]) == ("dock", ["pen", "yard"])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -245,12 +245,22 @@ class Place:
 
 def places_at(places: Sequence[Place], frame_id: str, x: float, y: float) -> tuple[str, ...]:
     """Returns the names of the places of a frame that a point is in, the smallest first."""
-    inside = [
+    return names_by_size(
         place for place in places if place.frame_id == frame_id and place.region.contains(x, y)
-    ]
-    return tuple(place.name for place in sorted(inside, key=lambda place: _area(place.region)))
+    )
+
+
+def names_by_size(places: Iterable[Place]) -> tuple[str, ...]:
+    """Returns the names of places, the smallest first."""
+    return tuple(place.name for place in sorted(places, key=lambda place: _area(place.region)))
 
 
 def _area(region: Region) -> float:
+    match region:
+        case Circle(radius_m=radius_m):
+            return math.pi * radius_m**2
+        case Polygon(corners):
+            sides = pairwise((*corners, corners[0]))
+            return abs(sum(ax * by - bx * ay for (ax, ay), (bx, by) in sides)) / 2
     low_x, high_x, low_y, high_y = region.bounds
     return (high_x - low_x) * (high_y - low_y)

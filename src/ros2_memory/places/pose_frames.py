@@ -29,7 +29,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.regions import Place, places_at
+from ros2_memory.core.regions import Place, names_by_size, places_at
 from ros2_memory.core.spans import Spans, without
 from ros2_memory.core.text import abbreviate, counted
 from ros2_memory.core.timebase import MIN_NS, Ns
@@ -224,16 +224,17 @@ def _unreachable(frame_id: str, own_frame: str) -> str:
 
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
-    """Returns a pose with the names of the places that it is in."""
+    """Returns a pose with the names of the places that it is in, in whatever frames these are."""
     places = view.limits.places
-    for frame in dict.fromkeys(place.frame_id for place in places):
-        there = pose_in(view, pose, frame, time, recording)
-        if there is None:
-            continue
-        names = places_at(places, frame, *there.position[:2])
-        if names:
-            return replace(pose, places=names)
-    return pose
+    frames = {place.frame_id for place in places}
+    there = {frame: pose_in(view, pose, frame, time, recording) for frame in frames}
+    inside = (
+        place
+        for place in places
+        if (placed := there[place.frame_id]) is not None
+        and place.region.contains(*placed.position[:2])
+    )
+    return replace(pose, places=names_by_size(inside))
 
 
 @dataclass(frozen=True, slots=True)

@@ -224,3 +224,8 @@ def test_of_places_within_each_other_the_smallest_is_named() -> None:
     assert places_at(places, "map", 3.0, 1.0) == ("kitchen",)
     assert places_at(places, "map", 7.0, 1.0) == ()
     assert places_at(places, "odom", 3.0, 1.0) == ("yard",)
+    # Each reaches farther than the kitchen, and has less of the plane.
+    bends = Polygon(tuple((x * 1.5, y * 1.5) for x, y in HORSESHOE.corners))
+    for name, region in (("corridor", bends), ("rug", Circle(2.6, 2.6, 2.7))):
+        several = (*places[:1], Place(name, "map", region))
+        assert places_at(several, "map", 1.0, 1.0) == (name, "kitchen")
