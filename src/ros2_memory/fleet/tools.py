@@ -351,6 +351,8 @@ def _coordinates_in(given: Mapping[str, object]) -> str | None:
         is_object = isinstance(where, dict) or str(where).lstrip().startswith("{")
         if is_object and not (name == "near" and "label" in str(where)):
             return name
+    if "near_position" in str(given.get("while")):
+        return "while"
     near = ("value",) if given.get("condition_type") == "near_position" else ()
     return next((name for name in (*near, "x", "y") if given.get(name) is not None), None)
 
@@ -421,22 +423,25 @@ def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) ->
     values = {reply.name: _as_rows(reply) for reply in replies}
     times = {key.name: key.row_time for key in declared if key.row_time}
     present = {name for value in values.values() for name in value}
-    key = next((name for name in times if name in present), next(iter(times)))
-    order: list[tuple[bool, float, JsonObject]] = []
+    # Of one robot there may be episodes, of another sightings.
+    keys = [name for name in times if name in present] or [*times][:1]
+    order: list[tuple[bool, float, str, JsonObject]] = []
     for reply in replies:
-        for row in _list(values[reply.name].get(key)):
-            time = row.get(times[key], 0)
-            # A row whose time is null goes on.
-            at = math.inf if time is None else _number(time)
-            named = {ROBOT_NAME: reply.name, **row}
-            order.append((reply.is_ahead, at if page.oldest_first else -at, named))
+        for key in keys:
+            for row in _list(values[reply.name].get(key)):
+                time = row.get(times[key], 0)
+                # A row whose time is null goes on.
+                at = math.inf if time is None else _number(time)
+                named = {ROBOT_NAME: reply.name, **row}
+                order.append((reply.is_ahead, at if page.oldest_first else -at, key, named))
     order.sort(key=itemgetter(0, 1))
-    rows: JsonObject = {key: [row for *_, row in order[: page.limit]]}
-    if key == MATCHES:
+    shown = order[: page.limit]
+    rows: JsonObject = {key: [row for *_, of, row in shown if of == key] for key in keys}
+    if keys == [MATCHES]:
         never = [reply.name for reply in replies if reply.value is None]
         return {**rows, "never": [*never]} if never else rows
-    rest = {name: _without(value, {key}) for name, value in values.items()}
-    is_cut = order[: page.limit] != order or any(value.get("more") for value in values.values())
+    rest = {name: _without(value, {*keys}) for name, value in values.items()}
+    is_cut = shown != order or any(value.get("more") for value in values.values())
     more: JsonObject = {"more": True}
     marks_more = is_cut and any(key.name == "more" for key in declared)
     added = {key.name for key in declared if key.is_added}

@@ -12,11 +12,13 @@ import pytest
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place
+from ros2_memory.core.timebase import NS_PER_S as S
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import ANSWER_FOR_ALL, fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.reply_size import to_json_text
+from tests.support.bags import text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import (
     CALLS,
@@ -152,6 +154,33 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
         assert row in one[rows]
 
 
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("limit", [1, 2, 3, 10])
+def test_episodes_of_one_robot_and_sightings_of_another_are_on_one_page(
+    tmp_path: Path, limit: int, first: bool
+) -> None:
+    """One robot ends its tasks with an empty text, the other by the next task."""
+    for robot, tasks in (
+        ("r1", ("tidy", "", "cook", "", "tidy", "")),
+        ("r2", ("tidy", "cook") * 3),
+    ):
+        late = 0 if robot == "r1" else 5
+        said = [
+            text((START_S + 20 * nth + late) * S, task, "/task") for nth, task in enumerate(tasks)
+        ]
+        write_mcap(tmp_path / robot / "rec" / "rec_0.mcap", said)
+    wanted = {"topic": "/task", "condition_type": "equals", "value": "tidy"}
+    fleet = fleet_over(tmp_path, ("r1", "r2"))
+    found = reply(fleet, "find_matches", {**wanted, "limit": limit, "oldest_first": first})
+    rows = [(row["end"], row["robot_name"]) for row in found["episodes"]]
+    rows += [(row["last_seen"], row["robot_name"]) for row in found["sightings"]]
+    ends = [(20, "r1"), (100, "r1"), (5, "r2"), (45, "r2"), (85, "r2")]
+    every = sorted(((START_S + end, robot) for end, robot in ends), reverse=not first)
+    assert sorted(rows, reverse=not first) == every[:limit]
+    assert found.get("more", False) == (limit < len(ends))
+    assert "episodes" not in str(found["by_robot"])
+
+
 def test_a_topic_has_one_row_with_the_robots_that_record_it(folder: Path, fleet: Fleet) -> None:
     found = reply(fleet, "list_recorded_topics", {})["topics"]
     own = alone(folder, "list_recorded_topics", {})
@@ -268,6 +297,17 @@ def test_several_that_are_named_answer_as_all_do(folder: Path, fleet: Fleet) -> 
         (
             "find_last_match",
             {"topic": "/odom", "condition_type": "near_position", "value": {"x": 1, "y": 0}},
+        ),
+        (
+            "find_matches",
+            {
+                **MUG,
+                "while": {
+                    "topic": "/odom",
+                    "condition_type": "near_position",
+                    "value": {"x": 1, "y": 0},
+                },
+            },
         ),
     ],
 )
