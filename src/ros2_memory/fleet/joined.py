@@ -79,8 +79,9 @@ class JoinedIndex:
 def joined(shipped: Snapshot, own: Snapshot, until: Ns) -> Snapshot:
     """Returns the bags of a lake, and a robot's own ones that begin up to a time and are not there.
 
-    A bag is known by its first message. Own ones of days of which those of the lake are not shown
-    (`Snapshot.older`) are left out, too; one whose path is that of another bag is set aside.
+    A bag is known by its first message, or, if that was deleted since, by its path and time. Own
+    ones of days of which those of the lake are not shown (`Snapshot.older`) are left out, too; one
+    whose path is that of another bag is set aside.
     """
     if own.problem is not None:
         return shipped if shipped.timeline.segments else own
@@ -114,7 +115,13 @@ def _timeline_of_both(
         is_new = np.searchsorted(in_lake, starts) == np.searchsorted(in_lake, starts, "right")
         is_own = is_new & (starts > after) & (starts <= until)
         bags += segment.bags.at(np.flatnonzero(is_own))
-    names_in_use = {bag.file for bag in shipped.timeline.named({bag.file for bag in bags})}
-    unnamed = (SetAside(bag.path, _NAME_IN_USE) for bag in bags if bag.file in names_in_use)
-    named = (bag for bag in bags if bag.file not in names_in_use)
+    same_name = {bag.file: bag for bag in shipped.timeline.named({bag.file for bag in bags})}
+    unnamed = (
+        SetAside(bag.path, _NAME_IN_USE)
+        for bag in bags
+        if (before := same_name.get(bag.file))
+        # Messages were deleted from one that lies within it: the lake has it as it was.
+        and not (before.start <= bag.start and bag.end <= before.end)
+    )
+    named = (bag for bag in bags if bag.file not in same_name)
     return shipped.timeline.changed((), named), tuple(unnamed)

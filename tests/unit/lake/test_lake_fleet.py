@@ -128,6 +128,22 @@ def test_a_bag_by_whose_name_the_lake_has_another_one_is_named_and_not_taken_for
     assert "the lake has another bag of this name" in str(found["notes"])
 
 
+def test_a_bag_that_lost_its_first_message_since_it_was_shipped_is_not_another_one(
+    tmp_path: Path,
+) -> None:
+    """As where a topic has a shorter life than its bags (`retention.topics`)."""
+    write_bag(tmp_path / "hall", 0)
+    ship_from(tmp_path)
+    write_bag(tmp_path / "hall", 0, at_s=START_S + 1, most=2)
+    fleet = served(tmp_path)
+    found = reply(
+        fleet, "get_topic_in_last", {"robot": "hall", "topic": "/chatter", "seconds": 1e9}
+    )
+    assert [sample["value"]["value"] for sample in found["samples"]] == ["n0", "n1", "n2"]
+    assert "could not be read" not in str(found)
+    assert reply(fleet, "find_last_match", CUP | {"value": "tree"})["never"] == ["hall"]
+
+
 def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Path) -> None:
     bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
     ship_from(tmp_path)
