@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
 MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""
-_FEWEST_DAYS: Final = 2
-"""Days that are looked at together where a time before the newest ones is asked about."""
 _MOST_WINDOWS: Final = 6
 """Times before the newest days that stay in memory."""
 _TOGETHER: Final = 64
@@ -166,9 +164,13 @@ class LakeIndex:
             current = self.refresh()
         if reach is None or current.older is None or reach > current.older:
             return current
+        day = day_of(reach)
         with self._lock:
-            # With the next day, in which what lies across midnight goes on.
-            window = self._window(day_of(reach) + timedelta(days=1), _FEWEST_DAYS)
+            # With the next day that has bags: what lies across midnight goes on there, and a gap
+            # up to it is no end of the memory.
+            days = self.lake.days("bags").get(self.robot, {})
+            until = next((later for later in days if later > day), day)
+            window = self._window(until, (until - day).days + 1)
         return replace(current, timeline=window.timeline, older=window.older)
 
     def refresh(self) -> Snapshot:

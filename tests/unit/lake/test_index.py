@@ -275,6 +275,15 @@ def test_what_was_seen_before_the_newest_days_is_found_and_never_is_of_all(robot
     assert asked(robot, "find_last_match", "cup", "/vision/old")["never"] == ["hall"]
 
 
+def test_older_days_end_with_a_pause_and_begin_where_the_memory_does(robot: Robot) -> None:
+    """Two of the times asked are in pauses of more than a day, one is before the first bag."""
+    fleet = Fleet([robot], FixedClock(NOW))
+    for at, reason in ((-5.5, "gap"), (-2.5, "gap"), (-40, "outside_range")):
+        span = {"start": START_S + at * DAY_S, "end": START_S + at * DAY_S + 60}
+        found = reply(fleet, "get_topic_in_range", {"topic": SEEN, "robot": "hall", **span})
+        assert (found["error"], found["reason"]) == ("no_data", reason)
+
+
 def test_days_before_are_named_only_where_the_answer_is_of_them(robot: Robot) -> None:
     spans: tuple[tuple[dict[str, Any], bool], ...] = (
         ({}, True),
