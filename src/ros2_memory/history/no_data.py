@@ -274,15 +274,18 @@ def not_recorded(view: View, name: str) -> NoDataError:
         NoDataError: nothing is recorded at all.
     """
     require_bags(view)
-    snapshot = view.snapshot
-    if name in snapshot.silent_topics or f"/{name}" in snapshot.silent_topics:
+    snapshot, reason = view.snapshot, NoDataReason.TOPIC_NOT_RECORDED
+    declared = snapshot.silent_topics.intersection({name, f"/{name}"})
+    if declared and _were_cut(view, declared, TimeWindow.everything()):
+        reason, detail = NoDataReason.DELETED, f"every message of {name} was deleted"
+    elif declared:
         detail = f"{name} is declared in the bags, but no message of it was recorded"
     else:
         detail = f"no topic {name} is recorded"
     topics, stem = snapshot.timeline.topics(), name.rstrip("/").rpartition("/")[2].strip("*")
     near = similar(name, topics, 5) or similar(stem, topics, 5)
     hint = f"similar: {', '.join(near)}" if near else "list_recorded_topics lists all"
-    error = NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{detail}; {hint}")
+    error = NoDataError(reason, f"{detail}; {hint}")
     return with_notes(view, TimeWindow.everything(), error)
 
 
@@ -316,7 +319,7 @@ def no_data_at(
     if (
         deleted
         or excluded
-        or _have_expired(view, topics, window)
+        or _were_cut(view, topics, window)
         or _is_thinned(view, TimeWindow(at, at + 1))
     ):
         reason = NoDataReason.DELETED
@@ -349,10 +352,14 @@ def _distances(
         yield f"the nearest newer one is {later} after it, at {unix_text(newer.time)}"
 
 
-def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bool:
-    """Whether messages of each of these topics in a window were cut by `retention.topics`."""
+def _were_cut(view: View, topics: Collection[str], window: TimeWindow) -> bool:
+    """Whether messages of each of these topics in a window were cut out of bags.
+
+    By `retention.topics`, or by request.
+    """
     losses = read_losses(view.bag_dir, window.start, window.stop)
-    return {loss.topic for loss in losses if loss.by == "expired"}.issuperset(topics)
+    cut = {loss.topic for loss in losses if loss.by in {"expired", "forgotten"}}
+    return cut.issuperset(topics)
 
 
 def _is_thinned(view: View, window: TimeWindow) -> bool:
@@ -390,7 +397,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     newest = min(end, max(start, view.memory.clock.now()))
     reason = between(view, window) if is_between else beyond(view, newest)
-    if _have_expired(view, topics, window) or _is_thinned(view, window):
+    if _were_cut(view, topics, window) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
     detail += _advice(view, reason, start)
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
@@ -464,7 +471,7 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     It names topics there that carry what these do (poses, velocities). In a folder with the bags of
     several robots, the nearest message of a topic may be another robot's.
     """
-    if _have_expired(view, topics, window):
+    if _were_cut(view, topics, window):
         return []
     timeline, whole = view.timeline, view.snapshot.metadata_folders
     names: dict[str, None] = {}

@@ -238,6 +238,12 @@ def test_answers_say_that_messages_were_deleted(
     window = f"start={T0 / S} end={T0 / S + 8}"
     shown = exits(0, f"ask get_topic_in_range topic={CAMERA} {window} --json").out
     assert f"2 messages deleted by request: {CAMERA} (2)" in shown
+    then = f"ask get_topic_at_time timestamp={T0 / S + 4} --json topic="
+    some = json.loads(exits(1, then + CAMERA).out)
+    forget(0, 0, 30, f"--yes --topic {MIC}")
+    every = json.loads(exits(1, then + MIC).out)
+    assert [some["reason"], every["reason"]] == ["deleted", "deleted"]
+    assert "every message of /mic was deleted" in every["detail"]
 
 
 def test_carried_messages_follow_where_their_topic_is_named_unless_a_recorder_has_them(
