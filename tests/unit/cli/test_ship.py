@@ -215,5 +215,7 @@ def test_a_select_is_answered_over_the_tables_as_they_are_now(
     refused = exits(2, "sql 'SELECT * FROM chanels'", *of_lake).err
     assert 'there is no table "chanels"' in refused
     assert "the tables are channels, poses" in refused
+    command = [sys.executable, "-m", "ros2_memory.cli", "sql", "SELECT 1", *of_lake]
+    assert not subprocess.run(command, capture_output=True, check=True).stderr
     nothing = exits(2, "sql 'SELECT 1'", f"lake.warehouse={tmp_path}/elsewhere").err
     assert f"{tmp_path}/elsewhere: there is no lake, or no bag in it" in nothing
