@@ -311,7 +311,10 @@ def open_robot(
 
 def present_time(memory: "Memory") -> Ns:
     """Returns the time that ages count from: the wall clock, or the newest data (`data.now`)."""
-    return memory.now(memory.clock.now(), memory.index.snapshot().dating.latest)
+    now = memory.clock.now()
+    if memory.limits.now == "wall":  # A fleet has no bags of its own, which a scan would report.
+        return now
+    return memory.now(now, memory.index.snapshot().dating.latest)
 
 
 def parse_duration(text: str) -> float | None:

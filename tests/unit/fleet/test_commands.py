@@ -37,3 +37,7 @@ def test_what_looks_at_one_robot_asks_which(robots: str, tmp_path: Path, exits: 
     assert f"--bag-dir {tmp_path}/r1 for r1" in refused
     assert "r1, away" in refused
     assert "/is_docked" in exits(0, f"topics --json --bag-dir {tmp_path}/r1", robots).out
+
+
+def test_ask_reports_no_other_folder(robots: str, exits: Program) -> None:
+    assert not exits(0, "ask list_frames robot=r1", robots).err
