@@ -7,19 +7,18 @@ import time
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import cast
 
 import pytest
 
 from ros2_memory import results
 from ros2_memory.core.errors import EpisodicError, NoDataReason
-from ros2_memory.core.reply import Declared
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import (
     MOMENT,
     RESOURCES,
     SCHEMA,
 )
+from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.build import build_tools
 from tests.project import reference_tables as reference
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
@@ -68,26 +67,14 @@ def test_every_tool_stands_there_with_its_arguments_a_call_and_its_reply(
     compare("tools", "tools", reference.tool_sections(TOOLS, answers))
 
 
-REPLIES: dict[str, type[object]] = {
-    "compare": results.Comparison,
-    "data_time_range": results.DataTimeRange,
-    "find_last_match": results.Match,
-    "find_matches": results.Sightings,
-    "get_topic_at_time": results.TopicValue,
-    "get_transform_at": results.TransformAt,
-    "get_value_when": results.ValueWhen,
-    "get_velocity_at": results.Velocity,
-    "list_frames": results.Frames,
-    "list_recorded_topics": results.TopicRow,
-    "recap": results.Recap,
-    "remember_moment": results.RememberedMoment,
-    "trajectory_summary": results.TrajectorySummary,
-    "visits": results.Visits,
+DECLARED = {
+    declaration.names[0].name: declaration
+    for declaration in (*spec_tools.DECLARATIONS, *extra_tools.DECLARATIONS)
+    if "Reply: " in declaration.description
 }
-"""The class that declares the reply of a tool."""
 
 
-SPREAD = {"x", "y", "z", "yaw_deg", "at_least", "notes"}
+SPREAD = {"x", "y", "z", "yaw_deg", "in", "also_in", "at_least", "notes"}
 """Keys that a unit shows in the place of its own, and the one that every reply may have."""
 
 
@@ -102,9 +89,10 @@ def outer_keys(text: str) -> list[str]:
     return re.findall(r"[a-z_]+", outer)
 
 
-@pytest.mark.parametrize("name", sorted(REPLIES))
+@pytest.mark.parametrize("name", DECLARED)
 def test_the_keys_that_a_reply_is_said_to_have_are_declared(name: str) -> None:
-    declared = SPREAD | {key.name for key in cast("type[Declared]", REPLIES[name]).reply.keys}
+    [returned, *_] = re.findall(r"[A-Z]\w+", DECLARED[name].query.__annotations__["return"])
+    declared = SPREAD | {key.name for key in getattr(results, returned).reply.keys}
     [description] = [tool.description for tool in TOOLS if tool.name == name]
     said = outer_keys(description.partition("Reply: ")[2])
     assert said
