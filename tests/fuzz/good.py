@@ -13,6 +13,7 @@ import numpy as np
 import zstandard
 from mcap.writer import CompressionType, Writer
 
+from ros2_memory.core.model import BAG_KINDS
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import (
     McapLayout,
@@ -196,7 +197,7 @@ def _from(folder: Path) -> list[Good]:
     found = [
         _from_file(path, suffix)
         for path in (sorted(folder.rglob("*")) if folder.is_dir() else ())
-        for suffix in (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+        for suffix in BAG_KINDS
         if path.name.endswith(suffix) and 0 < path.stat().st_size <= _LARGEST_SHARED
     ]
     return [each for each in found if each is not None]

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
 
 PLAIN_KINDS: Final = (".mcap", ".db3")
+UNMARKED_KINDS: Final = frozenset({".db3"})
+"""Those of which a file does not show whether its writer has finished."""
 COMPRESSED: Final = ".zstd"
 BAG_KINDS: Final = (*PLAIN_KINDS, *(f"{kind}{COMPRESSED}" for kind in PLAIN_KINDS))
 """Suffixes of bag files, whichever adapter reads them."""

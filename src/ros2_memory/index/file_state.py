@@ -42,7 +42,7 @@ from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
 from ros2_memory.bag_dir.state_files import Withheld, read_withheld
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
-from ros2_memory.core.model import BagFile, BagState, SetAside
+from ros2_memory.core.model import UNMARKED_KINDS, BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
 from ros2_memory.storage.base import BagReader, Closing
@@ -210,7 +210,10 @@ class FileNotes:
             not self.trusted
             or classification.state in _WATCHED
             or self.closing is Closing.OPEN
-            or (self.kind == ".db3" and context.now - self.stamp.mtime_ns <= context.three_splits)
+            or (
+                self.kind in UNMARKED_KINDS
+                and context.now - self.stamp.mtime_ns <= context.three_splits
+            )
         )
 
 
@@ -265,7 +268,7 @@ def _is_active(notes: FileNotes, context: ScanContext) -> bool:
         return notes.grew_lately(context)
     return (
         notes.closing is Closing.CLOSED
-        and notes.kind == ".db3"
+        and notes.kind in UNMARKED_KINDS
         and (context.open_recordings is None or context.names(notes.path))
         and notes.grew_lately(context)
         and not context.is_finished(notes.path)

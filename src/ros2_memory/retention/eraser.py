@@ -46,7 +46,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
-from ros2_memory.core.model import COMPRESSED, TimeWindow
+from ros2_memory.core.model import COMPRESSED, UNMARKED_KINDS, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.file_state import reason_unread
@@ -287,8 +287,7 @@ class Eraser:
             reason = "it is compressed as a whole; decompress it (zstd -d --rm), and forget again"
         elif self.reader.closing(path) is Closing.OPEN or not summary.complete:
             reason = "a crash left it open; ros2-memory recover closes it"
-        # Such a file does not show whether its writer has finished.
-        elif path.suffix == ".db3" and inode in open_files():
+        elif path.suffix in UNMARKED_KINDS and inode in open_files():
             reason = "a program has it open; close that, and forget again"
         elif summary.notes:
             reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.core.errors import BagVanishedError
+from ros2_memory.core.model import BAG_KINDS
 from ros2_memory.index.file_state import (
     RETRY_NS,
     Classification,
@@ -41,7 +42,7 @@ class RepeatedScan:
 
     def __init__(self, root: Path, *, trusts_mtime: bool = True) -> None:
         self.root = root
-        self.reader = PlainReader(".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+        self.reader = PlainReader(*BAG_KINDS)
         self.trusts_mtime = trusts_mtime
         self.notes: FileNotes | None = None
         self.classification: Classification | None = None

@@ -108,7 +108,7 @@ class McapWriter(BagWriter):
         takes: Callable[[str, Ns, Ns], bool],
     ) -> Counter[str]:
         """Writes a whole file again without some messages."""
-        if source.suffix.lower() != ".mcap":
+        if source.suffix.lower() == ".db3":
             with _written(target) as stream, reading(source):
                 return cut_sqlite(source, target, stream, takes)
         taken = Counter[str]()
