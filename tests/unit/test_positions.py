@@ -122,7 +122,7 @@ def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(
 def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n, 0.0) for n in range(9)])
     topic, above = "/fmu/out/vehicle_odometry", {"condition_type": "above", "value": 1.0}
-    note = "in NED x is north, y east and z down: yaw_deg is clockwise from north, seen from above"
+    note = "in NED x is north, y east and z down: yaw is clockwise from north, seen from above"
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 1}),
         ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),

@@ -1,7 +1,5 @@
 """Conditions on one extracted value.
 
-They are `contains`, `contains_word`, `equals`, `above`, `below` and `near_position`.
-
 They are tested on the whole value, before anything in it is downsampled or rounded. NaN and null
 match nothing. `refusal_for` says where no value of a shape can match: a search for a field that
 the values do not have would find nothing, and the answer "never" would be false.
@@ -374,7 +372,7 @@ def parse_condition(
     """Returns the condition that a planner's arguments describe.
 
     Args:
-        condition_type: `contains`, `contains_word`, `equals`, `above`, `below` or `near_position`.
+        condition_type: one of `_EXAMPLES`.
         value: a string, number or boolean; for `above` and `below` a number; for `near_position`
             an object with x, y and perhaps z.
         tolerance_m: how near `near_position` is.

@@ -345,7 +345,7 @@ def axes_of(frame_id: str) -> tuple[str, ...]:
     if not frame_id.casefold().endswith("ned"):
         return ()
     axes = f"in {frame_id} x is north, y east and z down"
-    return (f"{axes}: yaw_deg is clockwise from north, seen from above",)
+    return (f"{axes}: yaw is clockwise from north, seen from above",)
 
 
 def known_track(view: View, frame_id: str, window: TimeWindow) -> KnownTrack:
