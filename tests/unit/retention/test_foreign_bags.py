@@ -26,8 +26,10 @@ from tests.support.examples import examples
 from tests.support.housekeepers import (
     NOW,
     PLENTY,
+    T0,
     A,
     B,
+    S,
     files_in,
     house_of,
     in_moments,
@@ -39,11 +41,10 @@ from tests.support.housekeepers import (
     size_of,
 )
 from tests.support.memories import memory_of
+from tests.support.program import Program, exits
 from tests.support.simulated_recorders import events
 
-Capture = pytest.CaptureFixture[str]
-S = 10**9
-T0 = 1_790_000_000 * S
+__all__ = ["exits"]
 LITTLE = 1
 
 
@@ -231,6 +232,13 @@ class TestClearing:
         assert not moments[0].exists()
 
 
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program) -> Program:
+    """The program on the robot whose bags these are."""
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    return exits
+
+
 class TestReports:
     def memory(self, bag_dir: Path, *, keeps_foreign: bool = True) -> Memory:
         memory = memory_of(bag_dir, clock=SettableClock(NOW))
@@ -265,62 +273,52 @@ class TestReports:
         assert "foreign_bytes" not in anyio.run(Health(every, "1"))
 
     def test_doctor_and_info_say_it(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+        self, tmp_path: Path, robot: Program, capsys: pytest.CaptureFixture[str]
     ) -> None:
         own_all(tmp_path)
         foreign(tmp_path, "session_mcap/session_0.mcap")
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
-        cli.main(["doctor", "--json"])
+        cli.main(["doctor", "--json"])  # its exit code is of other findings, too
         found = json.loads(capsys.readouterr().out)["findings"]
         [disk] = [each["seen"] for each in found if each["about"] == "disk"]
         assert "bags that the recorder did not make take" in disk
         assert "ros2-memory adopt DIR" in disk
-        cli.main(["info", "--json"])
-        reported = json.loads(capsys.readouterr().out)["memory_status"]["budget"]
+        reported = robot(0, "info --json").json["memory_status"]["budget"]
         assert reported["used_gb"] < 0.001 < 10**9 * reported["foreign_gb"]
 
 
 class TestAdopt:
-    @pytest.fixture(autouse=True)
-    def robot(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
-
-    def test_it_takes_a_directory_and_all_below_it(self, tmp_path: Path, capsys: Capture) -> None:
+    def test_it_takes_a_directory_and_all_below_it(self, tmp_path: Path, robot: Program) -> None:
         foreign(tmp_path, "old/a/a_0.mcap", "old/a/a_1.mcap", "old/b/c/d_0.mcap", "other/x.mcap")
-        assert cli.main(["adopt", str(tmp_path / "old")]) == 0
+        reported = robot(0, "adopt", tmp_path / "old").out
         own = OwnRecordings(tmp_path)
         assert [*own.names()] == ["old/a", "old/b/c"]
         assert own.owns(tmp_path / "old" / "a")
-        reported = capsys.readouterr().out
         assert "adopted: old/a (2 bag files, " in reported
         assert "retention deletes them from now on" in reported
         # What lies loose in the bag directory is in none.
         foreign(tmp_path, "latched/carried.mcap", "moments/m/r/r.mcap")
         (tmp_path / "other" / "x.mcap").rename(tmp_path / "loose.mcap")
-        assert cli.main(["adopt", str(tmp_path)]) == 0
+        robot(0, "adopt", tmp_path)
         assert [*own.names()] == ["old/a", "old/b/c"]
 
     @pytest.mark.parametrize("name", ["nowhere", "/", "..", "link"])
     def test_what_is_no_directory_of_bags_here_is_refused(
-        self, tmp_path: Path, capsys: Capture, name: str
+        self, tmp_path: Path, robot: Program, name: str
     ) -> None:
         (tmp_path / "a").mkdir()
         (tmp_path / "link").symlink_to(tmp_path / "a")
-        assert cli.main(["adopt", name]) == 2
-        assert "ros2-memory adopt: " in capsys.readouterr().err
+        assert "ros2-memory adopt: " in robot(2, "adopt", name).err
 
-    def test_links_are_neither_adopted_nor_counted(self, tmp_path: Path, capsys: Capture) -> None:
+    def test_links_are_neither_adopted_nor_counted(self, tmp_path: Path, robot: Program) -> None:
         [target] = foreign(tmp_path, "old/x_0.mcap")
         for folder in ("a", "b"):
             (tmp_path / folder).mkdir()
         (tmp_path / "a" / "x_0.mcap").symlink_to(target)
         (tmp_path / "a" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
         (tmp_path / "b" / "old").symlink_to(target.parent)
-        assert cli.main(["adopt", "a", "b"]) == 1
-        output = capsys.readouterr().out
+        output = robot(1, "adopt a b").out
         told = ("there are no bag files", "links are not followed", "adopted")
         assert [each in output for each in told] == [True, True, False]
         (tmp_path / "old" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
-        assert cli.main(["adopt", "old", "a"]) == 0
-        assert "adopted: old (1 bag file, " in capsys.readouterr().out
+        assert "adopted: old (1 bag file, " in robot(0, "adopt old a").out
         assert [*OwnRecordings(tmp_path).names()] == ["old"]
