@@ -4,6 +4,8 @@ import errno
 import os
 import shutil
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -272,23 +274,20 @@ class TestSpace:
         assert len(world.recorders) == 1
 
 
-class TestUnmounted:
+@contextmanager
+def unmounted(world: World) -> Iterator[None]:
     """The disk is unmounted: its recordings are not there, and an empty directory is."""
+    aside, device = world.bag_dir.with_name("aside"), world.device
+    world.bag_dir.rename(aside)
+    world.bag_dir.mkdir()
+    world.device = 2
+    yield
+    shutil.rmtree(world.bag_dir)
+    aside.rename(world.bag_dir)
+    world.device = device
 
-    @staticmethod
-    def unmounted(world: World) -> Path:
-        aside = world.bag_dir.with_name("aside")
-        world.bag_dir.rename(aside)
-        world.bag_dir.mkdir()
-        world.device = 2
-        return aside
 
-    @staticmethod
-    def mounted(world: World, aside: Path) -> None:
-        shutil.rmtree(world.bag_dir)
-        aside.rename(world.bag_dir)
-        world.device = 1
-
+class TestUnmounted:
     @pytest.fixture
     def world(self, tmp_path: Path) -> World:
         return World(tmp_path / "bags").started(3)
@@ -296,12 +295,11 @@ class TestUnmounted:
     def test_nothing_is_recorded_onto_another_disk_and_it_goes_on_when_the_disk_is_back(
         self, world: World
     ) -> None:
-        aside = self.unmounted(world)
-        assert len(world.logged(200, "disk_gone")) == 1
-        assert world.running == []
-        assert world.house.asked == ["apply"]
-        assert list(world.bag_dir.iterdir()) == []
-        self.mounted(world, aside)
+        with unmounted(world):
+            assert len(world.logged(200, "disk_gone")) == 1
+            assert world.running == []
+            assert world.house.asked == ["apply"]
+            assert list(world.bag_dir.iterdir()) == []
         with capture_logs() as logs:
             world.run(0.5)
             assert len(world.recorders) == 1
@@ -311,10 +309,10 @@ class TestUnmounted:
         assert (world.supervisor.is_recording, beat["state"]) == (True, "recording")
         assert "has been unmounted" in beat["last_error"]
         assert [how for _, how in world.house.restarts] == ["paused"]
-        self.unmounted(world)
-        world.run(3)
-        world.supervisor.stop()
-        assert list(world.bag_dir.iterdir()) == []
+        with unmounted(world):
+            world.run(3)
+            world.supervisor.stop()
+            assert list(world.bag_dir.iterdir()) == []
 
     def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(
         self, tmp_path: Path
@@ -322,21 +320,19 @@ class TestUnmounted:
         bag_dir = tmp_path / "bags"
         world = World(bag_dir, housekeeper=keeper_of(bag_dir)).started(3)
         world.recorders[0].ends_with = -9
-        aside = self.unmounted(world)
-        world.run(0.25)
-        world.orders.reception.lost(world.recorders[0].directory.name, "/door", 3)
-        world.run(20)
-        assert list(bag_dir.iterdir()) == []
-        self.mounted(world, aside)
+        with unmounted(world):
+            world.run(0.25)
+            world.orders.reception.lost(world.recorders[0].directory.name, "/door", 3)
+            world.run(20)
+            assert list(bag_dir.iterdir()) == []
         world.run(20)
         lost = [(loss.topic, loss.lost, loss.by) for loss in read_losses(bag_dir, MIN_NS, MAX_NS)]
         assert lost == [("*", 0, "hung"), ("*", 0, "paused"), ("/door", 3, "rosbag2")]
 
     def test_one_that_comes_and_goes_is_waited_for_longer_each_time(self, world: World) -> None:
         for _ in range(5):
-            aside = self.unmounted(world)
-            world.run(1)
-            self.mounted(world, aside)
+            with unmounted(world):
+                world.run(1)
             world.run(1)
         world.run(10)
         assert len(world.recorders) <= 3
