@@ -22,7 +22,6 @@ _R = TypeVar("_R")
 UNMEASURED: Final = (
     "cli/test_forget.py",
     "cli/test_plot.py",
-    "columns/test_example_queries.py",
     "columns/test_fill.py",
     "columns/test_fragments.py",
     "columns/test_scan.py",
@@ -56,7 +55,6 @@ UNMEASURED: Final = (
     "test_latched_carry.py",
     "test_mcap_reader.py::test_of_uncompressed_files",
     "test_no_data.py::test_no_reply_about_a_memory_from_time_zero",
-    "test_outline.py",
     "test_path_length.py",
     "test_real_bags.py",
     "test_region_visits.py",

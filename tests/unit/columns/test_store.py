@@ -1,27 +1,32 @@
-"""The file of the store may be anything at any time, what its rows mean is pinned, and forgets."""
+"""The file of the store may be anything at any time; what its rows mean is pinned, and shown."""
 
 import hashlib
 import os
+import random
+import re
 import shutil
 import sqlite3
 import struct
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from random import Random
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
 from ros2_memory.columns import forget as forgetting
+from ros2_memory.columns.database import TABLES
+from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.pack import FORMAT, decompressed
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import (
     battery,
     boolean,
@@ -38,6 +43,7 @@ from tests.support.bags import (
 )
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.fakes import files_limited_to
+from tests.support.memories import ROOT
 
 S = 10**9
 
@@ -234,9 +240,6 @@ def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(
         scanner.packed(head, ["#log_time"], "#log_time")
 
 
-S = NS_PER_S
-
-
 def write_secret(bag_dir: Path, number: int) -> Path:
     """A minute, in which thrice something is said that only this minute has, and a topic is new."""
     start = T0 + number * 60 * S
@@ -411,3 +414,47 @@ def test_a_topic_that_is_stored_later_is_taken_for_none_that_was_forgotten(tmp_p
     world.fill()
     assert check_all(world) == 9
     assert world.stored() == {"rec/rec_1.mcap"}
+
+
+@cache
+def section() -> str:
+    text = (ROOT / "docs/reference/files.md").read_text(encoding="utf-8")
+    return text.partition("## The store of columns")[2]
+
+
+def query(question: str) -> str:
+    match = re.search(re.escape(question) + r"\n\n```sql\n(.+?);\n```", section(), re.DOTALL)
+    assert match is not None
+    return match[1]
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bag_dir = tmp_path_factory.mktemp("bags")
+    draw = random.Random(3)
+    for number in range(3):
+        start = T0 + number * 3000 * S
+        messages = [battery(start + n * S, 0.9 - number / 10 - n / 1000) for n in range(5)]
+        messages += [
+            odom(start + n * S // 100, draw.uniform(-9, 9), draw.uniform(-9, 9)) for n in range(300)
+        ]
+        path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
+        os.utime(path, ns=(T0, T0))
+    World.of(bag_dir, limits=StoreLimits(max_share=0.0)).fill()
+    return store_file(bag_dir)
+
+
+def answer(file: Path, question: str) -> list[Any]:
+    with closing(sqlite3.connect(file)) as base:
+        return base.execute(query(question)).fetchall()
+
+
+def test_columns_that_are_dropped_and_bytes_of_each_topic(file: Path) -> None:
+    dropped = answer(file, "Of which topics are columns dropped, and since when?")
+    assert dropped == [("/odom", "2023-11-14 22:20:00", 3)]
+    sizes = dict(answer(file, "How many bytes does each topic take?"))
+    assert sizes.keys() == {"/battery_state", "/odom"}
+
+
+def test_all_tables_are_described() -> None:
+    assert [table for table in TABLES if f"`{table}`" not in section()] == []

@@ -1,4 +1,4 @@
-"""An index that followed every change, or begins with known bags, knows what a fresh one finds."""
+"""What a walk of the bag directory finds; an index that followed every change finds that, too."""
 
 import os
 import shutil
@@ -8,27 +8,37 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
+from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.index.bag_rows import BagRows
+from ros2_memory.index.scan import ScanResult, Tree
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
+from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.heartbeats import beat
+from tests.support.memories import asked, each_way, memory_of
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
+from tests.unit.core.test_deep_directories import within
 
 S = 10**9
+
 NOW = 1_800_000_000 * S
 
 FOLDERS = (".", "rec_1", "rec_2", "day/rec_3", ".trash")
+
 NAMES = ("a.mcap", "b.mcap", "a.mcap.zstd", "c.db3", "d.db3.zstd", "notes.txt")
+
 WAITS_S = (0.0, 0.0, 0.001, 1.0, 2.0, 5.0, 14.0, 31.0, 700.0)
 
 places = st.tuples(st.sampled_from(FOLDERS), st.sampled_from(NAMES)).map("/".join)
+
 steps = st.one_of(
     st.tuples(st.sampled_from(["add", "open", "replace", "overwrite"]), places, st.integers(0, 99)),
     st.tuples(st.sampled_from(["empty", "zero", "junk", "grow", "close"]), places, st.just(0)),
@@ -176,3 +186,169 @@ def _views(snapshot: Snapshot) -> tuple[object, ...]:
         snapshot.timeline.transient_local,
         snapshot.timeline.overlapping(TimeWindow(20, 60)),
     )
+
+
+LONG_AGO = NOW - 3600 * S
+
+
+def put(path: Path, text: str = "x", *, at: int = LONG_AGO) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    os.utime(path, ns=(at, at))
+    return path
+
+
+def aged(root: Path, at: int = LONG_AGO) -> Path:
+    """Gives every directory an mtime that proves that nothing came or went since."""
+    for folder in (root, *(path for path in root.rglob("*") if path.is_dir())):
+        os.utime(folder, ns=(at, at))
+    return root
+
+
+def scanned_names(scanned: ScanResult) -> list[str]:
+    return sorted(Path(path).name for path in scanned.stamps)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("rec_0.mcap", ".mcap"),
+        ("rec_0.db3", ".db3"),
+        ("rec_0.mcap.zstd", ".mcap.zstd"),
+        ("rec_0.db3.zstd", ".db3.zstd"),
+        ("REC_0.MCAP", ".mcap"),
+        (".rec_0.mcap", None),
+        ("rec_0.db3-wal", None),
+        ("rec_0.mcap.tmp", None),
+    ],
+)
+def test_a_bag_is_known_by_the_end_of_its_name(name: str, kind: str | None) -> None:
+    assert bag_kind(name) == kind
+
+
+def test_a_watched_file_that_left_and_came_back_within_one_tick_is_found(tmp_path: Path) -> None:
+    path = put(tmp_path / "a.mcap")
+    tree = Tree(aged(tmp_path))
+    tree.scan(NOW, ())
+    path.unlink()
+    aged(tmp_path)
+    assert tree.scan(NOW, [str(path)]).gone == {str(path)}
+    put(path)
+    aged(tmp_path)
+    assert scanned_names(tree.scan(NOW, ())) == ["a.mcap"]
+
+
+def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
+    put(tmp_path / "elsewhere" / "a.mcap")
+    bags = tmp_path / "bags"
+    put(bags / "rec" / "b.mcap")
+    (bags / "latest").symlink_to(bags / "rec", target_is_directory=True)
+    (bags / "up").symlink_to(tmp_path, target_is_directory=True)
+    (bags / "c.mcap").symlink_to(tmp_path / "elsewhere" / "a.mcap")
+    (bags / "broken.mcap").symlink_to(tmp_path / "nowhere")
+    (bags / "README").symlink_to(put(tmp_path / "readme.txt"))
+    (bags / ".hidden").symlink_to(tmp_path, target_is_directory=True)
+    tree = Tree(aged(bags))
+    first, second = tree.scan(NOW, ()), tree.scan(NOW, ())
+    assert scanned_names(first) == ["b.mcap"]
+    for scanned in (first, second):
+        assert sorted(each.path.name for each in scanned.links) == [
+            "broken.mcap",
+            "c.mcap",
+            "latest",
+            "up",
+        ]
+        assert all("not followed" in each.reason for each in scanned.links)
+
+
+def test_a_folder_that_cannot_be_listed_is_damaged_and_hides_no_other(tmp_path: Path) -> None:
+    put(tmp_path / "rec" / "a.mcap")
+    deep = "d" * 250
+    with within(tmp_path, 18, deep):  # longer than any path may be
+        pass
+    tree = Tree(tmp_path)
+    first, second = tree.scan(NOW, ()), tree.scan(NOW, ())
+    assert scanned_names(first) == ["a.mcap"]
+    assert second.gone == set()
+    for scanned in (first, second):
+        assert [each.path.parts[len(tmp_path.parts)] for each in scanned.damaged] == [deep]
+        assert scanned.damaged[0].reason == "the directory cannot be listed: File name too long"
+
+
+@pytest.mark.parametrize("kind", ["missing", "file"])
+def test_a_root_that_is_no_directory_is_a_problem_and_empties_the_tree(
+    tmp_path: Path, kind: str
+) -> None:
+    bags = tmp_path / "bags"
+    path = put(bags / "rec" / "a.mcap")
+    tree = Tree(aged(bags))
+    tree.scan(NOW, ())
+    bags.rename(tmp_path / "aside")
+    if kind == "file":
+        bags.write_text("", encoding="utf-8")
+    scanned = tree.scan(NOW, [str(path)])
+    assert scanned.gone == {str(path)}
+    assert scanned.stamps == {}
+    words = "does not exist (yet): check" if kind == "missing" else "is a file, not a directory"
+    assert words in (scanned.problem or "")
+    assert (scanned.problem or "").endswith("recording.bag_dir (MEMORY_BAG_DIR)")
+    named = Tree(bags, setting="fleet.robots").scan(NOW, ()).problem or ""
+    assert named.endswith(" fleet.robots")
+    bags.unlink(missing_ok=True)
+    (tmp_path / "aside").rename(bags)
+    assert scanned_names(tree.scan(NOW, ())) == ["a.mcap"]
+
+
+def write_odometry(path: Path, speed: float, later: int = 0) -> Path:
+    begin = 1_784_000_000 * S
+    poses = [odom(begin + later + n * S, speed * n, 0.0) for n in range(10)]
+    write_mcap(path, poses)
+    os.utime(path, ns=(begin, begin))
+    return path
+
+
+@each_way
+def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) -> None:
+    path = write_odometry(tmp_path / "rec" / "rec_0.mcap", 0.1)
+    for name in ("rec_0 (copy).mcap", "another.mcap"):
+        shutil.copy2(path, path.with_name(name))
+    memory = memory_of(tmp_path, recalls=recalls)
+    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
+    assert odometry["count"] == 10
+    assert [bag.file for bag in memory.index.snapshot().bags] == [str(path)]
+    path.unlink()
+    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
+    assert odometry["count"] == 10
+
+
+@each_way
+def test_another_bag_written_over_one_of_its_size_and_mtime_is_read_anew(
+    tmp_path: Path, recalls: bool
+) -> None:
+    path = write_odometry(tmp_path / "rec" / "rec_0.mcap", 0.1)
+    memory = memory_of(tmp_path, recalls=recalls)
+
+    def driven() -> float:
+        of_all = {"start": 1_784_000_000, "end": 1_784_000_099}
+        return float(asked(memory, tmp_path, "trajectory_summary", **of_all)["distance_m"])
+
+    assert driven() == 0.9
+    before, other = path.stat(), write_odometry(tmp_path / "other", 0.2, later=S).read_bytes()
+    with path.open("r+b") as stream:
+        stream.write(other)
+    os.utime(path, ns=(before.st_mtime_ns, before.st_mtime_ns))
+    assert path.stat()[:7] == before[:7]
+    memory.index.refresh()
+    assert driven() == 1.8
+
+
+@each_way
+@pytest.mark.parametrize("dated", ["rec_1.mcap", "handover.json"])
+def test_a_file_dated_after_2262_hides_no_bag(tmp_path: Path, recalls: bool, dated: str) -> None:
+    paths = [tmp_path / "rec" / f"rec_{number}.mcap" for number in range(2)]
+    for path in paths:
+        write_odometry(path, 0.1, later=int(path == paths[1]) * 10 * S)
+    put(tmp_path / "rec" / "handover.json", '{"format": 1}')
+    os.utime(tmp_path / "rec" / dated, ns=(LONG_AGO, 10_413_792_000 * S))
+    [odometry] = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "list_recorded_topics")
+    assert odometry["count"] == 20

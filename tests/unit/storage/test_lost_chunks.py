@@ -1,33 +1,47 @@
-"""A damaged chunk costs its own messages, and is reported where these were looked for.
+"""A damaged chunk costs its own messages, and is reported where these were looked for."""
 
-A damaged index costs none, and is reported too.
-"""
-
-from collections.abc import Callable
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import zstandard
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.core.errors import BagError
+from ros2_memory.core.errors import BagContradictionError, BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Match
-from ros2_memory.storage.base import BagReader
+from ros2_memory.storage.base import BagReader, Batch, Channel, Record, Schema
+from ros2_memory.storage.contents import Tally
+from ros2_memory.storage.errors import UnreadableError, reading
+from ros2_memory.storage.mcap import bulk
+from ros2_memory.storage.mcap.bulk import ReadChunks
+from ros2_memory.storage.mcap.chunk import Pairs
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
-from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
+from tests.support.bags import McapLayout, Msg, boolean, definition, odom, text, write_mcap
+from tests.support.examples import examples
+from tests.support.mcap_surgery import SMALL, chatter, chunks_of, damaged, spoil_chunk
 from tests.support.memories import memory_of, with_store
 
 S = 10**9
+
 T0 = 1_700_000_000 * S
+
 LATCHED = McapLayout(chunk_size=1, latched=frozenset({"/dock"}))
+
 EVERYTHING = TimeWindow.everything()
 
 
@@ -151,3 +165,166 @@ def test_a_bag_that_pauses_and_one_whose_chunks_overlap_are_read_by_their_indexe
         for n in range(0, 500, 20):
             reader.newest(path, "/odom", TimeWindow(T0, T0 + n * S // 50))
         assert reader.summarize(path).notes == ()
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        MemoryError(),
+        KeyError(1),
+        OSError(5, "Input/output error"),
+        RuntimeError("LZ4F_decompress\nfailed"),
+        AssertionError(),
+        UnreadableError("its reason"),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_every_foreign_exception_becomes_an_error_about_the_file(
+    foreign: Exception, tmp_path: Path
+) -> None:
+    path = tmp_path / "bag.mcap"
+    with pytest.raises(BagError) as caught, reading(path):
+        raise foreign
+    assert caught.value.path == str(path)
+    assert caught.value.reason
+    assert "\n" not in caught.value.reason
+    assert caught.value.__cause__ is foreign
+
+
+@pytest.mark.parametrize("error", [UndecodableError("/t", "a/msg/B", "no"), KeyboardInterrupt()])
+def test_errors_of_the_tree_and_interruptions_pass_as_they_are(error: BaseException) -> None:
+    with pytest.raises(type(error)) as caught, reading(Path("bag.mcap")):
+        raise error
+    assert caught.value is error
+
+
+TOPICS = ("/chatter", "/bumper")
+
+
+def all_of(items: Iterator[Record] | Iterator[Batch]) -> tuple[list[object], list[BagError]]:
+    """What an iterator yields, and what it raises meanwhile."""
+    found: list[object] = []
+    errors: list[BagError] = []
+    while True:
+        try:
+            found.append(next(items))
+        except StopIteration:
+            return found, errors
+        except BagError as error:
+            errors.append(error)
+
+
+def records_in(batches: Iterable[object]) -> Counter[object]:
+    return Counter[object](
+        batch.record(nth)  # type: ignore[attr-defined]
+        for batch in batches
+        for nth in range(batch.sizes.size)  # type: ignore[attr-defined]
+    )
+
+
+@settings(max_examples=examples(150))
+@given(
+    st.integers(0, 2**32),
+    st.sampled_from([SMALL, McapLayout(chunk_size=400, compression=CompressionType.ZSTD)]),
+)
+def test_of_a_damaged_file_batches_hold_what_records_do(seed: int, how: McapLayout) -> None:
+    messages = [*chatter(12), *(boolean(time, True) for time in range(5, 9))]
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_mcap(Path(folder) / "a.mcap", messages, how)
+        path.write_bytes(damaged(path.read_bytes(), seed))
+        records, errors = all_of(McapReader().records(path, TOPICS, EVERYTHING))
+        batches, others = all_of(McapReader().batches(path, TOPICS, EVERYTHING))
+    found, expected = records_in(batches), Counter[object](records)
+    contradicted = any(isinstance(error, BagContradictionError) for error in errors)
+    # Where indexes lie, the rest is read in the order of the file, up to where that is damaged:
+    # messages beyond may have come before by their times.
+    if not contradicted:
+        assert found == expected
+    assert bool(errors) == bool(others)
+
+
+def test_a_place_past_all_that_can_be_counted_is_damage() -> None:
+    content = ReadChunks((), bytes(200), [100, 100])
+    pairs = Pairs(*np.array([[1], [0], [2**63 - 1], [1]]))
+    with pytest.raises(UnreadableError, match="a message is not where its index says"):
+        bulk.compared(content, pairs)
+
+
+def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:
+    plain = [text(time, f"message {time}") for time in range(9)]
+    packed = [
+        Msg(each.topic, each.type, each.log_time, zstandard.compress(each.payload))
+        if each.log_time % 2
+        else each
+        for each in plain
+    ]
+    path = write_mcap(tmp_path / "a.mcap", packed, SMALL)
+    batches = list(McapReader().batches(path, TOPICS, EVERYTHING))
+    found = {
+        time: batch.payload(nth)
+        for batch in batches
+        for nth, time in enumerate(batch.log_times.tolist())
+    }
+    assert found == {each.log_time: each.payload for each in plain}
+
+
+def test_no_buffer_has_more_than_its_share_of_small_chunks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(40), SMALL)
+    monkeypatch.setattr(bulk, "BATCH_BYTES", 1500)
+    batches = list(McapReader().batches(path, TOPICS, EVERYTHING))
+    assert len(batches) > 3
+    assert max(len(batch.buffer) for batch in batches) <= 1500
+    assert [time for batch in batches for time in batch.log_times.tolist()] == list(range(40))
+
+
+def record_of(message: Msg, schema: Schema | None = None) -> Record:
+    given = schema or Schema(message.type, "ros2msg", definition(message.type).encode())
+    return Record(Channel(message.topic, "cdr", given), 1, 1, message.payload)
+
+
+def test_big_endian_messages_are_read() -> None:
+    payload = b"\x00\x00\x00\x00" + b"\x00\x00\x00\x03hi\x00"
+    record = record_of(text(1, "x"))._replace(payload=payload)
+    assert getattr(McapReader().decode(record), "data", "") == "hi"
+
+
+def test_every_cut_of_a_payload_is_undecodable_and_nothing_else() -> None:
+    whole = record_of(odom(1, 2.0, 3.0))
+    decoding = McapReader()
+    for size in range(len(whole.payload)):
+        with pytest.raises(UndecodableError):
+            decoding.decode(whole._replace(payload=whole.payload[:size]))
+    assert decoding.decode(whole)
+
+
+def test_a_message_of_a_type_whose_definition_is_empty_names_what_to_set() -> None:
+    record = record_of(text(1, "a text"), Schema("a_msgs/msg/Lost", "ros2msg", b""))
+    decoding = McapReader()
+    with pytest.raises(UndecodableError, match=r"reader\.custom_msg_paths"):
+        decoding.decode(record)
+    nothing = record._replace(payload=b"\x00\x01\x00\x00\x00")
+    assert decoding.decode(nothing) is not None
+
+
+TENTH = NS_PER_S // 10
+
+
+@given(st.lists(st.integers(0, 400), min_size=1), st.integers(1, 12), st.integers(1, 50))
+@example([0, 100, 91, 82, 73, 64, 110], 7, 7)
+@example([0, 100, 91, 82, 73, 64, 110], 1, 7)
+def test_a_clock_that_goes_back_does_so_as_far_however_the_file_is_cut(
+    tenths: list[int], chunk_size: int, at_once: int
+) -> None:
+    """As far as a message lies before any earlier one."""
+    times = np.array(tenths, np.int64) * TENTH
+    chunks = np.arange(times.size) // chunk_size
+    tally = Tally()
+    for begin in range(0, times.size, at_once):
+        part = times[begin : begin + at_once]
+        tally.add(np.zeros_like(part), part, chunks[begin : begin + at_once])
+    by, at = tally.contents().set_back
+    assert by == max(np.maximum.accumulate(times) - times)
+    assert by == 0 or at in times
