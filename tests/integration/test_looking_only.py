@@ -19,10 +19,9 @@ from mcp import Client
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.columns.store import FILE
-from tests.integration.test_retention_process import state
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.column_worlds import store_file
-from tests.support.housekeepers import recorded_before
+from tests.support.housekeepers import recorded_before, state
 from tests.support.processes import until
 from tests.support.robot_run import T0, ask_everything, write_run
 from tests.support.served import Served, serving

@@ -15,6 +15,7 @@ from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import NullRecorderNode, Ros2BagNode, load_settings
 from ros2_memory.serving.auth import CREDENTIAL
 from tests.support.bags import odom, write_db3
+from tests.support.housekeepers import state
 from tests.support.memories import ROOT
 
 DEPLOY = ROOT / "deploy"
@@ -36,19 +37,6 @@ def installed(root: Path, *options: str, script: Path = SCRIPT) -> str:
     ran = install(root, *options, script=script)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout
-
-
-def tree(*roots: Path) -> dict[Path, tuple[object, ...]]:
-    """Mode, owner, group, change and content of some folders, and of all below them."""
-    return {
-        path: (
-            *(stat.st_mode, stat.st_uid, stat.st_gid, stat.st_ctime_ns),
-            path.read_bytes() if path.is_file() else b"",
-        )
-        for root in roots
-        for path in (root, *sorted(root.rglob("*")))
-        for stat in [path.lstat()]
-    }
 
 
 def release(folder: Path, unit: str) -> Path:
@@ -106,9 +94,9 @@ def test_bags_belong_to_the_user_and_the_folder_above_to_root(tmp_path: Path) ->
 def test_run_again_it_changes_nothing_and_names_nothing(tmp_path: Path) -> None:
     installed(tmp_path)
     folders = tmp_path / "var", tmp_path / "etc/ros2-memory"
-    before = tree(*folders)
+    before = [state(folder) for folder in folders]
     assert "NAME.new" not in installed(tmp_path)
-    assert tree(*folders) == before
+    assert [state(folder) for folder in folders] == before
     assert not [*tmp_path.rglob("*.new"), *tmp_path.rglob("*.part")]
 
 
@@ -146,9 +134,9 @@ def test_existing_bags_keep_their_owner_and_mode(tmp_path: Path) -> None:
     recording.mkdir(parents=True, mode=0o777)
     (recording / "rec_1_0.mcap").write_bytes(b"kept")
     (tmp_path / BAGS).chmod(0o777)
-    before = tree(tmp_path / BAGS)
+    before = state(tmp_path / BAGS)
     installed(tmp_path)
-    assert tree(tmp_path / BAGS) == before
+    assert state(tmp_path / BAGS) == before
 
 
 @pytest.mark.parametrize(
@@ -170,11 +158,11 @@ def test_a_link_on_the_way_is_named_and_nothing_is_installed(tmp_path: Path, lin
     elsewhere.mkdir()
     (root / link).parent.mkdir(parents=True)
     (root / link).symlink_to(elsewhere)
-    before = tree(root, elsewhere)
+    before = state(tmp_path)
     ran = install(root)
     assert ran.returncode == 1
     assert str(root / link) in ran.stderr
-    assert tree(root, elsewhere) == before
+    assert state(tmp_path) == before
 
 
 def test_the_query_server_alone_comes_without_a_recorder(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A housekeeper over a folder of bags, as the recorder's daemon has one."""
 
+import hashlib
 import json
 import shutil
 import threading
@@ -136,6 +137,23 @@ def size_of(bag_dir: Path) -> int:
         path.stat().st_ino: path.stat().st_size for path in files if path != bag_dir / DELETED_FILE
     }
     return sum(sizes.values())
+
+
+def state(folder: Path) -> dict[str, tuple[object, ...]]:
+    """Everything of every file and directory but when it was last read."""
+    found: dict[str, tuple[object, ...]] = {}
+    for path in (folder, *sorted(folder.rglob("*"))):
+        status = path.lstat()
+        content = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        found[str(path.relative_to(folder))] = (
+            status.st_mode,
+            status.st_ino,
+            status.st_size,
+            status.st_mtime_ns,
+            status.st_ctime_ns,
+            content,
+        )
+    return found
 
 
 def copied(source: Path, target: Path) -> Path:
