@@ -6,6 +6,7 @@ Replies of a call that was out of time have what is known, and claim no more tha
 import itertools
 import math
 import random
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import chain, repeat
@@ -112,9 +113,8 @@ def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recall
 def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
     question = (memory_of(tmp_path), Call(), "/battery_state")
-    for kind, search in itertools.product(
-        ("below", "above"), (queries.find_last_match, find_matches)
-    ):
+    searches: tuple[Callable[..., object], ...] = (queries.find_last_match, find_matches)
+    for kind, search in itertools.product(("below", "above"), searches):
         with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
             search(*question, kind, 20, field="percentage")
     assert at(queries.find_last_match(*question, "above", 0.2, field="percentage")) == 0

@@ -76,6 +76,10 @@ def hourly(hours: int, *, until: int = NOW) -> list[StoredBag]:
 
 
 class TestAge:
+    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
+        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
+        assert expired(contents(*before, after), LIMITS) == ()
+
     def test_whole_hours_go_to_make_room_but_for_what_is_needed_and_the_newest_hour(self) -> None:
         minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(200)]
         held = replace(contents(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
