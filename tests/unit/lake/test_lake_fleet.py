@@ -11,6 +11,8 @@ from typing import Any
 import anyio
 import pytest
 
+from ros2_memory.bag_dir.layout import MEMORY_FOLDER, memory_file
+from ros2_memory.bag_dir.state_files import append_deleted, deleted_of
 from ros2_memory.bootstrap_fleet import build_fleet, open_lake
 from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, RefusedError
@@ -142,6 +144,36 @@ def test_a_bag_that_lost_its_first_message_since_it_was_shipped_is_not_another_o
     assert [sample["value"]["value"] for sample in found["samples"]] == ["n0", "n1", "n2"]
     assert "could not be read" not in str(found)
     assert reply(fleet, "find_last_match", CUP | {"value": "tree"})["never"] == ["hall"]
+
+
+@pytest.mark.parametrize("shipped", [3, 2])
+@pytest.mark.parametrize("has_first", [True, False])
+def test_what_stayed_of_a_day_counts_only_where_a_bag_of_it_was_not_shipped(
+    tmp_path: Path, shipped: int, *, has_first: bool
+) -> None:
+    """Retention deletes the bags of a day, of which some messages stay, rounded (`memory.keep`)."""
+    bags = [write_bag(tmp_path / "hall", number, most=10) for number in range(3)]
+    for bag in bags[shipped:]:
+        bag.rename(tmp_path / bag.name)
+    ship_from(tmp_path)
+    for bag in bags:
+        bag.unlink(missing_ok=True)
+    ends = [(START_S + 10 * nth) * NS_PER_S for nth in range(4)]
+    named = [(f"rec_{nth}", ends[nth], ends[nth + 1] - NS_PER_S) for nth in range(3)]
+    append_deleted(tmp_path / "hall", [deleted_of("rec", named)])
+    first = 0 if has_first else 3
+    stayed = [text((START_S + nth) * NS_PER_S, "n") for nth in range(first, 30, 3)]
+    write_mcap(tmp_path / "hall" / MEMORY_FOLDER / memory_file("20261120"), stayed)
+    found = reply(
+        served(tmp_path),
+        "get_topic_in_last",
+        {"robot": "hall", "topic": "/chatter", "seconds": 1e9},
+    )
+    is_needed = shipped < 3
+    assert found["total"] == 10 * shipped + (len(stayed) if is_needed else 0)
+    wanted = {"topic": "/chatter", "condition_type": "contains", "value": "n"}
+    last = reply(served(tmp_path), "find_last_match", {**wanted, "robot": "hall"})
+    assert last["timestamp"] == START_S + (27 if is_needed else 29)
 
 
 def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Path) -> None:
