@@ -442,7 +442,7 @@ def value_when(
         read = upto if held is None else replace(upto, start=held.time)
         note_unread(view, read, nothing=not held)
         if held is None:
-            view.notes.add(f"{name} held no message yet at {unix_text(match.time)}")
+            view.notes.add(f"no message of {name} is here at or before {unix_text(match.time)}")
             notes = (*matched.notes, *view.notes.sentences())
             return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
         distance = match.time - held.time

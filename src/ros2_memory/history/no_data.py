@@ -36,7 +36,7 @@ from ros2_memory.history.coverage import (
 from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Iterator
 
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -274,11 +274,11 @@ def not_recorded(view: View, name: str) -> NoDataError:
         NoDataError: nothing is recorded at all.
     """
     require_bags(view)
-    snapshot, reason = view.snapshot, NoDataReason.TOPIC_NOT_RECORDED
-    declared = snapshot.silent_topics.intersection({name, f"/{name}"})
-    if declared and _were_cut(view, declared, TimeWindow.everything()):
+    snapshot, names = view.snapshot, {name, f"/{name}"}
+    reason = NoDataReason.TOPIC_NOT_RECORDED
+    if not names.isdisjoint(_cut_topics(view, TimeWindow.everything())):
         reason, detail = NoDataReason.DELETED, f"every message of {name} was deleted"
-    elif declared:
+    elif not names.isdisjoint(snapshot.silent_topics):
         detail = f"{name} is declared in the bags, but no message of it was recorded"
     else:
         detail = f"no topic {name} is recorded"
@@ -319,7 +319,7 @@ def no_data_at(
     if (
         deleted
         or excluded
-        or _were_cut(view, topics, window)
+        or _cut_topics(view, window).issuperset(topics)
         or _is_thinned(view, TimeWindow(at, at + 1))
     ):
         reason = NoDataReason.DELETED
@@ -352,14 +352,13 @@ def _distances(
         yield f"the nearest newer one is {later} after it, at {unix_text(newer.time)}"
 
 
-def _were_cut(view: View, topics: Collection[str], window: TimeWindow) -> bool:
-    """Whether messages of each of these topics in a window were cut out of bags.
+def _cut_topics(view: View, window: TimeWindow) -> set[str]:
+    """Returns the topics of which messages of a window were cut out of bags.
 
     By `retention.topics`, or by request.
     """
     losses = read_losses(view.bag_dir, window.start, window.stop)
-    cut = {loss.topic for loss in losses if loss.by in {"expired", "forgotten"}}
-    return cut.issuperset(topics)
+    return {loss.topic for loss in losses if loss.by in {"expired", "forgotten"}}
 
 
 def _is_thinned(view: View, window: TimeWindow) -> bool:
@@ -397,7 +396,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     newest = min(end, max(start, view.memory.clock.now()))
     reason = between(view, window) if is_between else beyond(view, newest)
-    if _were_cut(view, topics, window) or _is_thinned(view, window):
+    if _cut_topics(view, window).issuperset(topics) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
     detail += _advice(view, reason, start)
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
@@ -471,7 +470,7 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     It names topics there that carry what these do (poses, velocities). In a folder with the bags of
     several robots, the nearest message of a topic may be another robot's.
     """
-    if _were_cut(view, topics, window):
+    if _cut_topics(view, window).issuperset(topics):
         return []
     timeline, whole = view.timeline, view.snapshot.metadata_folders
     names: dict[str, None] = {}

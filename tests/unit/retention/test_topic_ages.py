@@ -105,6 +105,22 @@ def test_answers_say_that_it_was_deleted_and_count_it(bag_dir: Path) -> None:
     assert len(young["samples"]) == 10
 
 
+def test_a_topic_of_which_all_messages_were_deleted_is_not_said_to_be_unrecorded(
+    bag_dir: Path,
+) -> None:
+    last = T0 + 30 * HOUR
+    write_mcap(bag_dir / "rec_B" / "rec_B_0.mcap", [odom(last + n * S, n, 1.0) for n in range(9)])
+    own_all(bag_dir)
+    house(bag_dir, cutter_of(bag_dir, topic_ages=(TopicAge("/speech", HOUR // 2),))).apply()
+    for topic in ("/speech", "speech"):
+        reply = reply_over(
+            bag_dir, "find_last_match", topic=topic, condition_type="contains", value="word"
+        )
+        assert (reply["reason"], "was deleted" in reply["detail"]) == ("deleted", True)
+    other = reply_over(bag_dir, "get_topic_at_time", topic="/never", timestamp=T0 / S)
+    assert other["reason"] == "topic_not_recorded"
+
+
 def test_messages_that_count_in_another_recording_go_too(bag_dir: Path) -> None:
     bag = split(bag_dir, 2, first=5 * S + 1)
     until = T0 + 2 * HOUR + 5 * S
