@@ -41,6 +41,7 @@ from ros2_memory.core.model import BAG_KINDS, COMPRESSED
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
+    from collections.abc import Container
     from pathlib import Path
 
 LOCK_FILE: Final = "recorder.lock"
@@ -139,10 +140,11 @@ def utc_stamp(at: Ns) -> str:
     return datetime.fromtimestamp(at // NS_PER_S, tz=UTC).strftime(_TIME_FORMAT)
 
 
-def recording_name(now: Ns, bag_dir: Path) -> str:
+def recording_name(now: Ns, bag_dir: Path, deleted: Container[str]) -> str:
     """Returns a free name for a recording that begins now: its UTC time, numbered where taken.
 
-    Names are taken when two recordings begin within a second, or the clock was set back.
+    Names are taken when two recordings begin within a second, or the clock was set back. Those of
+    `deleted` recordings are, too: files in `.episodic` still have them.
 
     Raises:
         RecorderError: the bag directory cannot be read, as on a disk that fails.
@@ -150,7 +152,7 @@ def recording_name(now: Ns, bag_dir: Path) -> str:
     stem = f"rec_{utc_stamp(now)}"
     name, number = stem, 1
     try:
-        while mode_of(bag_dir / name):
+        while name in deleted or mode_of(bag_dir / name):
             number += 1
             name = f"{stem}_{number}"
     except OSError as error:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, recording_name
+from ros2_memory.bag_dir.state_files import read_deleted
 from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Clock, Ns
@@ -387,8 +388,11 @@ class RecordingSessions:
         Raises:
             RecorderError: it cannot be started.
         """
-        self.current = self._launch(recording_name(now.wall, self._bag_dir), now)
+        self.current = self._launch(self._name(now), now)
         self.grew_s = max(self.grew_s, now.monotonic_s)
+
+    def _name(self, now: ClockReading) -> str:
+        return recording_name(now.wall, self._bag_dir, read_deleted(self._bag_dir))
 
     def begin_handover(self, now: ClockReading) -> None:
         """Starts a recording that is to take over from the current one.
@@ -399,7 +403,7 @@ class RecordingSessions:
         old = self.current
         if old is None or self.handover is not None:
             return
-        name = recording_name(now.wall, self._bag_dir)
+        name = self._name(now)
         try:
             HandoverTransfer.announce(old, name)
             new = self._launch(name, now)

@@ -7,7 +7,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.bag_dir.state_files import read_losses
+from ros2_memory.bag_dir.layout import utc_stamp
+from ros2_memory.bag_dir.state_files import append_deleted, deleted_of, read_losses
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder import handover
@@ -48,6 +49,14 @@ class TestStart:
         beat = world.heartbeat()
         left = (beat["state"], beat["recordings"], beat["last_error"])
         assert left == ("stopped", [], "no more processes")
+
+    def test_no_recording_has_the_name_of_one_whose_files_were_deleted(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        name = f"rec_{utc_stamp(world.wall)}"
+        append_deleted(tmp_path, [deleted_of(name, [(f"{name}_0.mcap", 1, 2)])])
+        assert world.started().heartbeat()["recordings"] == [f"{name}_2"]
 
 
 class TestRotation:
