@@ -15,15 +15,17 @@ switched off does not erase itself when it wakes. Clocks step, so not every date
   undated: it makes no other bag old, and is itself as old as its file.
 - A pause longer than both `max_age_ns` and a day is a robot that was off or a clock that was set,
   and nothing distinguishes the two. It separates two periods; a bag ages only against its own.
+- Where no bag is believed, as in simulated time, all are dated by their files.
 - Nothing is older than what was recorded before it: a bag that is dated before the newest of an
   earlier recording has a wrong date, and counts as recorded with the next that has a right one.
   Likewise no more was recorded after a recording than after any that was listed before it.
 
-The budget deletes the oldest first: a dated bag of the present period by its newest message, any
-other by the time of its file. A file dated further ahead of now than history is kept goes first,
-since its time means nothing and it would otherwise stay for good. A file dated before there was ROS
-2, while the clock is there as well, is being recorded now and goes last. The newest bag always
-stays.
+The budget deletes the oldest first. The recorder's recordings are in the order in which they were
+listed as they began, whatever their dates. Bags that were adopted lie between them by dates: a
+dated bag of the present period by its newest message, any other by the time of its file. A file
+dated further ahead of now than history is kept goes first, since its time means nothing and it
+would otherwise stay for good. A file dated before there was ROS 2, while the clock is there as
+well, goes last. The newest bag always stays.
 """
 
 from __future__ import annotations
@@ -196,55 +198,70 @@ def plan_deletions(
 
     With `whole_hours`, age waits until all bags of an hour are too old, and to make room the rest
     of an hour goes, too, but for the hour of the newest bag. Bags that no age deletes neither go
-    with an hour nor keep it.
+    with an hour nor keep it. Where the clock is set back, another hour begins.
     """
     left, dated = _Remaining(contents), _with_consistent_dates(contents, limits)
     total, periods, most_free = left.total, _periods(dated, limits), None
     aged = _too_old(dated, periods, limits.max_age_ns)[contents.synchronised]
     if not aged and left.fits(limits):
         return DeletionPlan((), total, fits=True)
-    order = _oldest_first(dated, limits, periods[-1] if periods else [])
-    newest = _newest(order, periods)
+    order = _oldest_first(contents, dated, limits, periods[-1] if periods else [])
+    newest = _newest(order, contents, periods)
+    hours = _hours(order)
     order = [bag for bag in order if bag.path != newest]
     if whole_hours:
-        aged = _of_whole_hours(aged, contents, newest)
+        aged = _of_whole_hours(aged, hours, contents, newest)
     going = left.delete_until_fits(order, aged, limits)
     if left.free is not None and left.free < limits.min_free_bytes:
         most_free = left.free
         left = _Remaining(replace(contents, free_bytes=None))
         going = left.delete_until_fits(order, aged, limits)
     if whole_hours:
-        going |= _rest_of_hours(going - aged, contents, newest)
-    given = {bag.path: bag for bag in contents.bags}
+        going |= _rest_of_hours(going - aged, hours, contents, newest)
     return DeletionPlan(
-        tuple(given[bag.path] for bag in order if bag.path in going),
+        tuple(bag for bag in order if bag.path in going),
         total,
         fits=most_free is None and left.fits(limits),
         most_free=most_free,
     )
 
 
-def _newest(order: Sequence[StoredBag], periods: Sequence[_Period]) -> str:
-    """Returns the bag that stays: the newest dated one, else the last written with messages."""
-    if periods:
+def _newest(order: Sequence[StoredBag], contents: DirContents, periods: Sequence[_Period]) -> str:
+    """Returns the bag that stays: the last recorded, else dated, else written, with messages."""
+    with_messages = [bag for bag in order if bag.has_dates]
+    listed = [bag.path for bag in with_messages if bag.recording in contents.places]
+    if periods and not listed:
         return max(periods[-1], key=attrgetter("end", "path")).path
-    with_messages = [bag.path for bag in order if bag.has_dates]
-    return next(reversed(with_messages or [bag.path for bag in order]), "")
+    return next(reversed(listed or [bag.path for bag in with_messages or order]), "")
 
 
-def _of_whole_hours(aged: frozenset[str], contents: DirContents, newest: str) -> frozenset[str]:
+def _hours(order: Sequence[StoredBag]) -> list[_Period]:
+    """Splits the bags in order where another hour begins, or a clock that was set back."""
+    hours: list[_Period] = []
+    for bag in order:
+        before = hours[-1][-1] if hours else None
+        if before is None or bag.hour != before.hour or bag.date < before.date:
+            hours.append([])
+        hours[-1].append(bag)
+    return hours
+
+
+def _of_whole_hours(
+    aged: frozenset[str], hours: Sequence[_Period], contents: DirContents, newest: str
+) -> frozenset[str]:
     """Returns the bags that are too old in hours of which all are, but for those that stay."""
     stays = aged | contents.needed | contents.unshipped | {newest}
-    young = {bag.hour for bag in contents.bags if bag.path not in stays}
-    return frozenset(bag.path for bag in contents.bags if bag.hour not in young) & aged
+    old = (hour for hour in hours if all(bag.path in stays for bag in hour))
+    return frozenset(bag.path for hour in old for bag in hour) & aged
 
 
-def _rest_of_hours(going: set[str], contents: DirContents, newest: str) -> set[str]:
+def _rest_of_hours(
+    going: set[str], hours: Sequence[_Period], contents: DirContents, newest: str
+) -> set[str]:
     """Returns the bags of the hours in which some go to make room, but for those that stay."""
-    hours = {bag.hour for bag in contents.bags if bag.path in going}
-    hours -= {bag.hour for bag in contents.bags if bag.path == newest}
-    rest = {bag.path for bag in contents.bags if bag.hour in hours}
-    return rest - contents.needed - contents.unshipped
+    paths = ({bag.path for bag in hour} for hour in hours)
+    rest = [hour for hour in paths if newest not in hour and not going.isdisjoint(hour)]
+    return set().union(*rest) - contents.needed - contents.unshipped
 
 
 class _Remaining:
@@ -292,12 +309,17 @@ def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> Di
     """Returns the contents without ages that contradict the order of the recordings.
 
     A bag whose date does, by its messages or else by its file, gets the newest date of the next
-    recording that has a right one; of the newest of all, if there is none.
+    recording that has a right one; of the newest of all, if there is none. If no bag has a right
+    one, all get those of their files first.
     """
+    believed = _credibly_dated(contents, limits)
+    if not believed:
+        contents = replace(contents, bags=[bag.dated(bag.written) for bag in contents.bags])
+        believed = _credibly_dated(contents, limits)
     if not contents.places:
         return contents
     newest: dict[str, Ns] = {}
-    for bag in _credibly_dated(contents, limits):
+    for bag in believed:
         newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
     names = sorted(contents.places, key=contents.places.__getitem__)
     since, least = {**contents.recorded_since}, MAX_NS
@@ -377,14 +399,18 @@ def _too_old_by_dates(
 
 
 def _oldest_first(
-    contents: DirContents, limits: RetentionLimits, present: _Period
+    contents: DirContents, dated: DirContents, limits: RetentionLimits, present: _Period
 ) -> list[StoredBag]:
-    """Sorts all bags, oldest first."""
-    odd = _outside_periods(contents.bags, present)
+    """Sorts all bags, oldest first; `dated` has them with consistent dates."""
+    odd = _outside_periods(dated.bags, present)
     keys = {bag.path: _file_time_key(bag, contents.now, limits) for bag in odd}
-    return sorted(
-        contents.bags, key=lambda bag: (*keys.get(bag.path, (bag.end, bag.end)), bag.path)
+    by_date = sorted(
+        dated.bags, key=lambda bag: (*keys.get(bag.path, (bag.end, bag.end)), bag.path)
     )
+    given, places = {bag.path: bag for bag in contents.bags}, contents.places
+    listed = (bag for bag in contents.bags if bag.recording in places)
+    recorded = iter(sorted(listed, key=lambda bag: (places[bag.recording], bag.date, bag.path)))
+    return [next(recorded) if bag.recording in places else given[bag.path] for bag in by_date]
 
 
 def _outside_periods(bags: Sequence[StoredBag], *periods: _Period) -> Sequence[StoredBag]:

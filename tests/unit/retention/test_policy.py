@@ -1,7 +1,8 @@
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -94,6 +95,20 @@ class TestAge:
         rest = [each for each in minutes if each.end // HOUR in hours and each.path in left]
         assert {each.path for each in rest} <= held.needed
 
+    def test_simulated_time_ages_by_the_files_while_the_system_clock_is_right(self) -> None:
+        runs = [
+            bag(f"b{ago}", 60 * S, written=NOW - ago * DAY, recording=f"r{ago}") for ago in DAYS
+        ]
+        places = {f"r{ago}": -ago for ago in DAYS}
+        assert names(expired(contents(*runs), LIMITS)) == ["b9", "b8"]
+        listed = replace(contents(*runs), places=places)
+        assert names(expired(listed, LIMITS)) == ["b9", "b8"]
+        assert expired(replace(listed, synchronised=False), LIMITS) == ()
+
+    def test_in_whole_hours_a_clock_that_begins_anew_does_not_keep_old_runs(self) -> None:
+        held = replace(anew(2 * HOUR, 2), recorded_since={"r0": 200 * HOUR}, synchronised=False)
+        assert names(by_hours(held, LIMITS).to_delete) == ["r0_0", "r0_1", "r0_2", "r0_3"]
+
     def test_a_future_date_has_no_newest_hour(self) -> None:
         ahead = bag("ahead", NOW + 900 * DAY)
         minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
@@ -101,7 +116,37 @@ class TestAge:
         assert "m0" not in names(by_hours(held, budget(200)).to_delete)
 
 
+DAYS = range(9, -1, -1)
+
+
+def anew(clock: int, runs: int, now: int = NOW) -> DirContents:
+    """Runs of four minutes, by a clock that begins at a time with each of them."""
+    bags = [
+        bag(f"r{run}_{n}", clock + n * 60 * S, recording=f"r{run}")
+        for run in range(runs)
+        for n in range(4)
+    ]
+    return replace(contents(*bags, now=now), places={f"r{run}": run for run in range(runs)})
+
+
 class TestBudget:
+    @pytest.mark.parametrize("clock", [2 * HOUR, NOW - 400 * DAY, NOW + 3 * DAY])
+    @pytest.mark.parametrize("deletes", [expired, lambda *given: by_hours(*given).to_delete])
+    def test_what_was_recorded_first_goes_first_whatever_its_clock_said(
+        self, clock: int, deletes: Callable[[DirContents, RetentionLimits], tuple[StoredBag, ...]]
+    ) -> None:
+        for now in (NOW, clock + 240 * S):
+            held = anew(clock, 3, now)
+            assert names(deletes(held, budget(80))) == ["r0_0", "r0_1", "r0_2", "r0_3"]
+            all_but_one = names(deletes(held, budget(0)))
+            assert all_but_one == [f"r{n // 4}_{n % 4}" for n in range(11)]
+
+    def test_after_a_clock_that_was_ahead_its_bags_go_before_later_ones(self) -> None:
+        ahead = bag("ahead", NOW + 3 * DAY, recording="r0")
+        right = [bag(f"m{ago}", NOW - ago * 60 * S, recording="r1") for ago in (2, 1, 0)]
+        held = replace(contents(ahead, *right), places={"r0": 0, "r1": 1})
+        assert names(expired(held, budget(20))) == ["ahead", "m2"]
+
     def test_bags_without_a_date_go_by_the_time_of_their_file(self) -> None:
         bags = [
             bag("b", 3 * HOUR, written=NOW - 5 * HOUR),
