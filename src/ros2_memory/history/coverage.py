@@ -106,6 +106,7 @@ def note_unread(
         view.notes.add(
             *describe_deleted(view, window),
             *(f"{of}{sentence}" for sentence in describe_lost(bag_dir, window)),
+            *(f"{of}{sentence}" for sentence in describe_cut(bag_dir, window)),
             *describe_excluded(bag_dir, window),
         )
     if (nothing or search) and _are_losses_hidden(bag_dir):
@@ -132,16 +133,27 @@ def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
         )
 
 
-def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence for each way in which messages of a window are known to be missing."""
-    losses = read_losses(bag_dir, window.start, window.stop)
-    for what, *by in (
-        ("lost before {they} recorded", "counter", "rosbag2"),
-        # A publisher that skipped one leaves the same mark as a loss.
-        ("missing by the cadence of header stamps (never published, or lost)", "stamps"),
-        ("deleted by request", "forgotten"),
-        ("deleted by retention (retention.topics)", "expired"),
-    ):
+_LOST: Final = (
+    ("lost before {they} recorded", ("counter", "rosbag2")),
+    # A publisher that skipped one leaves the same mark as a loss.
+    ("missing by the cadence of header stamps (never published, or lost)", ("stamps",)),
+)
+_CUT: Final = (
+    ("deleted by request", ("forgotten",)),
+    ("deleted by retention (retention.topics)", ("expired",)),
+)
+
+
+def describe_cut(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence for each reason for which messages of a window were cut out of bags."""
+    return _counted_losses(read_losses(bag_dir, window.start, window.stop), _CUT)
+
+
+def _counted_losses(
+    losses: Iterable[Loss], kinds: Iterable[tuple[str, Collection[str]]]
+) -> Iterator[str]:
+    """Yields how many messages of which topics some kinds of losses have."""
+    for what, by in kinds:
         topics = Counter[str]()
         for loss in losses:
             if loss.by in by:
@@ -152,6 +164,12 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
             lost = topics.total()
             they = "it was" if lost == 1 else "they were"
             yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
+
+
+def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence for each way in which messages of a window are known to be missing."""
+    losses = read_losses(bag_dir, window.start, window.stop)
+    yield from _counted_losses(losses, _LOST)
     refused = defaultdict[str, Spans](list)
     for loss in losses:
         if loss.by == "refused":

@@ -16,6 +16,7 @@ from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     cut_spans,
     deleted_between,
+    describe_cut,
     describe_excluded,
     describe_gaps,
     describe_lost,
@@ -117,6 +118,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *filter(None, (*notes, describe_leaving(memory.index.bag_dir))),
             *mixed,
             *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
+            *describe_cut(memory.index.bag_dir, TimeWindow.everything()),
         ),
     )
 

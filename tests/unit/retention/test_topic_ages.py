@@ -103,6 +103,10 @@ def test_answers_say_that_it_was_deleted_and_count_it(bag_dir: Path) -> None:
     assert "10 messages deleted by retention (retention.topics): /speech (10)" in old["notes"]
     assert reply_over(bag_dir, "get_position_at", timestamp=start + 5)["x"] == 5.0
     assert len(young["samples"]) == 10
+    # What a setting has deleted is no loss.
+    status = reply_over(bag_dir, "memory_status")
+    assert "deleted" not in status["doubts"]
+    assert "20 messages deleted by retention (retention.topics): /speech (20)" in status["notes"]
 
 
 def test_a_topic_of_which_all_messages_were_deleted_is_not_said_to_be_unrecorded(
