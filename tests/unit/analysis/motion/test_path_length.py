@@ -54,7 +54,7 @@ def driven(positions: Iterable[Vector3 | list[float]], hertz: float = 1.0) -> Po
     st.sampled_from([line, arc]),
     st.sampled_from([0.0, 0.005]),
 )
-def test_other_cuts_of_a_history_differ_by_half_a_percent_at_most_and_without_noise_not_at_all(
+def test_other_cuts_of_a_history_differ_by_a_percent_at_most_and_without_noise_not_at_all(
     hertz: int, speed: float, count: int, seed: int, shape: Callable[..., Points], noise_m: float
 ) -> None:
     places = noisy(shape(speed, hertz, 60), noise_m, seed)
@@ -62,7 +62,7 @@ def test_other_cuts_of_a_history_differ_by_half_a_percent_at_most_and_without_no
     cuts = np.random.default_rng(seed).choice(len(places), count, replace=False).tolist()
     whole, parts = (way_of(poses, 10.0, each).trajectory().totals for each in (None, sorted(cuts)))
     exact = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-    expected, off = (whole.distance_m, 0.005) if noise_m else (exact, 1e-9)
+    expected, off = (whole.distance_m, 0.01) if noise_m else (exact, 1e-9)
     assert parts.distance_m == pytest.approx(expected, rel=off)
 
 
