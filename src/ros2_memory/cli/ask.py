@@ -24,6 +24,7 @@ from ros2_memory.cli.options import (
     parse_duration,
     parse_time,
     present_time,
+    with_date,
 )
 from ros2_memory.cli.output import print_line, print_reply, spinner, with_shorter_lists
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -200,8 +201,9 @@ def _with_parsed_times(value: object, schema: object, now: float) -> object:
         seconds = parse_duration(value)
         return value if seconds is None else seconds
     if isinstance(value, str) and kind == [*TIME_KINDS]:
+        value = with_date(value, now)
         try:
-            unix_from_text(value)  # the tool knows whether all of its last decimal counts
+            unix_from_text(value)  # the tool knows how long it lasts: a day, a minute, a second
         except ValueError:
             return parse_time(value, now)
     return value

@@ -350,11 +350,7 @@ def parse_time(text: str, now: float) -> float:
     if ago is not None:
         return now - ago
     with suppress(ValueError, OverflowError, OSError):
-        if clock := _TIME_OF_DAY.fullmatch(words):
-            midnight = datetime.fromtimestamp(now).astimezone().date()
-            date = midnight - timedelta(days=clock[1] == "yesterday")
-            return unix_from_text(f"{date}T{clock[2] or '00:00'}")
-        return unix_from_text(text)
+        return unix_from_text(with_date(text, now))
     raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}")
 
 
@@ -364,10 +360,20 @@ def parse_end(text: str, now: float, start: float) -> float:
     Raises:
         InvalidArgumentsError: the text is no time.
     """
-    end = parse_time(text, now)
-    if text.strip().lower() in {"today", "yesterday"}:
-        text = datetime.fromtimestamp(end).astimezone().date().isoformat()
-    return window_end_s(text, end, start)
+    return window_end_s(with_date(text, now), parse_time(text, now), start)
+
+
+def with_date(text: str, now: float) -> str:
+    """Returns `today`, `yesterday`, or a time of day, as ISO 8601; any other text as it is.
+
+    `now`, in Unix seconds, is what they count from.
+    """
+    clock = _TIME_OF_DAY.fullmatch(text.strip().lower())
+    if clock is None:
+        return text
+    today = datetime.fromtimestamp(now).astimezone().date()
+    date = today - timedelta(days=clock[1] == "yesterday")
+    return f"{date}T{clock[2]}" if clock[2] else date.isoformat()
 
 
 def newest_day(memory: "Memory") -> TimeWindow:

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from datetime import datetime
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
@@ -317,6 +318,15 @@ def test_tools_take_a_path_before_them_and_times_in_words(exits: Program) -> Non
     reply = exits(0, "ask recap b --json").json
     assert reply["start"] <= T0 / NS_PER_S + 100 < reply["end"]
     assert reply["end"] - reply["start"] >= 23 * 3600
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_window_of_a_day_or_a_minute_in_words_is_all_of_it(exits: Program) -> None:
+    minute = datetime.fromtimestamp(T0 / NS_PER_S + 100).astimezone().strftime("%H:%M")
+    for words in ("today", minute, f"'today {minute}'"):
+        told = exits(0, f"ask get_topic_in_range b --json topic=/odom start={words} end={words}")
+        assert told.json["total"] == 4
+        assert len(exits(0, f"cat /odom b --json --start {words} --end {words}").out.split()) >= 4
 
 
 @pytest.mark.parametrize(
