@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,15 +13,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
-from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import BagContradictionError, BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
-from ros2_memory.insights.sightings import find_matches
-from ros2_memory.results import Match
 from ros2_memory.storage.base import BagReader, Batch, Channel, Record, Schema
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import UnreadableError, reading
@@ -34,7 +30,7 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, boolean, definition, odom, text, write_mcap
 from tests.support.examples import examples
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, damaged, spoil_chunk
-from tests.support.memories import memory_of, with_store
+from tests.support.memories import asked, memory_of, with_store
 
 S = 10**9
 
@@ -89,23 +85,24 @@ def overlapping(folder: Path) -> Memory:
     return memory_of(folder)
 
 
-def asked(memory: Memory, pattern: str, wanted: str) -> Match:
-    return queries.find_last_match(memory, Call(), pattern, "contains", wanted)
-
-
-def test_a_chunk_damaged_before_the_match_is_reported_neither_with_a_catalogue_nor_without(
-    tmp_path: Path,
-) -> None:
-    """What overlaps has the search look further back for copies than it was asked to."""
+def test_a_damaged_chunk_is_reported_where_what_is_asked_may_be_in_it(tmp_path: Path) -> None:
+    """What overlaps has a search look further back for copies than it was asked to."""
     plain = overlapping(tmp_path)
-    found = queries.find_last_match(plain, Call(), "/*", "contains", "person", before_s=10.0)
-    assert found.found is not None
-    assert not any("could not be read" in note for note in found.notes)
     recalled = with_store(plain, tmp_path)
-    again = queries.find_last_match(recalled, Call(), "/*", "contains", "person", before_s=10.0)
-    assert repr(again) == repr(found)
-    # A query of what may be in it reports it.
-    assert "a_0.mcap could not be read whole" in asked(plain, "/*", "hello").notes[0]
+
+    def is_noted(tool: str, value: str = "person", **given: float) -> bool:
+        asks = {"topic": "/*", "condition_type": "contains", "value": value, **given}
+        reply, again = (asked(each, tmp_path, tool, **asks) for each in (plain, recalled))
+        assert reply == again
+        return "a_0.mcap could not be read whole" in str(reply.get("notes"))
+
+    assert not is_noted("find_last_match", before=10)
+    assert is_noted("find_last_match", "hello")
+    assert not is_noted("find_matches", start=2)
+    assert is_noted("find_matches", start=0.5)
+    assert is_noted("find_matches", limit=5)
+    assert is_noted("find_matches", end=10, limit=5)
+    assert not is_noted("find_matches", limit=1)
 
 
 def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported(
@@ -119,10 +116,10 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported
     write_mcap(tmp_path / "b" / "b_0.mcap", [again], LATCHED)
     plain = memory_of(tmp_path)
     for memory in (plain, with_store(plain, tmp_path)):
-        found = asked(memory, "/dock", "docked")
-        assert found.found is not None
-        assert found.found.sample.time == 100 * S
-        assert "a_0.mcap could not be read whole" in found.notes[0]
+        asks = {"topic": "/dock", "condition_type": "contains", "value": "docked"}
+        found = asked(memory, tmp_path, "find_last_match", **asks)
+        assert found["timestamp"] == 100
+        assert "a_0.mcap could not be read whole" in found["notes"][0]
 
 
 @pytest.mark.parametrize("newest_first", [False, True])
@@ -136,21 +133,6 @@ def test_what_is_read_for_copies_alone_is_not_reported_when_it_is_damaged(
     assert view.notes.sentences() == ()
     list(view.stream.messages(["/chatter"], TimeWindow(S, 4 * S), newest_first=newest_first))
     assert len(view.notes.sentences()) == 1
-
-
-def test_sightings_report_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
-    memory = overlapping(tmp_path)
-    for each in (memory, with_store(memory, tmp_path)):
-
-        def is_damage_noted(memory: Memory = each, **given: Any) -> bool:
-            notes = find_matches(memory, Call(), "/*", "contains", "person", **given).notes
-            return any("a_0.mcap could not be read whole" in note for note in notes)
-
-        assert not is_damage_noted(start_s=2.0)
-        assert is_damage_noted(start_s=0.5)
-        assert is_damage_noted(limit=5)
-        assert is_damage_noted(end_s=10.0, limit=5)
-        assert not is_damage_noted(limit=1)
 
 
 def test_a_bag_that_pauses_and_one_whose_chunks_overlap_are_read_by_their_indexes(
