@@ -13,6 +13,7 @@ from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
+from ros2_memory.serving.page.drawn_path import Box, line_in_box
 from tests.support.bags import (
     Msg,
     header,
@@ -203,6 +204,32 @@ def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_pa
     assert (reply["timestamp"], reply["x"]) == (T0_S + 20, 21.0)
     refused = ask(tmp_path, False, "get_velocity_at", timestamp=T0_S + 1)["detail"]
     assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
+
+
+@each_way
+def test_transforms_place_the_robot_where_the_setting_chooses_them(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Though a topic has poses, as of wheels that slip."""
+    slipping = [odom(T0 + n * S // 10, n / 5, 0.0, 0.0) for n in range(100)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*moved(range(100)), *slipping])
+    memory = memory_of(tmp_path, limits=QuerySettings(pose_topic="/tf"), recalls=recalls)
+    whole = {"start": T0_S, "end": T0_S + 10}
+    for tool, given in (
+        ("visits", {"x": 4.0, "y": 0.0, "radius_m": 1.0}),
+        ("recap", whole),
+        ("trajectory_summary", {**whole, "frame_id": "map"}),
+        ("get_position_at", {"timestamp": T0_S + 5, "frame_id": "map"}),
+    ):
+        reply = asked(memory, tmp_path, tool, **given)
+        assert reply["frame_id"] == "map"
+        assert "by transforms, of base_link" in reply["notes"]
+        assert reply.get("distance_m", 9.9) == pytest.approx(9.9)
+        assert reply.get("x") in {None, 4.0, 6.0}
+        assert reply.get("minutes", 0.03) == 0.03
+    everywhere = Box(-math.inf, -math.inf, math.inf, math.inf, 0.001)
+    _, line, _ = line_in_box(memory, Call(), TimeWindow(T0, T0 + 10 * S), everywhere)
+    assert (line.x[0], line.x[-1]) == pytest.approx((1.0, 10.9))
 
 
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:

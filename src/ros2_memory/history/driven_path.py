@@ -403,8 +403,11 @@ def body_of(view: View, topic: str) -> Body | None:
 
 
 def body_by_transforms(view: View) -> Body | None:
-    """Returns the robot's body where transforms alone show it; None where a topic has its poses."""
-    return None if view.has_poses else robot_body(view)
+    """Returns the robot's body where transforms place it; None where a topic of poses does.
+
+    They do where no topic has its poses, or where `data.pose_topic` is one of transforms.
+    """
+    return body_of(view, view.pose_topic) or (None if view.has_poses else robot_body(view))
 
 
 def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = False) -> str:
@@ -416,6 +419,8 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
         NoDataError: as for `resolve_pose_topic`.
     """
     topics = view.moving_topics
+    if name is None and view.pose_topic in topics:
+        name = view.pose_topic
     body, why = None, ""
     if name is None:
         body, why = body_by_transforms(view), ": no topic has the robot's poses"
@@ -490,11 +495,18 @@ def _poses_of_body(view: View, window: TimeWindow, body: Body) -> Poses:
     """Returns the poses of the body in a window, by the transforms of all sessions."""
     bags = view.stream.overlapping_bags(view.moving_topics, window)
     sessions = dict.fromkeys(view.sessions.of(span.bag.recording) for span in bags)
-    poses = joined_poses([_poses_by_session(view, window, each, body) for each in sessions])
+    poses = joined_poses([poses_by_session(view, window, each, body) for each in sessions])
     return poses.rows(_apart(poses.times))
 
 
-def _poses_by_session(view: View, window: TimeWindow, session: Session, body: Body) -> Poses:
+def poses_by_session(view: View, window: TimeWindow, session: Session, body: Body) -> Poses:
+    """Returns the poses of the body in a window, by the transforms of a session, in order of time.
+
+    In the frame of its odometry; none where no transforms lead there.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
     scanned = chain.from_iterable(scan(view, topic, window) for topic in view.moving_topics)
     edges = joined_edges([edges_of_rows(view, rows, session) for rows in scanned])
     poses = placed_body(

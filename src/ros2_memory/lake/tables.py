@@ -55,7 +55,7 @@ _PLAIN: Final = 1
 _PLACED: Final = 2
 _HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 36
+ROWS_VERSION: Final = 37
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")

@@ -12,6 +12,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -34,6 +35,7 @@ from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
+from ros2_memory.history.driven_path import Body, body_by_transforms, poses_by_session
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import messages_of, scan
 from ros2_memory.history.transforms import frames_over
@@ -79,6 +81,11 @@ class Placer:
         self._sessions = view.sessions
         self.rows = DetectionRows(view)
 
+    @cached_property
+    def body(self) -> Body | None:
+        """The robot's body where transforms place it; None where a topic of poses does."""
+        return body_by_transforms(self._view)
+
     def placed(
         self,
         window: TimeWindow,
@@ -104,7 +111,7 @@ class Placer:
         detected, detectors = self._detected(units, window.start)
         if not detected:
             return None
-        poses = self._poses(session, window)
+        poses = self._poses(session, lender, window)
         target, frames = self._frames(lender, window, poses)
         sights = [
             _sights_of(topic, messages, frames, _robot_at(poses, messages, frames))
@@ -126,7 +133,7 @@ class Placer:
 
         Takes what `placed` takes. Where the robot was is not in them.
         """
-        target, frames = self._frames(lender, window, self._poses(session, window))
+        target, frames = self._frames(lender, window, self._poses(session, lender, window))
         for bag, units in units_of_bags.items():
             for topic, messages in self._detected(units, window.start)[0].items():
                 if messages.found.rows.size:
@@ -153,20 +160,13 @@ class Placer:
                 detectors |= {topic} if is_named or messages.found.rows.size else set()
         return detected, detectors
 
-    def _poses(self, session: Session, window: TimeWindow) -> Poses:
+    def _poses(self, session: Session, lender: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
-        failures: list[UndecodableError] = []
-        units = pose_rows(
-            self._view,
-            self._view.pose_topic,
-            window.widened(2 * _NEAR_NS),
-            failures,
-            among=lambda recording: self._sessions.of(recording) == session,
-        )
-        try:
-            poses = joined_poses([unit.poses for unit in units])
-        except InvalidArgumentsError:  # the topic is of no poses
-            return NO_POSES
+        around = window.widened(2 * _NEAR_NS)
+        if self.body is None:
+            poses = self._recorded_poses(session, around)
+        else:
+            poses = poses_by_session(self._view, around, lender, self.body)
         if not len(poses):
             return poses
         # Poses of one topic nearly always have one frame: those of others are left out.
@@ -175,6 +175,21 @@ class Placer:
         poses = poses.rows(np.flatnonzero((poses.frames.codes == frame) & is_place))
         codes, words = poses.frames.codes * 0, poses.frames.words[frame : frame + 1]
         return replace(poses, frames=poses.frames._replace(codes=codes, words=words))
+
+    def _recorded_poses(self, session: Session, window: TimeWindow) -> Poses:
+        """Returns the poses of the robot's topic that a session has in a window."""
+        failures: list[UndecodableError] = []
+        units = pose_rows(
+            self._view,
+            self._view.pose_topic,
+            window,
+            failures,
+            among=lambda recording: self._sessions.of(recording) == session,
+        )
+        try:
+            return joined_poses([unit.poses for unit in units])
+        except InvalidArgumentsError:  # the topic is of no poses
+            return NO_POSES
 
     def _frames(self, lender: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
         """Returns the frame to place all in (the map if transforms lead there), and the frames."""

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 
-VERSION: Final = 7
+VERSION: Final = 8
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS
@@ -447,9 +447,9 @@ class Watching:
             )
             for session, lender, slices in around.sessions
         ]
-        limits = self._view.limits
-
-        settings = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
+        limits, body = self._view.limits, self._placer.body
+        placed_by = body or self._view.pose_topic
+        settings = (limits.map_frame, placed_by, limits.tf_topics, limits.tf_clock)
         return _hashed((VERSION, settings, transforms, sessions))
 
     def _read(self, around: _Surroundings) -> Seen:

@@ -16,7 +16,7 @@ from ros2_memory.core.text import abbreviate
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.things import unseen
 from tests.support.bags import Msg, detected, odom, text, tf, transform, write_splits
-from tests.support.memories import asked, memory_of, replied
+from tests.support.memories import asked, each_way, memory_of, replied
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -83,6 +83,39 @@ def told_of(bag_dir: Path, messages: Sequence[Msg], **given: Any) -> Any:
     """The reply about what is seen in some messages."""
     write_splits(bag_dir, messages)
     return ask(bag_dir, **given)
+
+
+@each_way
+@pytest.mark.parametrize("map_off", [None, 0.0, 0.6], ids=["no map", "map", "map jumps"])
+def test_things_of_a_robot_that_transforms_place_are_those_by_its_poses(
+    tmp_path: Path, recalls: bool, map_off: float | None
+) -> None:
+    """Whether no topic has its poses, or `data.pose_topic` is that of the transforms."""
+    more: dict[str, Any] = {"in_map": map_off is not None}
+    cup, fork, later = ("cup", 3.0, 0.0), ("fork", 3.0, -1.0), ("cup", 4.0, 1.0)
+    messages = [
+        *looked(0, 60, HERE, cup, fork, **more),
+        *looked(60, 120, AWAY, **more),
+        *looked(120, 180, HERE, later, **more, map_off=map_off or 0.0),
+    ]
+    without_poses = [message for message in messages if message.topic != "/odom"]
+    replies = []
+    for name, topic, of_robot in (
+        ("poses", "/odom", messages),
+        ("alone", "/odom", without_poses),
+        ("chosen", "/tf", messages),
+    ):
+        write_splits(tmp_path / name, of_robot)
+        limits = QuerySettings(pose_topic=topic)
+        memory = memory_of(tmp_path / name, limits=limits, recalls=recalls)
+        found = asked(memory, tmp_path / name, "find_things")
+        windows = {"start": BEGIN, "end": BEGIN + 60, "with_start": BEGIN + 120}
+        asked_of = {**windows, "with_end": BEGIN + 180}
+        compared = asked(memory, tmp_path / name, "compare", **asked_of)
+        replies.append((found, compared["frame_id"], compared["things"]))
+    assert replies[0][0]["total"] > 1
+    assert replies[0][0]["frame_id"] == ("odom" if map_off is None else "map")
+    assert replies[1] == replies[2] == replies[0]
 
 
 CUP_AS_JSON = json.dumps(
