@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Annotated, Final
 
 import anyio
@@ -30,8 +31,8 @@ from ros2_memory.cli.output import print_line, print_reply, spinner, with_shorte
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
-from ros2_memory.core.timebase import unix_from_ns, unix_from_text
-from ros2_memory.history.context import Memory, QuerySettings
+from ros2_memory.core.timebase import Deadline, unix_from_ns, unix_from_text
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.arguments import TIME_KINDS
 from ros2_memory.tools.build import build_tools
@@ -114,10 +115,15 @@ def ask(
             print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
         return False
     # A folder that is not there may stand before the tool.
-    tools = {tool.name for tool in dispatcher.tools}
+    tools = {tool.name: tool.arguments for tool in dispatcher.tools}
     name = next((word for word in asked if word in tools), asked[0])
     rest = [word for word in asked if word and word != name]
     with spinner(f"asking {name}"):
+        if fleet is not None:
+            with suppress(InvalidArgumentsError):  # the tool refuses them
+                robot = parse_arguments(rest, tools.get(name, {})).get("robot")
+                call = Call(Deadline.after(loaded.server.call_timeout_s))
+                memory = fleet.newest(robot, call) or memory
         reply = answer_to(dispatcher, memory, name, rest)
     answer: JsonValue = json.loads(reply.text)
     if as_json:

@@ -8,6 +8,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
@@ -232,6 +233,21 @@ class Fleet:
             return self.allowed(call)
         names = named.split(",") if isinstance(named, str) else [named]
         return [*dict.fromkeys([self.named(name, call) for name in names])]
+
+    def newest(self, named: object, call: Call) -> Memory | None:
+        """Returns the memory with the newest data of the robots of `chosen`; None if none answers.
+
+        Raises as `named`.
+        """
+
+        def dated(robot: Robot, own: Call) -> tuple[Ns, Memory]:
+            return robot.asked(
+                lambda memory, _: (memory.index.snapshot().dating.latest or MIN_NS, memory), own
+            )[0]
+
+        answers = FanOut().ask(self.chosen(named, call), dated, call).values()
+        dates = [answer for answer in answers if isinstance(answer, tuple)]
+        return max(dates, key=itemgetter(0))[1] if dates else None
 
 
 def there_are(robots: Iterable[Robot]) -> str:

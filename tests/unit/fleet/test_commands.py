@@ -41,3 +41,17 @@ def test_what_looks_at_one_robot_asks_which(robots: str, tmp_path: Path, exits: 
 
 def test_ask_reports_no_other_folder(robots: str, exits: Program) -> None:
     assert not exits(0, "ask list_frames robot=r1", robots).err
+
+
+@pytest.mark.parametrize("robot", [["robot=r1"], ["robot=r1, away"], []])
+def test_ask_counts_times_from_the_newest_data_of_the_robots_asked(
+    robots: str, exits: Program, robot: list[str]
+) -> None:
+    words = [robots, "data.now=latest", *robot]
+    for recap in ("ask recap --json", "ask recap --json start=10s end=now"):
+        told = exits(0, recap, *words).json
+        rows = [row for row in told.get("robots", [told]) if row.get("robot_name") != "away"]
+        assert [row["distance_m"] > 0 for row in rows] == [True]
+    if robot == ["robot=r1"]:
+        at = exits(0, "ask get_position_at --json timestamp=10s", *words).json
+        assert at["timestamp"] == seeded("r1").end_s - 10
