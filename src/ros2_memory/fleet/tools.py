@@ -435,7 +435,8 @@ def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) ->
                 named = {ROBOT_NAME: reply.name, **row}
                 order.append((reply.is_ahead, at if page.oldest_first else -at, key, named))
     order.sort(key=itemgetter(0, 1))
-    shown = order[: page.limit]
+    # Of one robot every named place is listed, whatever the limit of visits is.
+    shown = order if keys == ["places"] else order[: page.limit]
     rows: JsonObject = {key: [row for *_, of, row in shown if of == key] for key in keys}
     if keys == [MATCHES]:
         never = [reply.name for reply in replies if reply.value is None]

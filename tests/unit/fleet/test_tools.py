@@ -337,6 +337,17 @@ def test_a_place_is_that_of_each_robots_own_map(folder: Path) -> None:
     assert any(note.startswith("no answer of r3: ") for note in found["notes"])
 
 
+def test_every_named_place_of_every_robot_is_listed(folder: Path) -> None:
+    places = tuple(Place(f"place {n}", "map", Circle(n, 2.0, 1.0)) for n in range(6))
+    robots = [
+        Robot(name, folder / name, fleet_memory(folder / name, QuerySettings(places=places)))
+        for name in NAMES
+    ]
+    found = reply(Fleet(robots, FixedClock(NOW)), "visits", {})
+    assert len(found["places"]) == len(places) * len(NAMES)
+    assert "more" not in found
+
+
 def test_where_nobody_has_an_answer_the_reason_is_that_of_all(fleet: Fleet) -> None:
     found = reply(fleet, "find_matches", MUG | {"topic": "/none"})
     assert (found["error"], found["reason"]) == ("no_data", "topic_not_recorded")
