@@ -253,7 +253,8 @@ class Call:
     Attributes:
         used_active: whether the answer is partly from a bag that is still being written.
         used_thinned: whether it is partly from a day of which only some messages stayed.
-        asked: what the question is about, where that is known: the rest does not count for that.
+        asked: the times that the question is about, where these are known: the rest does not count
+            for that.
         robots: those of a fleet that it may ask about; None for all.
         rows_in: rows that end outside of it are dropped by who asks, so they may be left out; they
             count all the same. None for all.
@@ -267,7 +268,7 @@ class Call:
     stages: Stages = field(default_factory=Stages)
     used_active: bool = False
     used_thinned: bool = False
-    asked: TimeWindow | None = None
+    asked: tuple[TimeWindow, ...] = ()
     robots: frozenset[str] | None = None
     rows_in: TimeWindow | None = None
     now: Ns | None = None
@@ -283,7 +284,9 @@ class Call:
 
     def note_thinned(self, first: Ns, last: Ns) -> None:
         """Records that messages between two log times are from a thinned day."""
-        self.used_thinned |= self.asked is None or self.asked.overlaps(first, last)
+        self.used_thinned |= not self.asked or any(
+            window.overlaps(first, last) for window in self.asked
+        )
 
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row that ends then may not be left out."""

@@ -122,9 +122,10 @@ class View:
 
     def note_thinned(self, window: TimeWindow) -> None:
         """Records that what was read lies in a window, where that is partly in thinned days."""
-        part = window if self.call.asked is None else window.intersect(self.call.asked)
-        if not part.empty and overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1):
-            self.call.used_thinned = True
+        for part in map(window.intersect, self.call.asked or (window,)):
+            if not part.empty:
+                thinned = overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1)
+                self.call.used_thinned |= thinned
 
     def gaps(self, window: TimeWindow, *, around: bool = False) -> Sequence[Span]:
         """Returns the gaps of the snapshot that a window overlaps, without steps of the clock.
@@ -233,7 +234,7 @@ def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, N
         view, now = _open_now(memory, call, ago)
         at = MIN_NS if ago == MAX_NS else now - ago
     if at > MIN_NS:
-        call.asked = TimeWindow.around(at, THINNED_NS)
+        call.asked = (TimeWindow.around(at, THINNED_NS),)
         return view, at, now
     earliest = view.snapshot.earliest
     begins = "" if earliest is None else f"; the memory begins at {unix_text(earliest)}"
@@ -254,14 +255,15 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
         if length <= 0:
             raise InvalidArgumentsError("seconds must be more than 0: the length of the window")
         view, now = _open_now(memory, call, 0)
-        call.asked = clamped(view, last_window(now, length))
-        return view, call.asked
-    if span.start_s is None or span.end_s is None:
-        raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
-    window = TimeWindow.from_unix(span.start_s, span.end_s)
-    view = open_view(memory, call, window.stop)
-    call.asked = clamped(view, window)
-    return view, call.asked
+        window = last_window(now, length)
+    else:
+        if span.start_s is None or span.end_s is None:
+            raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
+        window = TimeWindow.from_unix(span.start_s, span.end_s)
+        view = open_view(memory, call, window.stop)
+    window = clamped(view, window)
+    call.asked = (window,)
+    return view, window
 
 
 def last_window(now: Ns, length: Ns) -> TimeWindow:

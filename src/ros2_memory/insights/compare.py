@@ -116,7 +116,7 @@ def compare(
         if gap_around(view, window) is not None:
             note_unrecorded(view, window)
             unlisted[nth] = None
-    windows = clamped(view, asked), clamped(view, other)
+    windows = call.asked = clamped(view, asked), clamped(view, other)
     frame, things = _compare_things(view, windows, region)
     drives = [drive_in(view, window) for window in windows]
     elapsed = [drive.elapsed for drive in drives]

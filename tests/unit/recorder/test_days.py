@@ -478,6 +478,10 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
         note for note in reply["notes"] if "it was within x 150.00 to 150.25 and y 1.00" in note
     ]
     assert "from" not in reply_over(bag_dir, "get_position_at", timestamp=T0_S + 3000)
+    later = {"start": T0_S + 3000, "end": T0_S + 3030}
+    for start, is_thinned in ((600, True), (3030, False)):
+        other = {"with_start": T0_S + start, "with_end": T0_S + start + 30}
+        assert ("from" in reply_over(bag_dir, "compare", **later, **other)) is is_thinned
     whole = reply_over(bag_dir, "get_topic_at_time", topic="/battery_state", timestamp=T0_S + 604.5)
     assert (whole["error"], whole["reason"]) == ("no_data", "deleted")
 
