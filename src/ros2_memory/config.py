@@ -183,6 +183,12 @@ def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[s
     return labels
 
 
+def _engine_chosen(engine: object) -> object:
+    if isinstance(engine, dict) and "_target_" not in engine:
+        raise ValueError("must go with lake=duckdb: choose that, too, or leave this out")
+    return engine
+
+
 def _listed(value: object) -> object:
     """Takes one path for a list of one."""
     return [value] if isinstance(value, str) and value else value
@@ -492,7 +498,7 @@ class LakeSettings:
     Secrets are in a file of their own, or where the store's own client looks for them (AWS_*).
     """
 
-    engine: DuckdbNode | None
+    engine: Annotated[DuckdbNode | None, BeforeValidator(_engine_chosen)]
     warehouse: Annotated[Text, AfterValidator(_without_password)] | None
     catalog: Literal["sql", "rest"]
     uri: Annotated[Text, AfterValidator(_without_password)] | None

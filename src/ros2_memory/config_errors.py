@@ -45,10 +45,12 @@ _RULES: Final = {
 }
 
 
-_NOT_RECORDING: Final = (
-    "recorder=none records nothing, so it is not allowed; leave it out, or choose what records: "
-    "unset MEMORY_DEPLOYMENT if it is replay or query_only"
-)
+_WITHOUT_KEYS: Final = {
+    "recorder": "recorder=none records nothing, so it is not allowed; leave it out, or choose what "
+    "records: unset MEMORY_DEPLOYMENT if it is replay or query_only",
+    "storage": "storage=mcap has no such setting; leave it out, or choose storage=rosbag2",
+}
+"""By section, what is said of a key where the chosen adapter has none."""
 
 
 class OpenSecretError(ValueError):
@@ -135,9 +137,9 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
     kind, context = fault["type"], fault.get("ctx", {})
     if kind == "unexpected_keyword_argument":
         keys = _known_keys(model, fault, nodes)
-        is_recorder = key.startswith("recorder.") and keys == ["_target_"]
-        wrong = _NOT_RECORDING if is_recorder else f"unknown key; use one of: {', '.join(keys)}"
-        return f"{key}: {wrong}"
+        known = f"unknown key; use one of: {', '.join(keys)}"
+        has_none = keys == ["_target_"]
+        return f"{key}: {_WITHOUT_KEYS[key.partition('.')[0]] if has_none else known}"
     if kind in {"missing", "union_tag_not_found"}:
         return f"{key}: missing; give it a value"
     if kind in {"dataclass_type", "model_attributes_type", "dict_type"}:

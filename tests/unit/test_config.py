@@ -259,7 +259,8 @@ class TestRefusals:
         [
             ("datas.now=wall", ["datas: unknown key", "recording, data, reader"]),
             ("data.nwo=wall", ["data.nwo: unknown key", "now, tf_clock"]),
-            ("storage.cache=1", ["storage.cache: unknown key; use one of: _target_ ("]),
+            ("storage.cache=1", ["storage.cache: storage=mcap has no such", "rosbag2"]),
+            ("lake.engine.memory_mb=512", ["lake.engine: ", "choose that", "on the command line"]),
             ("~data.now", ["data.now: missing"]),
             ("~nothing", ["'nothing' does not exist"]),
             ("server=3", ["server: 3 is not allowed", "must hold keys"]),
