@@ -65,6 +65,8 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 EXIT_CODE: Final = 2
+_MOST: Final = 10**9
+"""The largest number: in seconds a thread can wait so long, in GB a file system counts so far."""
 _SECRET_WORDS: Final = ("secret", "password", "token", "credential", "access-key", "key-id", "auth")
 """Settings of pyiceberg with one of these in their name are not shown, so not given openly."""
 
@@ -197,11 +199,11 @@ def _listed(value: object) -> object:
 Text: TypeAlias = Annotated[str, Field(strict=True, min_length=1)]
 Flag: TypeAlias = Annotated[bool, Field(strict=True)]
 Metres: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
-Count: TypeAlias = Annotated[int, Field(strict=True, gt=0)]
+Count: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=_MOST)]
 Mebibytes: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=1024)]
 Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
-Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
-Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, le=_MOST, allow_inf_nan=False)]
+Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=_MOST, allow_inf_nan=False)]
 Span: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=3600)]
 AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
 Folder: TypeAlias = Annotated[AnyPath, AfterValidator(_existing_folder)]
@@ -471,7 +473,7 @@ class Ros2BagNode(AdapterNode):
     target: Literal["ros2_memory.recorder.ros2bag.Ros2BagRecorder"] = Field(alias="_target_")
     setup_files: Annotated[tuple[AnyPath, ...], BeforeValidator(_listed)]
     repeat_latched: tuple[Text, ...]
-    chunk_bytes: Annotated[int, Field(strict=True, ge=1024)]
+    chunk_bytes: Annotated[int, Field(strict=True, ge=1024, le=_MOST)]
 
 
 @section

@@ -244,7 +244,7 @@ def _kind(schema: Mapping[str, Any]) -> str:
             ("maximum", "≤"),
             ("exclusiveMaximum", "<"),
         )
-        if key in schema
+        if key in schema and schema[key] != 10**9  # of all
     ]
     return " ".join([kind, *bounds])
 

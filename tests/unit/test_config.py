@@ -4,7 +4,7 @@ import dataclasses
 import re
 import shutil
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,9 +18,11 @@ from ros2_memory.config import (
     load_labels,
     load_message_schemas,
     load_settings,
+    plain_values,
 )
 from ros2_memory.config_sources import Sources
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.reply import JsonObject
 from tests.support.examples import examples
 from tests.support.fleets import reply
 from tests.support.robot_run import write_run
@@ -254,6 +256,20 @@ class TestAdapters:
 
 
 class TestRefusals:
+    @pytest.mark.parametrize("number", ["1e305", f"1{'0' * 400}"])
+    def test_no_number_is_too_large_for_nanoseconds(self, number: str) -> None:
+        def numbers(values: JsonObject, above: str = "") -> Iterator[str]:
+            for name, value in values.items():
+                if isinstance(value, dict):
+                    yield from numbers(value, f"{above}{name}.")
+                elif isinstance(value, int | float) and not isinstance(value, bool):
+                    yield f"{above}{name}"
+
+        keys = {*numbers(plain_values(load_settings((), {})))}
+        message = refusal(*(f"{key}={number}" for key in keys))
+        accepted = keys - {line.partition(":")[0] for line in message.split("\n")}
+        assert accepted <= {"server.max_reply_chars"}
+
     @pytest.mark.parametrize(
         ("override", "fragments"),
         [
