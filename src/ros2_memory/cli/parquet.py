@@ -82,7 +82,8 @@ class Dataset:
 
     Args:
         root: the folder; partitions that exist already are refused.
-        robot: the name of a further partition, so that many robots share a dataset.
+        robot: the name of a further partition, so that many robots share a dataset; not one of
+            bags that have none.
 
     Attributes:
         undecoded: the types of messages of which rows have no value.
@@ -91,6 +92,7 @@ class Dataset:
     def __init__(
         self, root: Path, reader: BagReader, extractor: SchemaExtractor, robot: str | None
     ) -> None:
+        self._dataset = root
         self._root = root if robot is None else root / f"robot={quote(robot, safe=' ')}"
         self._reader = reader
         self._extractor = extractor
@@ -102,8 +104,16 @@ class Dataset:
         """Writes all messages; the files appear at the end, or none where it fails.
 
         Raises:
-            InvalidArgumentsError: the partition of a message existed before.
+            InvalidArgumentsError: the partition of a message existed before, or the others have a
+                robot, or none.
         """
+        is_alone = self._root == self._dataset
+        other, change = ("robot=*", "give") if is_alone else ("recording=*", "leave out")
+        if mixed := next(self._dataset.glob(other), None):
+            raise InvalidArgumentsError(
+                f"{mixed} may have these rows already, which would be there twice; {change} "
+                "--robot, or name another folder"
+            )
         parts: dict[tuple[str, Ns], _PartFile] = {}  # the one used last stands last
         written: dict[Path, Path] = {}  # by its final path, where each file lies meanwhile
         self._root.mkdir(parents=True, exist_ok=True)

@@ -215,6 +215,16 @@ def test_duckdb_computes_the_way_that_trajectory_summary_reports(
     assert told > 4
 
 
+def test_a_dataset_has_robots_or_has_none(bag_dir: Path, tmp_path: Path, exits: Program) -> None:
+    for first, then in (("--robot r1", ""), ("", "--robot r1")):
+        rows = tmp_path / f"rows{first}"
+        words = ["--parquet", str(rows)]
+        exits(0, f"export {first}", *words)
+        files = {*rows.rglob("*")}
+        assert "--robot" in exits(2, f"export {then}", *words).err
+        assert {*rows.rglob("*")} == files
+
+
 def test_what_cannot_be_decoded_has_a_row_that_says_why(tmp_path: Path, exits: Program) -> None:
     odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\x00\x01\x00\x00\x00")
     layout = McapLayout(definitions=False)
