@@ -215,21 +215,21 @@ def rounded_off_s(text: str) -> float:
 def window_end_s(text: str, end_s: float, start_s: float | None) -> float:
     """Returns the Unix seconds at which a window ends by a text that is the time `end_s`.
 
-    A date alone is the end of its local day, and a minute its own end where the window starts with
-    it; see also `rounded_off_s`.
+    A date alone is the end of its local day, and a minute or a second its own end where the window
+    starts with it; see also `rounded_off_s`.
     """
     named_s = _named_span_s(_without_weekday(text.strip())[1])
     goes_on = named_s > _MINUTE_S or start_s == end_s
-    return end_s + (named_s if goes_on else 0.0) + rounded_off_s(text)
+    return end_s + (named_s if goes_on else rounded_off_s(text))
 
 
 def _named_span_s(written: str) -> float:
-    """Returns how long the minute or the local day that a text names goes on after its begin (s).
+    """Returns how long what a text names, up to a local day, goes on after its begin (s).
 
-    Less `_END_S`; 0 for a text with seconds, Unix seconds, and what is no ISO 8601.
+    Less `_END_S`; 0 for Unix seconds, and what is no ISO 8601.
     """
     if _SECONDS.search(written) or not _ISO.fullmatch(written):
-        return 0.0
+        return rest_of_text_s(written)
     if ":" in written:
         return _MINUTE_S - _END_S
     read = datetime.fromisoformat(written)

@@ -89,6 +89,21 @@ def test_at_a_text_is_up_to_the_end_of_its_last_decimal(drive: Memory, tmp_path:
     )
 
 
+def test_a_window_ends_where_its_end_begins_unless_it_starts_there(
+    drive: Memory, tmp_path: Path
+) -> None:
+    def count(start: str, end: str) -> object:
+        return asked(drive, tmp_path, "get_topic_in_range", topic="/odom", start=start, end=end)[
+            "total"
+        ]
+
+    minute, weekday = utc(10)[:-4] + "Z", f"{datetime.fromtimestamp(T0 + 5, UTC):%a} "
+    assert [count(utc(0), utc(5)), count(utc(0), minute)] == [50, 100]
+    assert [count(utc(5), utc(5)), count(minute, minute)] == [10, 100]
+    for start in (utc(0), utc(5)):
+        assert count(start, weekday + utc(5)) == count(start, utc(6))
+
+
 @pytest.mark.usefixtures("berlin")
 def test_in_the_hour_that_clocks_repeat_printed_times_have_their_offset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
