@@ -38,6 +38,7 @@ from ros2_memory.core.text import counted, listed, match_topics, similar
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
+from ros2_memory.history.no_data import nothing_here
 from ros2_memory.history.robots import ADVICE, describe_mixed
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.index.listed_splits import describe_absent
@@ -45,7 +46,6 @@ from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import (
     bags_with_remarks,
     budget_of,
-    nothing_here,
     required_missing,
     unrecorded,
 )

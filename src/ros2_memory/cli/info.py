@@ -27,9 +27,10 @@ from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
+from ros2_memory.history.no_data import nothing_here
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import budget_of, nothing_here, usual_rate
+from ros2_memory.insights.status import budget_of, usual_rate
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.results import Budget, TopicRow
 

@@ -33,6 +33,7 @@ from ros2_memory.history.coverage import (
     was_removed,
     why_nothing,
 )
+from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.index.snapshot import Snapshot
 
 GIVE_TOPIC: Final = "give topic where the tool takes it"
 _DEFAULT_POSES: Final = "/odom"
@@ -240,23 +242,36 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
     return matched
 
 
+def nothing_here(snapshot: Snapshot) -> str:
+    """Returns the sentence on a bag directory in which no bag answers."""
+    held_splits = [split for split in snapshot.active if split.reason == HELD_BACK]
+    if held_splits:
+        splits = counted(len(held_splits), "split")
+        return f"no bag is served yet: recording.exclude_when has still to be applied to {splits}"
+    if snapshot.active:
+        return "there is no closed bag yet: the first one is still being written"
+    if snapshot.empty:
+        bags = counted(len(snapshot.empty), "bag holds", "bags hold")
+        return f"no message is recorded here: {bags} none"
+    if snapshot.damaged or snapshot.unread:
+        return "no bag here can be read"
+    return "no bag is here: nothing is recorded yet, or it is recorded elsewhere"
+
+
 def require_bags(view: View) -> None:
     """Checks that the memory holds something.
 
     Raises:
-        NoDataError: `empty_memory`, or `not_closed_yet` where the first split is being written.
+        NoDataError: `empty_memory`, or `not_closed_yet` where splits are there that do not answer.
     """
     snapshot = view.snapshot
     if snapshot.bags:
         return
     if snapshot.active:
-        raise NoDataError(
-            NoDataReason.NOT_CLOSED_YET,
-            f"nothing of the first split is on disk yet; ask again in {ON_DISK_S} s"
-            if _active_answers(view)
-            else "the first split is still being written; ask again when it closes, in "
-            f"{view.limits.closed_after_s:g} s or less",
-        )
+        lack, after_s = nothing_here(snapshot), view.limits.closed_after_s
+        if _active_answers(view):
+            lack, after_s = "nothing of the first split is on disk yet", ON_DISK_S
+        raise NoDataError(NoDataReason.NOT_CLOSED_YET, f"{lack}; ask again in {after_s:g} s")
     why = [snapshot.problem or "the bag directory contains no bag with messages"]
     if snapshot.damaged:
         why.append(f"{counted(len(snapshot.damaged), 'damaged file')} set aside")

@@ -24,6 +24,7 @@ from ros2_memory.history.coverage import (
     unexcluded,
     unix_text,
 )
+from ros2_memory.history.no_data import nothing_here
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.file_state import HELD_BACK
@@ -329,22 +330,6 @@ def bags_with_remarks(snapshot: Snapshot) -> list[BagFile]:
     """Returns the bags with remarks other than on a crash or a clock, in bag order."""
     bags = snapshot.timeline.faulty(TimeWindow.everything())
     return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
-
-
-def nothing_here(snapshot: Snapshot) -> str:
-    """Returns the sentence on a bag directory in which no bag answers."""
-    held_splits = [split for split in snapshot.active if split.reason == HELD_BACK]
-    if held_splits:
-        splits = counted(len(held_splits), "split")
-        return f"no bag is served yet: recording.exclude_when has still to be applied to {splits}"
-    if snapshot.active:
-        return "there is no closed bag yet: the first one is still being written"
-    if snapshot.empty:
-        bags = counted(len(snapshot.empty), "bag holds", "bags hold")
-        return f"no message is recorded here: {bags} none"
-    if snapshot.damaged or snapshot.unread:
-        return "no bag here can be read"
-    return "no bag is here: nothing is recorded yet, or it is recorded elsewhere"
 
 
 def clock_faults(snapshot: Snapshot) -> tuple[SetAside, ...]:

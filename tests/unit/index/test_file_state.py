@@ -10,6 +10,7 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BAG_KINDS, TimeWindow
 from ros2_memory.history.context import QuerySettings, SnapshotSource
 from ros2_memory.history.coverage import describe_excluded, unread_spans
+from ros2_memory.history.no_data import nothing_here
 from ros2_memory.index.file_state import (
     HELD_BACK,
     RETRY_NS,
@@ -21,7 +22,6 @@ from ros2_memory.index.file_state import (
 )
 from ros2_memory.index.scan import Stamp
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import nothing_here
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.instructions import instructions
 from tests.support.bags import McapLayout
@@ -260,8 +260,13 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
     name = bags.begin(0)
     bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
     bags.split(name, words(10, 20))
-    assert nothing_here(index_of(bags).snapshot()) == (
-        "no bag is served yet: recording.exclude_when has still to be applied to 2 splits"
+    held_back = "no bag is served yet: recording.exclude_when has still to be applied to 2 splits"
+    assert nothing_here(index_of(bags).snapshot()) == held_back
+    memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 3600 * S))
+    reply = asked(memory, bags.bag_dir, "recap", start=T0 // S, end=T0 // S + 5)
+    assert (reply["reason"], reply["detail"]) == (
+        "not_closed_yet",
+        f"{held_back}; ask again in 10 s",
     )
     bags.step()
     window = TimeWindow(T0, T0 + 30 * S)
@@ -282,5 +287,8 @@ def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: P
     limits = QuerySettings(screened=True, include_active=True, kept=RetentionLimits(10**9, 0))
     memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 12 * S), limits=limits)
     at = {"topic": "/chatter", "timestamp": T0 // S + 5}
-    assert "in 25 s or less" in asked(memory, bags.bag_dir, "get_topic_at_time", **at)["detail"]
+    assert (
+        "to 1 split; ask again in 25 s"
+        in asked(memory, bags.bag_dir, "get_topic_at_time", **at)["detail"]
+    )
     assert "the newest 25 s or so" in instructions(limits)
