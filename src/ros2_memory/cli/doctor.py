@@ -65,6 +65,7 @@ _READ: Final = "give this user the right to read it, or run as the user of the s
 _WAIT: Final = (
     "it counts as being written; if no program writes it, as a copy, it is read once it is older"
 )
+_CORRECT: Final = "correct the key that it names"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 _LATE_NS: Final[Ns] = 3600 * NS_PER_S
 """A hub that is reached has confirmed closed bags after this time."""
@@ -145,17 +146,17 @@ def _examine(bags: Bags) -> Iterator[Finding]:
     try:
         settings = bags.settings()
         robots = settings.fleet.robots
-        memory = None if robots else open_memory(settings, verbose=bags.verbose)
+        memory = open_memory(settings, verbose=bags.verbose, scans=not robots)
     except ConfigError as refused:
-        yield Finding(Level.ERROR, "config", str(refused), "correct the key that it names")
+        yield Finding(Level.ERROR, "config", str(refused), _CORRECT)
         return
     yield Finding(Level.OK, "config", f"files in use: {', '.join(files_in_use(settings))}")
     if unused := unused_config():
         do = "set that, or rename the file if it is another program's"
         yield Finding(Level.WARNING, "config", unused, do)
-    if memory is None:
+    if robots:
         for name in robots:
-            yield from _of_robot(name, *open_robot(settings, name, verbose=bags.verbose))
+            yield from _of_robot(name, settings, verbose=bags.verbose)
         with spinner("asking the lake"):
             yield from _findings_of({"lake": check_lake} | _OF_SETTINGS, settings)
         return
@@ -182,8 +183,13 @@ def _findings_of(
             yield Finding(Level.ERROR, about, reason_of(problem), do)
 
 
-def _of_robot(name: str, own: Settings, memory: Memory) -> Iterator[Finding]:
-    """Yields what is wrong with the bags of a robot of a fleet; else how many there are."""
+def _of_robot(name: str, fleet: Settings, *, verbose: bool) -> Iterator[Finding]:
+    """Yields what is wrong with the places or bags of a robot of a fleet; else how many bags."""
+    try:
+        own, memory = open_robot(fleet, name, verbose=verbose)
+    except ConfigError as refused:
+        yield Finding(Level.ERROR, "robot", f"{name}: {refused}", _CORRECT)
+        return
     snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir
     findings: Iterable[Finding]
     if snapshot.problem or not (snapshot.bags or snapshot.active):

@@ -270,6 +270,19 @@ def enveloped(writer: Writer, at: int) -> None:
     writer.add_message(channel, at, b"\x08\x01", at)
 
 
+def test_places_that_are_refused_are_of_one_robot_of_a_fleet(
+    tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "fleet")
+    for name in ("r1", "r2", "r3"):
+        write_mcap(tmp_path / "robots" / name / "rec.mcap", [odom(NS_PER_S, 0.0, 0.0)])
+    (tmp_path / "places_r2.yaml").write_text("places: {kitchen: {x: [0, 5]}}\n")
+    words = [f"fleet.robots={tmp_path}/robots/*", f"fleet.places={tmp_path}/places_*.yaml"]
+    found = exits(2, "doctor --json", *words).json["findings"]
+    seen = {row["seen"][:3]: row["level"] for row in found if row["about"] == "robot"}
+    assert seen == {"r1:": "ok", "r2:": "error", "r3:": "ok"}
+
+
 def test_what_this_user_may_not_read_is_not_advised_to_be_copied_and_ends_no_report(
     robot: Path, monkeypatch: pytest.MonkeyPatch, examined: Examined
 ) -> None:
