@@ -553,19 +553,20 @@ def describe_misdated(faults: Sequence[ClockFault]) -> str:
 
 
 def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | None:
-    """Returns between which times nothing was recorded, where all of a window lies in there.
+    """Returns the gap that all of a window lies in: when recording ended, and when it went on.
 
-    None before and after the memory. An open end of the window is `MIN_NS` or `MAX_NS`. Bags that a
-    wrong clock dated count as recorded. Returns None where something of the window was.
+    Before the memory it has no begin, after it no end: None. Returns None alone where something of
+    the window was recorded, also by a bag that a wrong clock dated. An open end of the window is
+    `MIN_NS` or `MAX_NS`.
     """
     snapshot = view.snapshot
     earliest, latest = snapshot.earliest, snapshot.latest
     if earliest is None or latest is None:
         return None
     misdated = (fault.bag for fault in snapshot.dating.faults if fault.misleads)
-    if not any(bag.reaches_into(asked) for bag in misdated):
-        for gap in view.gaps(asked, around=True):
-            return gap
+    is_misdated = any(bag.reaches_into(asked) for bag in misdated)
+    if not is_misdated and (gaps := view.gaps(asked, around=True)):
+        return gaps[0]
     segments = snapshot.timeline.segments_in(asked)
     bags = (bag for segment in segments for bag in segment.overlapping(asked))
     if not all(is_carried(bag.file) for bag in bags):
@@ -579,7 +580,8 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
 def note_unrecorded(view: View, asked: TimeWindow) -> None:
     """Adds a note on how much of a window was not recorded, if some was not.
 
-    It ends now at the latest, or where the memory does if its end is open (`MAX_NS`).
+    It ends now at the latest, unless it begins later; or where the memory does if its end is open
+    (`MAX_NS`).
 
     None where only pauses are missing that are no gap, and as little before and after the memory.
     """
@@ -589,7 +591,8 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     start, end = asked.asked()
     start = max(start, min(0, earliest))
     until = latest if asked.stop >= MAX_NS else memory.now(memory.clock.now(), latest)
-    end = min(end, max(start, until))
+    if start < until:
+        end = min(end, until)
     until_end = TimeWindow(start, end)
     outside = (min(end, earliest) - start, end - max(start, latest))
     gaps = [last - first for first, last in recording_gaps(view, until_end)]

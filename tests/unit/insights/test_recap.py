@@ -29,6 +29,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
+from tests.support.clocks import SettableClock
 from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
@@ -50,6 +51,13 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> Non
     assert note == (
         f"/many has too many booleans or things in one message: {more} more are not followed"
     )
+
+
+def test_a_time_to_come_is_named_as_it_was_asked(tmp_path: Path) -> None:
+    write_splits(tmp_path, [boolean(BEGIN + n * S, False) for n in range(10)])
+    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 12 * S))
+    start, end = (f"{BEGIN // S + after_s}.000000" for after_s in (60, 90))
+    assert f"nothing was recorded between {start} and {end}" in over(memory, 60, 90).notes
 
 
 def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
