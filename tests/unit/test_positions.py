@@ -1,6 +1,7 @@
 """Positions come from whatever carries one, and refusals name what does."""
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -131,6 +132,10 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
         ("find_last_match", {"topic": topic, **above, "field": "position.z"}),
     ):
         assert note in ask(tmp_path, False, tool, **given)["notes"]
+    other = [replace(vehicle(T0 + n * S, n, 0.0), topic="/r2/odometry") for n in range(9)]
+    write_mcap(tmp_path / "other.mcap", other)
+    several = {"topic": "/*odometry", **above, "field": "position.z"}
+    assert ask(tmp_path, False, "find_matches", **several)["notes"].count(note) == 1
 
 
 def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> None:

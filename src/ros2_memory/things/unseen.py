@@ -157,10 +157,11 @@ def notes_on_never(
     meant = () if is_bounded else _found_in_singular(view, topic, condition, window)
     topics = matching_topics(view, topic)
     heights = position_frames(view, topics) if condition.field == "position.z" else ()
+    frames = {frame for _, of_topic in heights for frame in of_topic}
     return (
         *score_limit(condition, min_score),
         *named_numbers(view, topics, condition),
-        *(note for _, frames in heights for frame in frames for note in axes_of(frame)),
+        *(note for frame in sorted(frames) for note in axes_of(frame)),
         *meant,
     )
 
