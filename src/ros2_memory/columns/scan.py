@@ -12,6 +12,7 @@ from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -29,7 +30,6 @@ from ros2_memory.columns.units import (
     repeated_among,
 )
 from ros2_memory.columns.writing import DELAY, PUBLISH_TIME
-from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
@@ -430,17 +430,15 @@ class Scan:
 
     def _holding_copies(self) -> list[Span]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
-        starts, stops = np.array(self.shared, np.int64).T
-        begins, ends = np.searchsorted(self._latest, starts), np.searchsorted(self._firsts, stops)
-        counts = np.maximum(ends - begins, 0)
-        source, span = in_ranges(begins, counts), np.repeat(np.arange(counts.size), counts)
-        published = [self._published.get(s.number, (-math.inf, math.inf)) for s in self._sources]
-        earliest, latest = np.array(published).reshape(-1, 2)[source].T
-        order = np.lexsort((latest, earliest, span))
-        order = order[(self._lasts[source] >= starts[span])[order]]
-        before, after = order[:-1], order[1:]
-        may_repeat = (span[before] == span[after]) & (latest[before] >= earliest[after])
-        return [self.shared[nth] for nth in np.unique(span[before][may_repeat]).tolist()]
+
+        def may_repeat(span: Span) -> bool:
+            published = sorted(
+                self._published.get(source.number, (-math.inf, math.inf))
+                for source in self._sources_in(TimeWindow(*span))
+            )
+            return any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published))
+
+        return [span for span in self.shared if may_repeat(span)]
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
