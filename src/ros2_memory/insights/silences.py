@@ -13,11 +13,9 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, overlaps_any, united, without
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import (
-    AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     MIN_NS,
     NS_PER_S,
-    START_SLACK_NS,
     Ns,
     Span,
     local_text,
@@ -98,8 +96,7 @@ def _outside_deleted(
 
 def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
     """Yields the silences in a window, in order, as far as they are inside."""
-    start = window.start + START_SLACK_NS
-    end = max(start, window.stop - 1 - AT_OR_BEFORE_SLACK_NS)
+    start, end = window.asked()
     for silence in silences_of(view.memory, view.snapshot, start, end):
         part = silence.within(start, end)
         if part is not None:
