@@ -674,9 +674,10 @@ def build_dispatcher(
     from ros2_memory.tools.replies import Replies
 
     server = settings.server
+    additions = server.tools == "all"
     tools = build_tools(
         memory.limits,
-        additions=server.tools == "all",
+        additions=additions,
         # Where nothing records nothing is deleted, and nobody would save a moment.
         writing=server.write_tools and not isinstance(settings.recorder, NullRecorderNode),
     )
@@ -685,14 +686,14 @@ def build_dispatcher(
         from ros2_memory.fleet.tools import fleet_tools
 
         tools = fleet_tools(tools, fleet, server.max_reply_chars)
-        if server.tools == "all":
+        if additions:
             tools = (*tools, *select_tools(fleet, server.max_reply_chars))
     return Dispatcher(
         memory,
         tools,
         Replies(settings.recording.bag_dir, server.max_reply_chars),
         call_timeout_s=server.call_timeout_s,
-        readable=readable_tools(memory.limits) if fleet is None else (),
+        readable=readable_tools(memory.limits) if additions and fleet is None else (),
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,
         most_questions=server.keep_questions,

@@ -152,9 +152,7 @@ class EpisodicServer(MCPServer[object]):
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
         has_status = any(tool.name == "memory_status" for tool in dispatcher.tools)
-        offered = (
-            dispatcher.readable if has_status else dispatcher.readable & {"list_recorded_topics"}
-        )
+        offered = dispatcher.readable
         self._resources = {tool: row for tool, row in RESOURCES.items() if tool in offered}
         self._templates = {prefix: row for prefix, row in _TEMPLATES.items() if row[1] in offered}
         self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
