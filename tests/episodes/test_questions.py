@@ -155,7 +155,7 @@ def wrong_among(memory: Memory, folder: Path) -> list[Any]:
     wrong = []
     for question in questions(SEED):
         tool, given = call_for(question)
-        reply = asked(memory, folder, tool, **given)
+        reply = asked(memory, tool, **given)
         found = None if "error" in reply else answer_of(question, reply)
         if not is_true(found, question.answer):
             wrong.append((question, found, reply.get("detail"), reply.get("notes")))

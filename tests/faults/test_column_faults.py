@@ -95,7 +95,7 @@ def answers(world: World) -> list[object]:
     """What tools answer of everything."""
     spans = {"start": T0 / S - 3600, "end": T0 / S + 7200}
     return [
-        asked(world.memory, world.bag_dir, name, **given, **(spans if name in SPANNED else {}))
+        asked(world.memory, name, **given, **(spans if name in SPANNED else {}))
         for name, given in ASKED
     ]
 

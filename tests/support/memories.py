@@ -125,9 +125,9 @@ def stored_columns(
     return scanner
 
 
-def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:
+def asked(memory: Memory, name: str, **given: object) -> Any:
     """The JSON of the reply, be it an error."""
-    return json.loads(replied(memory, bag_dir, name, given).text)
+    return json.loads(replied(memory, name, given).text)
 
 
 def assert_same_counts(reply: Any, expected: Any, *, of_means: float = 1e-3) -> None:
@@ -180,7 +180,6 @@ def _without_means(reply: Any) -> Any:
 
 def replied(
     memory: Memory,
-    bag_dir: Path,
     name: str,
     given: Mapping[str, object],
     *,
@@ -188,7 +187,7 @@ def replied(
 ) -> Reply:
     """The reply itself."""
     [tool] = [each for each in build_tools(memory.limits) if each.name == name]
-    replies, call = Replies(bag_dir, max_chars), Call()
+    replies, call = Replies(memory.index.bag_dir, max_chars), Call()
     try:
         answer = tool.question(given)(memory, call)
     except EpisodicError as error:

@@ -75,7 +75,7 @@ def remembered(bag_dir: Path, recalls: bool) -> Memory:
 
 
 def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
-    return asked(remembered(bag_dir, recalls), bag_dir, tool, **given)
+    return asked(remembered(bag_dir, recalls), tool, **given)
 
 
 GLOBAL = "px4_msgs/msg/VehicleGlobalPosition"
@@ -143,7 +143,7 @@ def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> No
     write_mcap(tmp_path / "rec" / "rec_0.mcap", states)
     memory = memory_of(tmp_path)
     for at, has_fix in ((4, False), (5, True)):
-        found = asked(memory, tmp_path, "get_position_at", timestamp=T0 / S + at, topic="/fix")
+        found = asked(memory, "get_position_at", timestamp=T0 / S + at, topic="/fix")
         assert found["latitude"] == pytest.approx(48.1234567 + at * 1e-5)
         assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
     fixes = fixes_in(View(memory, Call()), "/fix", TimeWindow.everything())
@@ -226,7 +226,7 @@ def test_transforms_place_the_robot_where_the_setting_chooses_them(
         ("trajectory_summary", {**whole, "frame_id": "map"}),
         ("get_position_at", {"timestamp": T0_S + 5, "frame_id": "map"}),
     ):
-        reply = asked(memory, tmp_path, tool, **given)
+        reply = asked(memory, tool, **given)
         assert reply["frame_id"] == "map"
         assert "by transforms, of base_link" in reply["notes"]
         assert reply.get("distance_m", 9.9) == pytest.approx(9.9)
@@ -284,7 +284,7 @@ def test_a_position_is_in_places_of_several_frames_the_smallest_first(tmp_path: 
         Place("lab", "site", Circle(1.0, 0.0, 0.5)),
     )
     memory = memory_of(tmp_path, limits=QuerySettings(places=places))
-    reply = asked(memory, tmp_path, "get_position_at", timestamp=T0_S + 1)
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 1)
     assert (reply["in"], reply["also_in"]) == ("dock", ["pen", "yard"])
 
 
@@ -296,10 +296,10 @@ def test_a_frame_that_is_known_at_other_times_is_no_data_and_another_is_refused(
     write_mcap(tmp_path / "bag.mcap", messages)
     memory = memory_of(tmp_path)
     early, late = {"timestamp": T0_S + 9}, {"timestamp": T0_S + 50}
-    assert asked(memory, tmp_path, "get_position_at", frame_id="map", **early)["x"] == 10
-    refused = asked(memory, tmp_path, "get_position_at", frame_id="map", **late)
+    assert asked(memory, "get_position_at", frame_id="map", **early)["x"] == 10
+    refused = asked(memory, "get_position_at", frame_id="map", **late)
     frames = {"parent": "map", "child": "odom"}
-    why = asked(memory, tmp_path, "get_transform_at", **frames, **late)
+    why = asked(memory, "get_transform_at", **frames, **late)
     assert (refused["error"], refused["reason"]) == ("no_data", why["reason"])
-    other = asked(memory, tmp_path, "get_position_at", frame_id="moon", **late)
+    other = asked(memory, "get_position_at", frame_id="moon", **late)
     assert other["error"] == "invalid_arguments"

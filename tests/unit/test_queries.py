@@ -50,10 +50,10 @@ def test_a_field_that_one_type_of_a_topic_has_is_shown_of_its_messages(tmp_path:
     write_mcap(tmp_path / "b" / "b_0.mcap", [command(T0 + 9 * S, 0.5, topic="/odom")])
     window = {"topic": "/odom", "start": T0 / 1e9, "end": T0 / 1e9 + 9}
     memory = memory_of(tmp_path)
-    told = asked(memory, tmp_path, "get_topic_in_range", **window, fields=["position.x"])
+    told = asked(memory, "get_topic_in_range", **window, fields=["position.x"])
     assert [x for _, x in told["rows"]] == [0, 1, 2]
     assert any("1 samples left out: geometry_msgs/msg/Twist has no" in n for n in told["notes"])
-    told = asked(memory, tmp_path, "get_topic_in_range", **window, fields=["nothing"])
+    told = asked(memory, "get_topic_in_range", **window, fields=["nothing"])
     assert told["error"] == "invalid_arguments"
 
 

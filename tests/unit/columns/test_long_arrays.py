@@ -49,7 +49,7 @@ def test_a_sequence_whose_columns_were_dropped_is_read_from_its_bag(tmp_path: Pa
     world.fill()
     for off, expected in ((-0.01, T0 / NS_PER_S), (0.01, None)):
         above = {"condition_type": "above", "field": "poses.position.x", "value": max(xs) + off}
-        found = asked(world.memory, tmp_path, "find_last_match", topic="/poses", **above)
+        found = asked(world.memory, "find_last_match", topic="/poses", **above)
         assert (found or {}).get("timestamp") == expected
 
 
@@ -86,7 +86,7 @@ def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
         ("contains", 10),
     ):
         asks = {"topic": "/*", "condition_type": condition, "value": number}
-        ask = partial(asked, memory, tmp_path, "find_last_match", **asks)
+        ask = partial(asked, memory, "find_last_match", **asks)
         assert "ask about data.bytes" in ask(field="data")["detail"]
         if condition == "equals":  # in the whole message
             assert "data is long it is only summarised" in ask()["notes"][0]
@@ -127,7 +127,7 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
     elbow = {"condition_type": "above", "value": 0.5, "field": "positions.elbow"}
     left = {**elbow, "field": "positions.gripper.left", "value": 2.0}
     for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
-        ask = partial(asked, memory, tmp_path, topic="/joints")
+        ask = partial(asked, memory, topic="/joints")
         assert ask(name="find_last_match", **elbow)["timestamp"] == bent[-1]
         runs = ask(name="find_matches", **elbow, limit=100)["sightings"]
         assert sum(run["count"] for run in runs) == len(bent)

@@ -186,5 +186,5 @@ def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
         plain = world.unstored().memory
         started = World.of(folder).memory  # what it knows it has from the store
         for tool, given_ in questions(Random(seed)):
-            expected = asked(plain, folder, tool, **given_)
-            assert_same_counts(asked(started, folder, tool, **given_), expected, of_means=0.02)
+            expected = asked(plain, tool, **given_)
+            assert_same_counts(asked(started, tool, **given_), expected, of_means=0.02)

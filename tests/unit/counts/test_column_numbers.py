@@ -173,10 +173,10 @@ def test_the_least_and_greatest_of_whole_numbers_are_exact(
     write_numbers(tmp_path, *((kind, number) for number in numbers))
     memory = memory_of(tmp_path, recalls=recalls)
     given = {"topic": "/number", "start": T0, "end": T0 + 9, "fields": ["value"]}
-    extremes = asked(memory, tmp_path, "get_topic_in_range", **given)["extremes"]["value"]
+    extremes = asked(memory, "get_topic_in_range", **given)["extremes"]["value"]
     assert (extremes["min"], extremes["max"]) == (min(numbers), max(numbers))
     assert extremes["max_at"] == T0 + numbers.index(max(numbers))
-    row = table(asked(memory, tmp_path, "get_topic_in_range", **given, by="hour"))["all"]
+    row = table(asked(memory, "get_topic_in_range", **given, by="hour"))["all"]
     assert (row["value.min"], row["value.max"]) == (min(numbers), max(numbers))
     assert row["value.max_at_unix"] == extremes["max_at"]
 

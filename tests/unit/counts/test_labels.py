@@ -71,7 +71,7 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
         write(world, bags)
         memory = asked_of(bags, stored=stored)
         where = {"where": bounds(*rooms)} if rooms else {}
-        reply = asked(memory, bags, "find_matches", min_score=least, **where, **ANY)
+        reply = asked(memory, "find_matches", min_score=least, **where, **ANY)
     seconds = [nth for nth in range(120) if not rooms or world.room(nth) in rooms]
     truth = {label: expected(world, seconds, label, least) for label in PLACES}
     rows = table(reply)
@@ -94,7 +94,7 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
 )
 def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[str, Any]) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [detections(BEGIN * S, ["cup"])])
-    reply = asked(memory_of(tmp_path), tmp_path, "find_matches", **{**ANY, **given})
+    reply = asked(memory_of(tmp_path), "find_matches", **{**ANY, **given})
     assert reply["error"] == "invalid_arguments"
     assert "by label takes labels of detections: give condition_type contains" in reply["detail"]
 
@@ -114,9 +114,9 @@ def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, *, recalls: bool
     memory = memory_of(tmp_path, recalls=recalls)
     for kind, value in (("equals", "knife"), ("contains_word", "knife -butter")):
         sought = {"topic": "/chatter", "condition_type": kind, "value": value}
-        answer = asked(memory, tmp_path, "find_matches", **sought)
+        answer = asked(memory, "find_matches", **sought)
         assert [each["count"] for each in answer["sightings"]] == [20]
-        newest = asked(memory, tmp_path, "find_last_match", **sought)
+        newest = asked(memory, "find_last_match", **sought)
         assert newest["timestamp"] == T + 19
 
 
@@ -135,11 +135,11 @@ def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
     memory = memory_of(tmp_path, recalls=recalls)
     window = {"topic": "/on", "start": T, "end": T + 198}
     on = {**window, "condition_type": "contains", "value": "true"}
-    found = asked(memory, tmp_path, "find_matches", **on, limit=20)
-    whole = table(asked(memory, tmp_path, "find_matches", **on, by="day"))["all"]
+    found = asked(memory, "find_matches", **on, limit=20)
+    whole = table(asked(memory, "find_matches", **on, by="day"))["all"]
     assert found["total"] == 10
     assert (whole["count"], whole["seconds"]) == (10, 100)
-    changes = asked(memory, tmp_path, "get_topic_in_range", **window, changes=True)
+    changes = asked(memory, "get_topic_in_range", **window, changes=True)
     assert [row["value"] for row in changes["changes"]] == ["true", "no"] * 5 + [True, False] * 5
-    values = asked(memory, tmp_path, "get_topic_in_range", **window, by="value")
+    values = asked(memory, "get_topic_in_range", **window, by="value")
     assert values["all"][0] == 20

@@ -41,7 +41,7 @@ def matches(bag_dir: Path, topic: str, first: float, last: float, **more: object
     given = {"topic": topic, "condition_type": "equals", "start": T0 / S + first, **more}
     recalls = bool(given.pop("recalls"))
     memory = memory_of(bag_dir, recalls=recalls)
-    return asked(memory, bag_dir, "find_matches", value=True, end=T0 / S + last, **given)
+    return asked(memory, "find_matches", value=True, end=T0 / S + last, **given)
 
 
 @each_way
@@ -80,7 +80,7 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     memory = memory_of(tmp_path, recalls=recalls)
     bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
     auto = {"topic": "/mode", "condition_type": "contains", "value": "auto", "while": bumped}
-    found = asked(memory, tmp_path, "find_matches", **auto)
+    found = asked(memory, "find_matches", **auto)
     rows = [(row["first_seen"] - T0 / S, row["duration_s"]) for row in found["sightings"]]
     assert rows == [(85, 15), (80, 5), (40, 5), (20, 10)]
     texts = [row["matched"] for row in found["sightings"]]
@@ -88,13 +88,13 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     assert [row.get("count") for row in found["sightings"]] == [1, None, None, None]
     assert [row["robot"]["x"] for row in found["sightings"]] == [8.5, 8.0, 4.0, 2.0]
     assert (found["total"], "notes" in found) == (4, False)
-    counted = asked(memory, tmp_path, "find_matches", **auto, by="day")
+    counted = asked(memory, "find_matches", **auto, by="day")
     whole = table(counted)["all"]
     assert (whole["seconds"], whole["count"]) == (35, 1)
-    later = asked(memory, tmp_path, "find_matches", **auto, by="day", start=T0 / S + 25)
+    later = asked(memory, "find_matches", **auto, by="day", start=T0 / S + 25)
     assert table(later)["all"]["seconds"] == 30
     place = {"x": [1.0, 3.0], "y": [-1, 1]}
-    inside = asked(memory, tmp_path, "find_matches", **{**auto, "while": [bumped]}, where=place)
+    inside = asked(memory, "find_matches", **{**auto, "while": [bumped]}, where=place)
     assert [row["first_seen"] for row in inside["sightings"]] == [T0 / S + 20]
 
 
@@ -108,7 +108,7 @@ def test_what_a_slow_topic_states_lasts_to_the_end_of_a_scope(
     given = {"topic": BUMPER, "condition_type": "equals", "value": False, "while": docked, **by}
     memory = memory_of(bag_dir, recalls=recalls)
     end = T0 / S + 402
-    answer = asked(memory, bag_dir, "find_matches", start=T0 / S, end=end, **given)
+    answer = asked(memory, "find_matches", start=T0 / S, end=end, **given)
     if by:
         assert table(answer)["all"]["seconds"] == 102
     else:
@@ -130,15 +130,15 @@ def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
     is_true = {**window, "condition_type": "equals", "value": True}
     recorded_s = 200 - 10 - 3.1
     for by in ("hour", "value"):
-        answer = asked(memory, tmp_path, "find_matches", **is_true, by=by)
+        answer = asked(memory, "find_matches", **is_true, by=by)
         whole = table(answer)["all"]
         assert (whole["seconds"], whole["count"]) == (recorded_s, 1)
-    events = asked(memory, tmp_path, "recap", start=T0 / S, end=T0 / S + 200)["events"]
+    events = asked(memory, "recap", start=T0 / S, end=T0 / S + 200)["events"]
     [flip] = [event for event in events if event["text"] == "/docked became true"]
     assert ("duration_s" in flip, flip["goes_on"]) == (False, True)
     answers = [
-        asked(memory, tmp_path, "find_matches", **is_true),
-        asked(memory, tmp_path, "get_topic_in_range", **window, changes=True),
+        asked(memory, "find_matches", **is_true),
+        asked(memory, "get_topic_in_range", **window, changes=True),
     ]
     assert answers[0]["sightings"][0]["duration_s"] == 190
     assert answers[1]["changes"][-1]["seconds"] == 190
@@ -146,9 +146,7 @@ def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
         assert any("nothing was recorded from" in note for note in answer["notes"])
     later = {"topic": "/battery_state", "condition_type": "above", "value": 0.1}
     while_true = {"while": {"topic": DOCKED, "condition_type": "equals", "value": True}}
-    answer = asked(
-        memory, tmp_path, "find_matches", **later, field="percentage", by="hour", **while_true
-    )
+    answer = asked(memory, "find_matches", **later, field="percentage", by="hour", **while_true)
     assert table(answer)["all"]["seconds"] > 180
 
 
@@ -196,7 +194,7 @@ def test_a_boolean_holds_on_in_a_day_of_which_a_message_a_minute_stayed(tmp_path
     write_splits(tmp_path, [battery(T0 + at * S, 0.5) for at in range(90_000, 90_060)])
     present = {"condition_type": "equals", "value": True, "field": "present", "by": "day"}
     asks = {"topic": "/battery_state", **present, "start": T0 / S, "end": T0 / S + 3600}
-    answer = asked(memory_of(tmp_path), tmp_path, "find_matches", **asks)
+    answer = asked(memory_of(tmp_path), "find_matches", **asks)
     assert table(answer)["all"]["seconds"] == 3600
 
 
@@ -225,26 +223,26 @@ def whole(by: str = "hour") -> dict[str, object]:
 def test_labels_of_a_wrong_clock_do_not_count(memory: Memory, tmp_path: Path) -> None:
     seen = {"topic": CUPS, "condition_type": "contains", "value": "cup", "by": "label"}
     for window in ({}, {"start": 0, "end": AHEAD + 10}):
-        reply = asked(memory, tmp_path, "find_matches", **seen, **window)
+        reply = asked(memory, "find_matches", **seen, **window)
         found = table(reply)["all"]
         assert (found["count"], found["seconds"]) == (1, 5.0)
         assert found["first_unix"] == pytest.approx(TRUE, abs=0.001)
         assert found["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
         assert not any("recorded only" in note for note in reply["notes"])
-    reply = asked(memory, tmp_path, "find_matches", **seen, start=UNSET - 5, end=UNSET + 60)
+    reply = asked(memory, "find_matches", **seen, start=UNSET - 5, end=UNSET + 60)
     assert table(reply)["all"]["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
     assert not any("recorded only" in note for note in reply["notes"])
 
 
 def test_no_value_holds_from_one_clock_to_the_next(memory: Memory, tmp_path: Path) -> None:
     """The robot was idle at the end of 1970, and at the beginning of today."""
-    reply = asked(memory, tmp_path, "get_topic_in_range", topic="/chatter", **whole("value"))
+    reply = asked(memory, "get_topic_in_range", topic="/chatter", **whole("value"))
     rows = table(reply)
     assert {value: row["count"] for value, row in rows.items()} == {"idle": 1, "busy": 1, "all": 2}
     assert rows["idle"]["first_unix"] == pytest.approx(TRUE, abs=0.001)
     assert rows["busy"]["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
     of_1970 = {"start": UNSET - 5, "end": UNSET + 60, "by": "value"}
-    reply = asked(memory, tmp_path, "get_topic_in_range", topic="/chatter", **of_1970)
+    reply = asked(memory, "get_topic_in_range", topic="/chatter", **of_1970)
     assert table(reply)["all"]["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
 
 
@@ -253,8 +251,8 @@ def test_a_window_inside_of_a_bag_of_a_wrong_clock_counts_what_is_there(
     memory: Memory, tmp_path: Path, begin: int, count: int
 ) -> None:
     window = {"start": begin - 5, "end": begin + 60}
-    reply = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", by="hour", **window)
+    reply = asked(memory, "get_topic_in_range", topic="/odom", by="hour", **window)
     assert table(reply)["all"]["count"] == count
     condition = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
-    reply = asked(memory, tmp_path, "find_matches", **condition, **window)
+    reply = asked(memory, "find_matches", **condition, **window)
     assert reply["searched_from"] == begin

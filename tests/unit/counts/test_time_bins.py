@@ -128,7 +128,7 @@ def test_times_in_which_nothing_was_recorded_have_no_rows(tmp_path: Path) -> Non
 
     def rows(by: str) -> tuple[list[str], list[str]]:
         span = {"start": noon, "end": noon + 3 * 86_400 + 60}
-        reply = asked(memory, tmp_path, "trajectory_summary", by=by, **span)
+        reply = asked(memory, "trajectory_summary", by=by, **span)
         notes = [each for each in reply.get("notes", ()) if each.startswith("no rows")]
         return [each[0] for each in reply["rows"]], notes
 
@@ -155,9 +155,9 @@ def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> N
     memory = memory_of(tmp_path)
     asks = {"topic": "/is_docked", "condition_type": "equals", "by": "day"}
     for each in (memory, with_store(memory, tmp_path)):
-        docked = table(asked(each, tmp_path, "find_matches", **asks, value=True))["all"]
+        docked = table(asked(each, "find_matches", **asks, value=True))["all"]
         assert (docked["count"], docked["seconds"]) == (2, 2 * 49)
-        reply = asked(each, tmp_path, "find_matches", **asks, value="false")
+        reply = asked(each, "find_matches", **asks, value="false")
         off = table(reply)["all"]
         # Twice it was off the dock from the beginning on: nobody saw it leave.
         assert (off["count"], off["seconds"], off["recorded_s"]) == (0, 2 * 50, 2 * 99)
@@ -175,7 +175,7 @@ def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(tmp_path: Path
     write_moving_map(tmp_path, 1, seconds=300)
     memory = memory_of(tmp_path, limits=QuerySettings(places=NESTED), recalls=True)
     span = {"start": MAP_BEGIN / S, "end": MAP_BEGIN / S + 300}
-    reply = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", by="place", **span)
+    reply = asked(memory, "get_topic_in_range", topic="/odom", by="place", **span)
     rows = table(reply)
     assert sum(row["count"] for name, row in rows.items() if name != "all") > 1500
     assert rows["all"]["count"] == 1500
@@ -195,7 +195,7 @@ def test_the_first_of_a_day_is_not_known_where_the_window_begins_after_others(
 
     def usual_first(start_h: float) -> tuple[str, str, int]:
         span = {"start": midnight + start_h * 3600, "end": midnight + 3 * 86_400}
-        usual = asked(memory, tmp_path, "find_matches", **asks, **span)["usual_first"]
+        usual = asked(memory, "find_matches", **asks, **span)["usual_first"]
         return usual["earliest"], usual["latest"], usual["days"]
 
     assert usual_first(0) == usual_first(7) == usual_first(8) == ("08:00:10", "09:00:10", 3)

@@ -57,7 +57,7 @@ def fleet(folder: Path) -> Fleet:
 def alone(folder: Path, name: str, given: dict[str, object]) -> dict[str, Any]:
     """The replies of servers of one robot alone, by its name."""
     memories = {robot: fleet_memory(folder / robot) for robot in NAMES}
-    return {robot: asked(memory, folder, name, **given) for robot, memory in memories.items()}
+    return {robot: asked(memory, name, **given) for robot, memory in memories.items()}
 
 
 @pytest.mark.parametrize("name", TOOLS)

@@ -170,8 +170,8 @@ def check_stored(world: World, asking: Sequence[Question]) -> list[Any]:
     """Checks that replies are the same with the store and without one; returns them."""
     plain, replies = world.unstored().memory, []
     for name, given_ in asking:
-        replies.append(asked(world.memory, world.bag_dir, name, **given_))
-        expected = asked(plain, world.bag_dir, name, **given_)
+        replies.append(asked(world.memory, name, **given_))
+        expected = asked(plain, name, **given_)
         assert_same_counts(replies[-1], expected, of_means=0.02)
     return replies
 
@@ -398,9 +398,9 @@ def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[flo
         asking = questions(draw, world.topics(), moments, most=10)
         asking.append(("recap", _window(draw, moments)))
         for (name, given_), reply in zip(asking, check_stored(world, asking), strict=True):
-            expected = alike(asked(uncut, whole, name, **given_))
+            expected = alike(asked(uncut, name, **given_))
             assert_same_counts(alike(reply), expected, of_means=0.02)
-        ask = partial(asked, world.memory, bag_dir)
+        ask = partial(asked, world.memory)
         plain, gaps, memory = read(whole), gaps_of(splits), ask("data_time_range")
         dated = {topic: [row for row in rows if row.at >= T0] for topic, rows in plain.items()}
         times = [at for at in moments if at >= T0]

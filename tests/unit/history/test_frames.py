@@ -127,7 +127,7 @@ def test_a_place_in_the_map_is_one_by_the_transforms_of_the_own_recording(
 
 def looked_up(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> Any:
     asks = {"parent": parent, "child": child, "timestamp": at / S}
-    return asked(memory, memory.index.bag_dir, "get_transform_at", **asks)
+    return asked(memory, "get_transform_at", **asks)
 
 
 def x_of(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> Any:
@@ -263,7 +263,7 @@ def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path) -> None:
     record(tmp_path / "r2", [*standing, *(boolean(at + 2, at == times[50]) for at in times)])
     bumped = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
     memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "get_value_when", value_topic="/odom", **bumped)
+    reply = asked(memory, "get_value_when", value_topic="/odom", **bumped)
     assert reply["value"]["position"]["x"] == 50
     assert reply["value_timestamp"] == T0 / S + 9.9
     assert [note for note in reply["notes"] if "/bumper" in note and note.endswith(": r1, r2")]

@@ -152,7 +152,7 @@ def torn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_every_tool_says_that_a_split_of_its_window_could_not_be_read(
     tool: str, given: dict[str, Any], torn: Memory
 ) -> None:
-    told = notes_of(asked(torn, torn.index.bag_dir, tool, **given))
+    told = notes_of(asked(torn, tool, **given))
     assert any(note.startswith(LOST) for note in told), told
 
 
@@ -160,7 +160,7 @@ def test_every_tool_says_that_a_split_of_its_window_could_not_be_read(
 def test_no_tool_speaks_of_a_split_that_its_window_does_not_touch(
     tool: str, given: dict[str, Any], torn: Memory
 ) -> None:
-    reply = asked(torn, torn.index.bag_dir, tool, **given)
+    reply = asked(torn, tool, **given)
     assert reply is None or "error" not in reply
     assert not any("could not be read" in note for note in notes_of(reply))
 
@@ -173,25 +173,25 @@ def test_the_split_being_written_is_reported_where_it_may_hold_newer_and_no_futu
     os.utime(active, ns=(T0 + 29 * S,) * 2)
     memory = memory_of(tmp_path, clock=FixedClock(T0 + 30 * S))
     written = f"the split being written is left out: nothing after {at(19):.6f}"
-    newest = asked(memory, tmp_path, "find_last_match", **SEEN)
+    newest = asked(memory, "find_last_match", **SEEN)
     assert (newest["timestamp"], newest["notes"]) == (at(10), [written])
-    older = asked(memory, tmp_path, "find_last_match", **SEEN, before=at(15))
+    older = asked(memory, "find_last_match", **SEEN, before=at(15))
     assert "notes" not in older
-    lately = asked(memory, tmp_path, "get_topic_in_last", topic="/odom", seconds=25)
+    lately = asked(memory, "get_topic_in_last", topic="/odom", seconds=25)
     assert lately["notes"] == [written]
-    now = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=1)
+    now = asked(memory, "get_position_seconds_ago", seconds_ago=1)
     assert (now["reason"], now["notes"]) == ("not_closed_yet", [written])
     # A time in the future is not waited for.
-    soon = asked(memory, tmp_path, "get_position_at", timestamp=at(80))
+    soon = asked(memory, "get_position_at", timestamp=at(80))
     assert soon["reason"] == "not_closed_yet"
-    future = asked(memory, tmp_path, "get_position_at", timestamp=at(3630))
+    future = asked(memory, "get_position_at", timestamp=at(3630))
     assert future["reason"] == "outside_range"
     assert f"the time asked is 3600 s in the future: it is {at(30):.6f} now" in future["detail"]
     assert "tolerance_s" not in future["detail"]
     window = {"topic": "/odom", "end": at(9000)}
-    begun = asked(memory, tmp_path, "get_topic_in_range", **window, start=at(25))
+    begun = asked(memory, "get_topic_in_range", **window, start=at(25))
     assert begun["reason"] == "not_closed_yet"
-    later = asked(memory, tmp_path, "get_topic_in_range", **window, start=at(8000))
+    later = asked(memory, "get_topic_in_range", **window, start=at(8000))
     assert later["reason"] == "outside_range"
     assert "in the future" in later["detail"]
 
@@ -201,11 +201,11 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_pa
     paths[2].write_bytes(paths[2].read_bytes()[:6000])
     os.utime(paths[2], ns=(T0 + 32 * S,) * 2)
     memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    [told] = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", start=at(1), end=at(31))[
-        "notes"
-    ][:1]
+    [told] = asked(memory, "get_topic_in_range", topic="/odom", start=at(1), end=at(31))["notes"][
+        :1
+    ]
     assert told.startswith("1 unfinished bag; its readable part is used: rec/rec_2.mcap (")
-    [named] = asked(memory, tmp_path, "data_time_range")["incomplete"]
+    [named] = asked(memory, "data_time_range")["incomplete"]
     assert named["file"] == "rec/rec_2.mcap"
     rows = queries.list_recorded_topics(memory, Call())
     assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
@@ -227,7 +227,7 @@ def test_a_chunk_that_is_lost_is_not_reported_in_windows_behind_it_whatever_is_s
     for start, is_lost in ((29, False), (5, False), (0, True)):
         asking = {"topic": "/odom", "fields": ["position.x"], "by": "day", "end": at(50)}
         replies = [
-            asked(memory, tmp_path, "get_topic_in_range", start=at(start), **asking)
+            asked(memory, "get_topic_in_range", start=at(start), **asking)
             for memory in (stored, plain)
         ]
         assert replies[0] == replies[1]
@@ -261,7 +261,7 @@ def test_many_topics_that_are_not_read_hide_no_damaged_file(tmp_path: Path, reca
     tear(tmp_path / "f" / "f_0.mcap")
     never = {"topic": "/*", "condition_type": "contains", "value": "never seen"}
     memory = memory_of(tmp_path, recalls=recalls)
-    notes = asked(memory, tmp_path, "find_last_match", **never)["notes"]
+    notes = asked(memory, "find_last_match", **never)["notes"]
     unread, damaged, undecoded = sorted(notes)
     assert undecoded.startswith(
         "messages of 6 topics could not be decoded: its message encoding 'protobuf'"
@@ -290,7 +290,7 @@ def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
         ("get_topic_in_range", window),
         ("trajectory_summary", window),
     ):
-        reply = asked(memory, tmp_path, tool, **given_)
+        reply = asked(memory, tool, **given_)
         assert (reply["error"], reply["reason"]) == ("no_data", "undecodable")
         assert "(keelson.Envelope) are recorded but cannot be decoded" in reply["detail"]
         assert any("may hold more: f/f_0.mcap" in note for note in reply["notes"])
@@ -315,7 +315,7 @@ def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
         path = tmp_path / "rec" / f"rec_{nth}.mcap"
         write_mcap(path, messages[10 * nth : 10 * nth + 10])
     memory = memory_of(tmp_path, recalls=recalls)
-    reply = asked(memory, tmp_path, "find_matches", **CUP)
+    reply = asked(memory, "find_matches", **CUP)
     seen = [n for n in range(20) if n not in damaged]
     [sighting] = reply["sightings"]
     assert (sighting["first_seen"], sighting["last_seen"]) == (T0_S + seen[0], T0_S + seen[-1])
@@ -343,7 +343,7 @@ def test_what_is_wrong_with_a_bag_is_reported_once(tmp_path: Path) -> None:
         ("recap", window),
     ):
         memory = memory_of(tmp_path, storage="rosbag2")
-        notes = asked(memory, tmp_path, tool, **given_)["notes"]
+        notes = asked(memory, tool, **given_)["notes"]
         [damaged] = [note for note in notes if "index by time is damaged" in note]
         assert "a/a_0.db3" in damaged
 
@@ -445,6 +445,6 @@ def test_a_reply_names_the_damage_of_its_window_alone(
     memory = memory_of(tmp_path, recalls=recalls)
     for start, is_named in ((0, True), (28, False), (45, True)):
         window = {"start": T0_S + start, "end": T0_S + start + 12}
-        reply = asked(memory, tmp_path, tool, **given, **window)
+        reply = asked(memory, tool, **given, **window)
         assert "error" not in reply
         assert any("could not be read whole" in note for note in notes_of(reply)) == is_named

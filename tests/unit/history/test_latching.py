@@ -50,7 +50,7 @@ def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
 def at(memory: Memory, topic: str, when: int) -> Any:
     """The reply to a question for a moment."""
     asks = {"topic": topic, "timestamp": when / S}
-    return asked(memory, memory.index.bag_dir, "get_topic_at_time", **asks)
+    return asked(memory, "get_topic_at_time", **asks)
 
 
 @pytest.mark.parametrize(
@@ -94,9 +94,9 @@ def test_a_value_of_another_time_and_a_pose_say_that_they_are_latched(tmp_path: 
     record(tmp_path, [text(T0, "office", MAP), bump, *drive(T0, T0 + S), text(T0 + 60 * S, "")])
     memory = remembered(tmp_path, latching=Latching(include=("/odom",)))
     bumped = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
-    shown = asked(memory, tmp_path, "get_value_when", value_topic=MAP, **bumped)
+    shown = asked(memory, "get_value_when", value_topic=MAP, **bumped)
     assert (shown["value_latched"], shown["value_age_s"]) == (True, 20.0)
-    pose = asked(memory, tmp_path, "get_position_at", timestamp=T0 / S + 30)
+    pose = asked(memory, "get_position_at", timestamp=T0 / S + 30)
     assert [note for note in pose["notes"] if "/odom is latched" in note and "30" in note]
 
 
@@ -193,7 +193,7 @@ def test_a_latched_value_is_not_held_into_a_time_that_was_deleted(
 def test_how_long_a_value_held_ends_where_a_time_was_deleted(bag_dir: Path, recalls: bool) -> None:
     asking = memory(bag_dir, recalls=recalls)
     window = {"topic": DOCKED, "start": T0_S + 10, "end": T0_S + 130}
-    changes = asked(asking, bag_dir, "get_topic_in_range", changes=True, **window)["changes"]
+    changes = asked(asking, "get_topic_in_range", changes=True, **window)["changes"]
     assert [spell_of(spell) for spell in changes] == [
         (True, 5.5, 10, True),
         (False, 15.5, 13.5, False),
@@ -201,10 +201,10 @@ def test_how_long_a_value_held_ends_where_a_time_was_deleted(bag_dir: Path, reca
         (False, 115.5, 3.5, False),
     ]
     undocked = {"condition_type": "equals", "value": False}
-    found = asked(asking, bag_dir, "find_matches", **window, **undocked)["sightings"]
+    found = asked(asking, "find_matches", **window, **undocked)["sightings"]
     spans = [(row["first_seen"] - T0_S, row["duration_s"]) for row in found]
     assert spans == [(115.5, 3.5), (15.5, 13.5)]
-    events = asked(asking, bag_dir, "recap", start=T0_S, end=T0_S + 130)["events"]
+    events = asked(asking, "recap", start=T0_S, end=T0_S + 130)["events"]
     flips = [event for event in events if event["text"] == "/docked became false"]
     assert [flip.get("duration_s") for flip in flips] == [13.5, None]
 
@@ -229,7 +229,7 @@ def test_a_value_is_not_held_on_across_messages_that_were_deleted_by_request(
     docked_then = {"topic": DOCKED, "condition_type": "equals", "value": True}
     for end, last in ((12, 12), (50, 20)):
         span = {"start": T0_S, "end": T0_S + end, "while": docked_then}
-        answer = asked(asking, tmp_path, "find_matches", **odometry, **span)
+        answer = asked(asking, "find_matches", **odometry, **span)
         [found] = answer["sightings"]
         assert (found["first_seen"] - T0_S, found["last_seen"] - T0_S) == (6, last)
     assert answer["unknown_s"] == 30

@@ -69,14 +69,14 @@ def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
     plain = memory_of(tmp_path)
     asks = {"parent": parent, "child": child, "timestamp": T0_S + later}
     for memory in (plain, with_store(plain, tmp_path)):
-        assert asked(memory, tmp_path, "get_transform_at", **asks)["reason"] == reason
+        assert asked(memory, "get_transform_at", **asks)["reason"] == reason
 
 
 @pytest.mark.parametrize("older_s", [12.631, 59.891])
 def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s: float) -> None:
     messages = [boolean(T0, True), text(T0 + round(older_s * S), "late")]
     write_mcap(tmp_path / "run" / "run_0.mcap", messages)
-    ask = partial(asked, memory_of(tmp_path), tmp_path, "get_topic_at_time", topic="/bumper")
+    ask = partial(asked, memory_of(tmp_path), "get_topic_at_time", topic="/bumper")
     detail = ask(timestamp=T0_S + older_s)["detail"]
     advised = re.search(r"tolerance_s of at least ([\d.]+)", detail)
     assert advised
@@ -93,7 +93,7 @@ def test_of_several_robots_in_one_folder_the_nearest_message_is_not_another_robo
     own = [odom(T0 + n * S, 0.0, 0.0, topic="/base/odometry") for n in range(10)]
     write_mcap(tmp_path / f"{names[0]}.mcap", [*own, text(T0, "one")])
     write_mcap(tmp_path / f"{names[1]}.mcap", [odom(T0 + year * S, 0.0, 0.0)])
-    ask = partial(asked, memory_of(tmp_path), tmp_path)
+    ask = partial(asked, memory_of(tmp_path))
     detail = ask("get_position_at", timestamp=T0_S + 5)["detail"]
     assert "robin" in detail
     assert "has no such topic; similar there: /base/odometry; give topic" in detail
@@ -154,31 +154,31 @@ def test_a_window_without_recording_is_not_answered_as_never(
     memory: Memory, bag_dir: Path, tool: str, window: tuple[int, int], reason: str
 ) -> None:
     start, end = (T0_S + each for each in window)
-    told = asked(memory, bag_dir, tool, **WINDOWED[tool], start=start, end=end)
+    told = asked(memory, tool, **WINDOWED[tool], start=start, end=end)
     assert (told["error"], told["reason"]) == ("no_data", reason)
     assert "the memory covers" in told["detail"]
 
 
 @pytest.mark.parametrize("tool", BEFORE)
 def test_never_before_the_memory_began_is_no_data(memory: Memory, bag_dir: Path, tool: str) -> None:
-    told = asked(memory, bag_dir, tool, **BEFORE[tool], before=T0_S - 1)
+    told = asked(memory, tool, **BEFORE[tool], before=T0_S - 1)
     assert (told["error"], told["reason"]) == ("no_data", "outside_range")
-    found = asked(memory, bag_dir, tool, **BEFORE[tool], before=T0_S + 90)
+    found = asked(memory, tool, **BEFORE[tool], before=T0_S + 90)
     assert found["timestamp"] == T0_S
     never = BEFORE[tool] | {"value": False}
-    assert asked(memory, bag_dir, tool, **never) is None
+    assert asked(memory, tool, **never) is None
 
 
 @pytest.mark.parametrize("tool", WINDOWED)
 def test_a_window_that_is_recorded_in_part_says_how_much(
     memory: Memory, bag_dir: Path, tool: str
 ) -> None:
-    told = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 149)
+    told = asked(memory, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 149)
     window = f"between {T0_S}.000000 and {T0_S + 149}.000000"
     assert f"recorded only 48 of 149 s {window}" in told["notes"]
-    whole = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39)
+    whole = asked(memory, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39)
     assert not any("recorded" in note for note in whole.get("notes", ()))
-    almost = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39.01)
+    almost = asked(memory, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39.01)
     assert not any("recorded only" in note for note in almost.get("notes", ()))
 
 
@@ -209,7 +209,7 @@ def exclude(apart: Path, start: int, stop: int) -> None:
 
 
 def ask(apart: Path, tool: str, **given: object) -> Any:
-    return asked(memory_of(apart), apart, tool, **given)
+    return asked(memory_of(apart), tool, **given)
 
 
 def causes(apart: Path) -> list[str]:
@@ -335,7 +335,7 @@ def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
         from_zero, clock=SettableClock(9 * S), limits=QuerySettings(now=now), recalls=recalls
     )
     for name, given in zero_questions(memory.index.snapshot().timeline.topics()):
-        reply = replied(memory, from_zero, name, given)
+        reply = replied(memory, name, given)
         told = f"{name}({given}): {reply.text[:2000]}"
         assert "92233720" not in reply.text, told
         value = json.loads(reply.text)
@@ -353,12 +353,12 @@ def test_a_window_below_zero_is_clamped_at_both_ends(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
     memory = memory_of(tmp_path, clock=SettableClock((begin_s + 9) * S))
     window = {"start": start, "end": end}
-    told = asked(memory, tmp_path, "recap", **window)
+    told = asked(memory, "recap", **window)
     assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
-    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    told = asked(memory, "find_matches", topic="/bumper", **SEARCH, **window)
     assert (told["error"], told["reason"]) == ("no_data", "outside_range")
     for tool in ("get_topic_in_range", "trajectory_summary"):
-        told = asked(memory, tmp_path, tool, topic="/odom", **window)
+        told = asked(memory, tool, topic="/odom", **window)
         assert "no message of /odom between 0.000000 and 0.000000" in told["detail"]
 
 
@@ -370,7 +370,7 @@ def test_no_span_that_was_searched_ends_before_it_begins(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
     memory = memory_of(tmp_path)
     window = {"start": start, "end": end}
-    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    told = asked(memory, "find_matches", topic="/bumper", **SEARCH, **window)
     if not end > begin / S > start:
         assert (told["error"], told["reason"]) == ("no_data", "outside_range")
         return

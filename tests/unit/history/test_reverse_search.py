@@ -96,7 +96,7 @@ def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recall
 
     def reply(tool: str, field: str, limit: float, topic: str = "/level") -> Any:
         given = {"topic": topic, "condition_type": "above", "field": field, "value": limit}
-        return asked(memory, tmp_path, tool, **given)
+        return asked(memory, tool, **given)
 
     for field in ("data", "value"):
         assert reply("find_last_match", field, 45)["timestamp"] == T0_S
@@ -253,6 +253,6 @@ def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
     over = partial(next, chain([0.0], repeat(math.inf)))
     monkeypatch.setattr(Call, "partial_after", lambda *_: Deadline.after(1.0, over))
     wash = {"topic": "/chatter", "condition_type": "contains", "value": "wash"}
-    reply = asked(memory_of(tmp_path), tmp_path, "find_matches", **wash)
+    reply = asked(memory_of(tmp_path), "find_matches", **wash)
     assert len(reply["sightings"]) == 4
     assert any("may have held for longer" in note for note in reply["notes"])

@@ -44,7 +44,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Memory:
 def driven(memory: Memory, start: int, stop: int) -> Any:
     """The path from a second to another."""
     span = {"start": T0_S + start, "end": T0_S + stop}
-    return asked(memory, memory.index.bag_dir, "trajectory_summary", **span)
+    return asked(memory, "trajectory_summary", **span)
 
 
 def differing(memory: Memory) -> list[tuple[tuple[str, str], str | None]]:
@@ -66,7 +66,7 @@ def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
     (note,) = warned(memory)
     assert "blue, red overlap in time" in note
     assert "/odom" in note
-    assert "robots are mixed (see notes)" in asked(memory, tmp_path, "memory_status")["doubts"]
+    assert "robots are mixed (see notes)" in asked(memory, "memory_status")["doubts"]
 
 
 def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Path) -> None:
@@ -78,14 +78,14 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
         assert own.complete(name)
     memory = memory_of(tmp_path)
     assert warned(memory) == []
-    status = asked(memory, tmp_path, "memory_status")
+    status = asked(memory, "memory_status")
     assert status["doubts"] == "the clock was set back between recordings (see notes)"
     (note,) = [note for note in status["notes"] if "one recorder made them" in note]
     assert ", ".join(sorted(names)) in note
-    path = asked(memory, tmp_path, "trajectory_summary", start=0, end=2 * T0_S)
+    path = asked(memory, "trajectory_summary", start=0, end=2 * T0_S)
     assert path["distance_m"] == pytest.approx(6.0, abs=0.1)
     assert "as after a clock was set back" in str(path["notes"])
-    visited = asked(memory, tmp_path, "visits", x=0.0, y=3.0, radius_m=1.0)
+    visited = asked(memory, "visits", x=0.0, y=3.0, radius_m=1.0)
     assert (visited["total"], visited.get("unknown_s", 0)) == (1, 0)
     assert "as after a clock was set back" in str(visited["notes"])
     # A copy that nobody listed may be of another robot.
@@ -116,7 +116,7 @@ def test_answers_from_messages_of_both_robots_say_so(both: Memory) -> None:
         ("get_position_at", {"timestamp": T0_S + 9}),
         ("recap", WINDOW),
     ):
-        notes = asked(both, both.index.bag_dir, tool, **given)["notes"]
+        notes = asked(both, tool, **given)["notes"]
         assert any(MIXED.search(note) for note in notes), (tool, given)
 
 
@@ -128,14 +128,14 @@ def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robot
         write_mcap(tmp_path / robot / f"{robot}_0.mcap", said)
     for word in ("blue 4", "red 5"):
         asks = {"topic": "/chatter", "condition_type": "equals", "value": word}
-        answer = asked(memory_of(tmp_path), tmp_path, "find_last_match", **asks)
+        answer = asked(memory_of(tmp_path), "find_last_match", **asks)
         assert [note for note in answer["notes"] if MIXED.search(note)]
 
 
 @pytest.mark.parametrize("asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}])
 def test_a_way_over_both_robots_is_not_known(both: Memory, asks: dict[str, object]) -> None:
     def ask(tool: str, **more: object) -> Any:
-        return asked(both, both.index.bag_dir, tool, **WINDOW, **asks, **more)
+        return asked(both, tool, **WINDOW, **asks, **more)
 
     told, unknown = ask("recap"), "the path is unknown: 2 recordings"
     assert [told.get(each) for each in ("distance_m", "max_speed", "stood_s")] == [None] * 3
@@ -156,7 +156,7 @@ def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
         write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
     memory = memory_of(tmp_path)
     assert differing(memory) == [(("run_1", "run_2"), "/odom")]
-    told = asked(memory, tmp_path, "trajectory_summary", start=0, end=61)
+    told = asked(memory, "trajectory_summary", start=0, end=61)
     assert told["reason"] == "mixed"
 
 
@@ -182,9 +182,9 @@ def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_record
     [note] = [each for each in told["notes"] if "run_0 and run_1" in each]
     assert "as after a clock was set back, or from two robots" in note
     assert note.endswith("the path there is that of run_0")
-    recapped = asked(memory, tmp_path, "recap", **window)
+    recapped = asked(memory, "recap", **window)
     assert recapped["distance_m"] == pytest.approx(told["distance_m"], abs=0.02)
-    by_hour = asked(memory, tmp_path, "trajectory_summary", **window, by="hour")
+    by_hour = asked(memory, "trajectory_summary", **window, by="hour")
     [[*_, metres]] = by_hour["rows"]
     assert metres == pytest.approx(told["distance_m"], abs=0.02)
     alone = driven(memory, 130, 200)
@@ -211,7 +211,7 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
         assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
         assert any("run_1 has the time from" in each for each in whole["notes"])
         for at, is_twice in ((50, True), (150, False)):
-            there = asked(known, tmp_path, "get_position_at", timestamp=T0_S + at)
+            there = asked(known, "get_position_at", timestamp=T0_S + at)
             assert ("run_1 has the time from" in str(there.get("notes"))) is is_twice
         assert len(whole["waypoints"]) == 4
 
@@ -266,7 +266,7 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         write_mcap(tmp_path / "run" / "run_0.mcap", logged, layout)
     plain = memory_of(tmp_path, storage="sqlite3" if kind == "db3" else "mcap")
     for memory in (plain, with_store(plain, tmp_path)):
-        (step,) = asked(memory, tmp_path, "data_time_range")["clock_steps"]
+        (step,) = asked(memory, "data_time_range")["clock_steps"]
         assert step["at"] == pytest.approx(T0_S + 20, abs=1)
         assert step["step_s"] == pytest.approx(-29.9, abs=2)
         path = driven(memory, 0, 70)
@@ -274,7 +274,7 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         assert path["gap_m"] == pytest.approx(30.0, abs=1.2)
         assert any("run has the time from" in note for note in path["notes"])
         # At log time 40 it was at x = 20 m and, 30 s later, at x = 35 m.
-        visits = asked(memory, tmp_path, "visits", x=35.0, y=0.0, radius_m=1.0)
+        visits = asked(memory, "visits", x=35.0, y=0.0, radius_m=1.0)
         assert visits["unknown_s"] == pytest.approx(30, abs=2.1)
         assert any("run has the time from" in note for note in visits["notes"])
 

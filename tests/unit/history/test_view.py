@@ -307,7 +307,7 @@ def sightings(recordings: Mapping[str, list[Msg]]) -> tuple[int, float]:
 
 def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
     """The same as `find_matches` counts it; both are 0 where there is no such topic."""
-    reply = asked(memory, bag_dir, "find_matches", **CUP, by="day", **SPAN)
+    reply = asked(memory, "find_matches", **CUP, by="day", **SPAN)
     values = dict(zip(reply.get("columns", ())[1:], reply.get("all", ()), strict=True))
     return values.get("count", 0), values.get("seconds", 0.0)
 
@@ -331,14 +331,14 @@ def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
         write_cut(bag_dir, recordings, draw)
         plain = memory_of(bag_dir)
         every = [with_store(plain, bag_dir, part=part, share=share) for share in (1.0, 0.0)]
-        recorded = asked(plain, bag_dir, "data_time_range")
+        recorded = asked(plain, "data_time_range")
         # Durations are without gaps, and pauses that look as where the clock was set ahead.
         if not has_types and not recorded["clock_steps"] and not recorded["gaps"]:
             assert counted(plain, bag_dir) == pytest.approx(sightings(recordings), abs=0.051)
         for name, given_ in QUESTIONS:
-            expected = asked(plain, bag_dir, name, **given_, **SPAN)
+            expected = asked(plain, name, **given_, **SPAN)
             stored = draw.choice(every)
-            assert_same_counts(asked(stored, bag_dir, name, **given_, **SPAN), expected)
+            assert_same_counts(asked(stored, name, **given_, **SPAN), expected)
 
 
 @pytest.mark.parametrize("recalls", [False, True], ids=["bags", "store"])
@@ -360,5 +360,5 @@ def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     memory = memory_of(tmp_path, recalls=recalls)
     wanted = {"topic": "/numbers", "condition_type": "equals", "field": "data.700"}
     for nth in range(0, 50, 6):
-        found = asked(memory, tmp_path, "find_matches", **wanted, value=4_000 * nth + 700)
+        found = asked(memory, "find_matches", **wanted, value=4_000 * nth + 700)
         assert [row["first_seen"] for row in found["sightings"]] == [T0 / S + nth // 5]

@@ -214,12 +214,12 @@ def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Pa
     messages = [message(n) for n in range(20)] + [message(n - 30) for n in range(20, 50)]
     write_mcap(tmp_path / "a.mcap", messages, LAYOUTS["indexed"])
     memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "data_time_range")
+    reply = asked(memory, "data_time_range")
     [fault] = reply["clock_faults"]
     assert "set back by 29 s or more while it was being written" in fault["reason"]
     assert reply["earliest"] == BEGIN / S - 10
     window = {"topic": messages[0].topic, "start": BEGIN / S, "end": BEGIN / S + 10}
-    assert "set back" in str(asked(memory, tmp_path, "get_topic_in_range", **window)["notes"])
+    assert "set back" in str(asked(memory, "get_topic_in_range", **window)["notes"])
 
 
 def test_a_time_that_damage_made_is_no_clock_that_was_set_back(tmp_path: Path) -> None:
@@ -229,12 +229,12 @@ def test_a_time_that_damage_made_is_no_clock_that_was_set_back(tmp_path: Path) -
     damage_time(path, times[50], times[20])
     damage_time(path, times[99], times[99] + 5 * S)
     memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "data_time_range")
+    reply = asked(memory, "data_time_range")
     assert "is not where its index says" in str(reply["notes"])
-    for said in (reply, asked(memory, tmp_path, "memory_status")):
+    for said in (reply, asked(memory, "memory_status")):
         assert "clock was set" not in str(said)
         assert "clock_steps" not in said or not said["clock_steps"]
-    way = asked(memory, tmp_path, "trajectory_summary", start=BEGIN / S, end=times[98] / S)
+    way = asked(memory, "trajectory_summary", start=BEGIN / S, end=times[98] / S)
     assert way["distance_m"] == pytest.approx(9.8, abs=0.2)
 
 

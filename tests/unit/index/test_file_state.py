@@ -263,7 +263,7 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
     held_back = "no bag is served yet: recording.exclude_when has still to be applied to 2 splits"
     assert nothing_here(index_of(bags).snapshot()) == held_back
     memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 3600 * S))
-    reply = asked(memory, bags.bag_dir, "recap", start=T0 // S, end=T0 // S + 5)
+    reply = asked(memory, "recap", start=T0 // S, end=T0 // S + 5)
     assert (reply["reason"], reply["detail"]) == (
         "not_closed_yet",
         f"{held_back}; ask again in 10 s",
@@ -287,8 +287,5 @@ def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: P
     limits = QuerySettings(screened=True, include_active=True, kept=RetentionLimits(10**9, 0))
     memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 12 * S), limits=limits)
     at = {"topic": "/chatter", "timestamp": T0 // S + 5}
-    assert (
-        "to 1 split; ask again in 25 s"
-        in asked(memory, bags.bag_dir, "get_topic_at_time", **at)["detail"]
-    )
+    assert "to 1 split; ask again in 25 s" in asked(memory, "get_topic_at_time", **at)["detail"]
     assert "the newest 25 s or so" in instructions(limits)

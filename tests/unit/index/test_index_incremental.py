@@ -313,11 +313,11 @@ def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) ->
     for name in ("rec_0 (copy).mcap", "another.mcap"):
         shutil.copy2(path, path.with_name(name))
     memory = memory_of(tmp_path, recalls=recalls)
-    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
+    [odometry] = asked(memory, "list_recorded_topics")
     assert odometry["count"] == 10
     assert [bag.file for bag in memory.index.snapshot().bags] == [str(path)]
     path.unlink()
-    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
+    [odometry] = asked(memory, "list_recorded_topics")
     assert odometry["count"] == 10
 
 
@@ -330,7 +330,7 @@ def test_another_bag_written_over_one_of_its_size_and_mtime_is_read_anew(
 
     def driven() -> float:
         of_all = {"start": 1_784_000_000, "end": 1_784_000_099}
-        return float(asked(memory, tmp_path, "trajectory_summary", **of_all)["distance_m"])
+        return float(asked(memory, "trajectory_summary", **of_all)["distance_m"])
 
     assert driven() == 0.9
     before, other = path.stat(), write_odometry(tmp_path / "other", 0.2, later=S).read_bytes()
@@ -350,5 +350,5 @@ def test_a_file_dated_after_2262_hides_no_bag(tmp_path: Path, recalls: bool, dat
         write_odometry(path, 0.1, later=int(path == paths[1]) * 10 * S)
     put(tmp_path / "rec" / "handover.json", '{"format": 1}')
     os.utime(tmp_path / "rec" / dated, ns=(LONG_AGO, 10_413_792_000 * S))
-    [odometry] = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "list_recorded_topics")
+    [odometry] = asked(memory_of(tmp_path, recalls=recalls), "list_recorded_topics")
     assert odometry["count"] == 20

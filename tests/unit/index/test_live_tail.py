@@ -117,7 +117,7 @@ class Tail:
         return [bag.state for bag in self.memory.index.refresh().bags]
 
     def asked(self, name: str, **arguments: object) -> Any:
-        return asked(self.memory, self.bag_dir, name, **arguments)
+        return asked(self.memory, name, **arguments)
 
 
 @pytest.fixture
@@ -143,12 +143,7 @@ def test_wherever_the_file_ends_all_whole_chunks_answer_and_nothing_that_is_not_
         assert aside.until == (T0 + (len(ticks) - 1) * TENTH if ticks else None)
         for tick in {*ticks[:1], *ticks[-1:]}:
             live = tail.asked("get_position_at", timestamp=T0 / S + tick / 10)
-            whole = asked(
-                closed(layout),
-                closed(layout).index.bag_dir,
-                "get_position_at",
-                timestamp=T0 / S + tick / 10,
-            )
+            whole = asked(closed(layout), "get_position_at", timestamp=T0 / S + tick / 10)
             assert live.pop("from_active") is True
             assert {**live, "notes": None} == {**whole, "notes": None}
 

@@ -34,7 +34,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
 
 def test_an_error_takes_the_place_of_what_is_not_there(memory: Memory, tmp_path: Path) -> None:
     times = [T0 + 5, T0 + 14.5, T0 + 15.5, T0 + 25, T0 + 5000]
-    told = asked(memory, tmp_path, "get_position_at", timestamps=times)
+    told = asked(memory, "get_position_at", timestamps=times)
     first, hole, again, last, beyond = told["results"]
     assert (first["x"], last["x"]) == (5.0, 25.0)
     assert (hole["at"], hole["error"], hole["reason"]) == (T0 + 14.5, "no_data", NoDataReason.GAP)
@@ -47,9 +47,9 @@ def test_an_error_takes_the_place_of_what_is_not_there(memory: Memory, tmp_path:
 
 def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory, tmp_path: Path) -> None:
     for timestamps in ({"timestamps": [T0, T0 + 1]}, {"timestamp": T0}):
-        told = asked(memory, tmp_path, "get_topic_at_time", topic="/nope", **timestamps)
+        told = asked(memory, "get_topic_at_time", topic="/nope", **timestamps)
         assert (told["error"], told["reason"]) == ("no_data", "topic_not_recorded")
-    refused = asked(memory, tmp_path, "get_position_at", timestamps=[T0], topic="/vision/*")
+    refused = asked(memory, "get_position_at", timestamps=[T0], topic="/vision/*")
     assert "error" in refused
 
 
@@ -58,10 +58,10 @@ def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
     messages.append(odom((T0 + 3) * S, 1.0, 0.0))
     write_mcap(tmp_path / "a" / "a_0.mcap", messages)
     memory = memory_of(tmp_path)
-    told = asked(memory, tmp_path, "get_position_at", timestamps=[T0, T0 + 1, T0 + 3])
+    told = asked(memory, "get_position_at", timestamps=[T0, T0 + 1, T0 + 3])
     assert told["notes"] == ["the recorded position is not a number"]
     assert all("notes" not in each for each in told["results"])
-    alone = asked(memory, tmp_path, "get_position_at", timestamps=[T0, T0 + 3])
+    alone = asked(memory, "get_position_at", timestamps=[T0, T0 + 3])
     assert [each.get("notes") for each in alone["results"]] == [told["notes"], None]
     assert "notes" not in alone
 
@@ -75,10 +75,10 @@ def test_a_window_with_too_many_messages_to_read_says_so(
     write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)])
     window = {"start": BEGIN / S, "end": BEGIN / S + 100, "fields": ["pose.covariance"]}
     memory = memory_of(tmp_path)
-    whole = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", **window)
+    whole = asked(memory, "get_topic_in_range", topic="/odom", **window)
     assert whole["extremes"]["pose.covariance"]["min"] == 0.0
     monkeypatch.setattr(fields, "MAX_MESSAGES", 3)
-    answer = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", **window)
+    answer = asked(memory, "get_topic_in_range", topic="/odom", **window)
     assert "extremes" not in answer
     assert fields.TOO_MANY in answer["notes"]
 

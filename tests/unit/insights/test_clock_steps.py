@@ -63,21 +63,21 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
     for memory in each_known(recorded(tmp_path, shown=lambda t: t + by * (t > when))):
         at = BEGIN + round(when - 0.05, 1)
         expected = [{"at": pytest.approx(at, abs=1e-5), "step_s": pytest.approx(by, abs=0.01)}]
-        assert asked(memory, tmp_path, "data_time_range")["clock_steps"] == expected
-        status = asked(memory, tmp_path, "memory_status")
+        assert asked(memory, "data_time_range")["clock_steps"] == expected
+        status = asked(memory, "memory_status")
         assert status["clock_steps"] == expected
         assert status["doubts"].endswith(f"the clock was set {by:g} s ahead")
-        reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 100)
+        reply = asked(memory, "recap", start=BEGIN, end=BEGIN + 100)
         [event] = [each for each in reply["events"] if "clock" in each["text"]]
         assert event["text"] == f"the clock was set forward by {by:g} s"
         assert reply["counts"]["clock steps"] == 1
         assert reply["duration_s"] == pytest.approx(100 - by, abs=0.05)
-        later = asked(memory, tmp_path, "recap", start=BEGIN + 100, end=BEGIN + 150)
+        later = asked(memory, "recap", start=BEGIN + 100, end=BEGIN + 150)
         assert "clock steps" not in later["counts"]
 
 
 def steps(memory: Memory, folder: Path) -> list[Any]:
-    found: list[Any] = asked(memory, folder, "data_time_range")["clock_steps"]
+    found: list[Any] = asked(memory, "data_time_range")["clock_steps"]
     return found
 
 
@@ -200,7 +200,7 @@ def test_pauses_that_are_not_looked_at_are_noted(
 
     memory = stamped(tmp_path, delay=lambda t: 2.0 * (t > 54.95), is_lost=is_lost)
     for tool in ("data_time_range", "memory_status"):
-        reply = asked(memory, tmp_path, tool)
+        reply = asked(memory, tool)
         assert not reply.get("clock_steps")
         assert any("only the newest 2 of 3 pauses" in note for note in reply["notes"]), tool
     monkeypatch.setattr(clock_steps, "_MOST_SUSPECTS", 3)
@@ -226,12 +226,12 @@ def test_a_step_back_that_several_bags_show_is_listed_once(tmp_path: Path, recor
     if recordings > 1:  # a rotation: the next one has begun already
         set_back_in_a_split(tmp_path / "next", 120, driven=False)
     memory = memory_of(tmp_path)
-    reply = asked(memory, tmp_path, "data_time_range")
+    reply = asked(memory, "data_time_range")
     [step] = reply["clock_steps"]
     assert -20 <= step["step_s"] <= -19
     assert step["at"] == pytest.approx(BEGIN - 5, abs=0.1)
     reasons = [fault["reason"] for fault in reply["clock_faults"]]
     within = "the clock was set back by 20 s or more while it was being written"
     assert reasons == [within] * recordings
-    recap = asked(memory, tmp_path, "recap", start=BEGIN - 10, end=BEGIN + 20)
+    recap = asked(memory, "recap", start=BEGIN - 10, end=BEGIN + 20)
     assert recap["counts"]["clock steps"] == 1

@@ -52,7 +52,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequ
 
 
 def ask(memory: Memory, tool: str, **given: object) -> Any:
-    return asked(memory, memory.index.bag_dir, tool, **given)
+    return asked(memory, tool, **given)
 
 
 def matches(memory: Memory, kind: str, value: str, **given: object) -> list[Any]:

@@ -64,7 +64,7 @@ def stalled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def ask(memory: Memory, tool: str, **arguments: Any) -> dict[str, Any]:
-    found: dict[str, Any] = asked(memory, memory.index.bag_dir, tool, **arguments)
+    found: dict[str, Any] = asked(memory, tool, **arguments)
     return found
 
 

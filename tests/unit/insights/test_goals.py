@@ -186,9 +186,9 @@ def test_a_goal_that_goes_on_lasts_as_far_as_something_is_recorded(tmp_path: Pat
         memory = memory_of(tmp_path)
         for end, lasted in ((60, 10), (2_000, 49)):
             given = {**executing, "start": BEGIN / S, "end": BEGIN / S + end}
-            reply = asked(memory, tmp_path, "find_matches", **given)
+            reply = asked(memory, "find_matches", **given)
             assert [row["duration_s"] for row in reply["sightings"]] == [lasted]
-            reply = asked(memory, tmp_path, "find_matches", **given, by="day")
+            reply = asked(memory, "find_matches", **given, by="day")
             assert table(reply)["all"]["seconds"] == lasted
 
 
@@ -207,8 +207,8 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     def held(word: str, begin: int, end: int) -> object:
         given = {"topic": TOPIC, "condition_type": "equals", "value": word}
         window = {"start": BEGIN / S + begin, "end": BEGIN / S + end}
-        rows = asked(memory, tmp_path, "find_matches", **given, **window)["sightings"]
-        by_hour = asked(memory, tmp_path, "find_matches", **given, **window, by="hour")
+        rows = asked(memory, "find_matches", **given, **window)["sightings"]
+        by_hour = asked(memory, "find_matches", **given, **window, by="hour")
         whole = table(by_hour)["all"]
         shown = [(row["duration_s"], row["began_earlier"], row["robot"]["x"]) for row in rows]
         return shown, whole["count"], whole["seconds"], str(whole["first"])[-5:]

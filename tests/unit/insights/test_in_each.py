@@ -71,7 +71,7 @@ def test_each_window_has_the_answer_that_it_has_alone(
     memory: Memory, folder: Path, tool: str, hours: str, first: int, last: int
 ) -> None:
     given = QUESTIONS[tool]
-    reply = asked(memory, folder, tool, between=hours, **SPAN, **given)
+    reply = asked(memory, tool, between=hours, **SPAN, **given)
     assert len(reply["windows"]) == DAYS
     shared = {key: each for key, each in reply.items() if key not in {"windows", "all", "notes"}}
     sums = dict.fromkeys(reply.get("all", ()), 0.0)
@@ -80,7 +80,7 @@ def test_each_window_has_the_answer_that_it_has_alone(
         begin = midnight + first if day else max(midnight + first, BEGIN)
         assert row["start"] == pytest.approx(begin, abs=1e-3)
         assert row["end"] == pytest.approx(midnight + last, abs=1e-3)
-        alone = asked(memory, folder, tool, **given, start=row["start"], end=row["end"])
+        alone = asked(memory, tool, **given, start=row["start"], end=row["end"])
         beside = {"start", "end", "local", "notes", "now", "quoted"}
         expected = {key: each for key, each in alone.items() if key not in beside}
         found = {key: each for key, each in {**shared, **row}.items() if key not in beside}
@@ -95,7 +95,7 @@ def test_what_comes_as_hours_end_and_begin_counts_once(tmp_path: Path, hours: st
     ticks = [text((MIDNIGHT + 3600 * nth) * S, "tick") for nth in range(24 * DAYS + 1)]
     write_mcap(tmp_path / "bag.mcap", ticks)
     given = {"topic": "/chatter", "start": MIDNIGHT, "end": MIDNIGHT + DAYS * DAY_S}
-    reply = asked(memory_of(tmp_path), tmp_path, "get_topic_in_range", **given, between=hours)
+    reply = asked(memory_of(tmp_path), "get_topic_in_range", **given, between=hours)
     assert reply["all"]["total"] == len(ticks)
 
 
@@ -103,9 +103,7 @@ def test_a_month_of_dates_has_the_hours_of_its_own_days(tmp_path: Path) -> None:
     ticks = [text((MIDNIGHT + 3600 * nth) * S, "tick") for nth in range(-24, 24 * 32)]
     write_mcap(tmp_path / "bag.mcap", ticks)
     given = {"topic": "/chatter", "start": "2026-07-14", "end": "2026-08-13", "max_samples": 1}
-    reply = asked(
-        memory_of(tmp_path), tmp_path, "get_topic_in_range", **given, between="20:00-24:00"
-    )
+    reply = asked(memory_of(tmp_path), "get_topic_in_range", **given, between="20:00-24:00")
     begins = [row["start"] - MIDNIGHT for row in reply["windows"]]
     assert begins == [day * DAY_S + 20 * 3600 for day in range(31)]
 
@@ -119,7 +117,7 @@ def _without_ages(value: Any) -> Any:
 
 
 def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory, folder: Path) -> None:
-    reply = asked(memory, folder, "trajectory_summary", between="12:00-13:00", **SPAN)
+    reply = asked(memory, "trajectory_summary", between="12:00-13:00", **SPAN)
     assert (reply["error"], reply["reason"]) == ("no_data", "gap")
 
 
@@ -127,21 +125,21 @@ def test_what_none_of_the_hours_have_is_said_as_it_is_without_them(
     memory: Memory, folder: Path
 ) -> None:
     given = {**HELLO, "topic": "/chater", "between": "23:59-00:02"}
-    reply = asked(memory, folder, "find_matches", **given, **SPAN)
+    reply = asked(memory, "find_matches", **given, **SPAN)
     assert reply["reason"] == "topic_not_recorded"
     assert "similar: /chatter" in reply["detail"]
     cups = {"topic": "/cups", "between": "23:59-00:02"}
     write_mcap(folder.parent / "more" / "rec" / "rec_0.mcap", [odom((BEGIN + 60) * S, 0.0, 0.0)])
     write_mcap(folder.parent / "more" / "b" / "b_0.mcap", [text((BEGIN + 600) * S, "x", "/cups")])
     more = memory_of(folder.parent / "more")
-    reply = asked(more, folder.parent / "more", "get_topic_in_range", **cups, **SPAN)
+    reply = asked(more, "get_topic_in_range", **cups, **SPAN)
     assert reply["error"] == "no_data"
     assert "none between these hours on any day" in reply["detail"]
     assert "no message of /cups" in reply["detail"]
 
 
 def test_days_that_were_not_asked_in_time_leave_no_total(memory: Memory, folder: Path) -> None:
-    whole = asked(memory, folder, "find_matches", **HELLO, between="23:59-00:02", **SPAN)
+    whole = asked(memory, "find_matches", **HELLO, between="23:59-00:02", **SPAN)
     asked_days: list[TimeRange] = []
 
     def ask(memory: Memory, span: TimeRange) -> Sightings:
@@ -164,7 +162,7 @@ def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None
     for day in (0, 40):
         write(draw(day, 20), tmp_path / f"day_{day}", begin=BEGIN + day * DAY_S)
     memory = asked_of(tmp_path, stored=False)
-    reply = asked(memory, tmp_path, "visits", where="kitchen", between="19:00-22:00")
+    reply = asked(memory, "visits", where="kitchen", between="19:00-22:00")
     assert "between takes at most 31 days: ask about a shorter window" in reply["detail"]
 
 

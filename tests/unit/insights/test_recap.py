@@ -126,9 +126,9 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     ]
     never = recap(memory, Call(), span, where="elsewhere")
     assert (never.visits, never.events, never.distance_m, never.stood) == (0, (), 0, 0)
-    refused = asked(memory, tmp_path, "recap", around=BEGIN / S + 20, where="room")
+    refused = asked(memory, "recap", around=BEGIN / S + 20, where="room")
     assert refused["error"] == "invalid_arguments"
-    robot = asked(memory, tmp_path, "recap", around=BEGIN / S + 20)["robot"]
+    robot = asked(memory, "recap", around=BEGIN / S + 20)["robot"]
     assert (robot["frame_id"], robot["in"]) == ("odom", "room")
 
 
@@ -140,7 +140,7 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
         body += [boolean(begin + n * S, n < 5, "/bumper") for n in range(20)]
         write_mcap(tmp_path / f"run{run}" / f"run{run}_0.mcap", body)
     memory, window = memory_of(tmp_path), {"start": BEGIN / S, "end": BEGIN / S + 7220}
-    answer = asked(memory, tmp_path, "recap", **window)
+    answer = asked(memory, "recap", **window)
     flips = [each for each in answer["events"] if each["text"].startswith("/bumper")]
     assert [each["text"] for each in flips] == [
         f"/bumper became {now}" for now in ("false", "true", "false", "true", "false")
@@ -149,7 +149,7 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
         pytest.approx(length, abs=1.0) if length else None for length in (15, 5, 15, 5, None)
     ]
     assert answer["stood_s"] == 0
-    path = asked(memory, tmp_path, "trajectory_summary", **window)
+    path = asked(memory, "trajectory_summary", **window)
     assert path["avg_speed"] == pytest.approx(0.5, abs=0.01)
     assert path["avg_speed"] <= path["max_speed"]
     assert path["duration_s"] == pytest.approx(7219.9)
@@ -167,7 +167,7 @@ def test_how_long_a_robot_stood_that_publishes_poses_only_while_it_moves_is_not_
 
     def stood(memory: Memory, end_s: int) -> object:
         given = {"start": BEGIN / S, "end": BEGIN / S + end_s}
-        return asked(memory, tmp_path, "recap", **given)["stood_s"]
+        return asked(memory, "recap", **given)["stood_s"]
 
     for memory in (memory_of(tmp_path), memory_of(tmp_path, recalls=True)):
         assert stood(memory, 120) is None
@@ -207,8 +207,7 @@ def driving(until: int, stops: float) -> list[Msg]:
 
 
 def before(memory: Memory, around: float, **given: float) -> dict[str, Any]:
-    folder, moment = memory.index.bag_dir, BEGIN / S + around
-    reply: dict[str, Any] = asked(memory, folder, "recap", around=moment, **given)
+    reply: dict[str, Any] = asked(memory, "recap", around=BEGIN / S + around, **given)
     return reply
 
 
@@ -265,7 +264,7 @@ def test_how_far_back_can_be_asked_and_a_stop_knows_what_changed_before_the_wind
         ("/bumper became true", 0.4),
     ]
     assert before(memory, 43.0, seconds_before=61)["error"] == "invalid_arguments"
-    reply = asked(memory, bag_dir, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
+    reply = asked(memory, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
     assert "/bumper became true" in [each["text"] for each in stop["before"]]
 

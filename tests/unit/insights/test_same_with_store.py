@@ -106,7 +106,7 @@ def test_every_question_is_answered_as_without_a_store(
                 given_ = {**question, "start": first / S, "end": last / S}
                 if tool == "compare":
                     given_ |= {"with_start": moments[0] / S - 1, "with_end": moments[1] / S}
-                answer = asked(plain, bags, tool, **given_)
+                answer = asked(plain, tool, **given_)
                 # What was joined of all that is stored serves when it is asked for again.
                 for _ in range(2):
-                    assert_same_counts(asked(known, bags, tool, **given_), answer)
+                    assert_same_counts(asked(known, tool, **given_), answer)

@@ -195,7 +195,7 @@ def test_rules_are_told_with_how_often_they_fired_and_what_of_a_moment_is_not_ke
         },
         {"rule": "door", "fired": 0, "moments": 0},
     ]
-    assert asked(memory, tmp_path, "memory_status")["rules"] == told["rules"]
+    assert asked(memory, "memory_status")["rules"] == told["rules"]
 
 
 def test_a_status_says_that_moments_cannot_be_listed(
@@ -205,7 +205,7 @@ def test_a_status_says_that_moments_cannot_be_listed(
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(saved_moments, "stored_moments_in", refused)
-    status = asked(memory_of(tmp_path), tmp_path, "memory_status")
+    status = asked(memory_of(tmp_path), "memory_status")
     assert "moments" not in status
     assert any("the moments cannot be listed: Permission denied" in n for n in status["notes"])
     with pytest.raises(RefusedError, match="Permission denied"):

@@ -122,9 +122,9 @@ def test_the_place_of_a_sighting_is_where_the_thing_was_at_the_stamp_of_its_mess
     seen = [replace(shown, log_time=BEGIN + at * S) for at in logged_s]
     write_splits(tmp_path, [*turning, *seen])
     memory = memory_of(tmp_path)
-    [row] = asked(
-        memory, tmp_path, "find_matches", topic=OBJECTS, condition_type="contains", value="cup"
-    )["sightings"]
+    [row] = asked(memory, "find_matches", topic=OBJECTS, condition_type="contains", value="cup")[
+        "sightings"
+    ]
     assert tuple(round(row["place"][name], 2) for name in ("x", "y")) == place
     assert row["place"]["frame_id"] == "map"
 
@@ -157,14 +157,12 @@ def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: 
     write_splits(tmp_path, [*driven, boolean(BEGIN + 9 * S, True)])
     memory = memory_of(tmp_path)
     fast = {"condition_type": "above", "value": 0.45, "field": "linear_velocity.x"}
-    reply = asked(memory, tmp_path, "find_matches", topic="/odom", fields=["position.x"], **fast)
+    reply = asked(memory, "find_matches", topic="/odom", fields=["position.x"], **fast)
     assert reply["sightings"][0]["value"] == {"position.x": 9.0}
     bumped = {"condition_type": "equals", "value": True}
     given = {"topic": "/*", "fields": "data", **bumped}
-    assert asked(memory, tmp_path, "find_matches", **given)["sightings"][0]["value"] == {
-        "data": True
-    }
-    refused = asked(memory, tmp_path, "find_matches", topic="/odom", fields=["nope"], **fast)
+    assert asked(memory, "find_matches", **given)["sightings"][0]["value"] == {"data": True}
+    refused = asked(memory, "find_matches", topic="/odom", fields=["nope"], **fast)
     assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
 
 
@@ -258,7 +256,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
 
     def texts(kind: str, value: JsonValue) -> list[object]:
         call = {"condition_type": kind, "value": value, "field": "level", "fields": ["msg"]}
-        found = asked(memory, tmp_path, "find_matches", topic="/rosout", **call)
+        found = asked(memory, "find_matches", topic="/rosout", **call)
         return [each["value"]["msg"] for each in found["sightings"]]
 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
@@ -272,7 +270,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
 
     def newest(topic: str, level: str, **more: object) -> Any:
         named = {"topic": topic, "condition_type": "equals", "value": level, **more}
-        return asked(memory, tmp_path, "find_last_match", **named)
+        return asked(memory, "find_last_match", **named)
 
     assert newest("/rosout", "Error")["value"]["msg"] == "lost"
     for more in ({}, {"field": "status.level"}):
@@ -293,7 +291,7 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
     raw_mcap(tmp_path / "rec" / "rec_0.mcap", fill)
     memory = memory_of(tmp_path)
     asks = {"topic": "/rosout", "condition_type": "above", "field": "level"}
-    found = asked(memory, tmp_path, "find_matches", **asks, value="WARN", fields=["message"])
+    found = asked(memory, "find_matches", **asks, value="WARN", fields=["message"])
     assert [each["value"]["message"] for each in found["sightings"]] == ["line 3", "line 2"]
     # Under one name with a log of ROS, of another hour.
     write_mcap(
@@ -301,10 +299,10 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
         [log_entry(BEGIN + (3600 + n) * S, 10 + 10 * n, "node", f"entry {n}") for n in range(5)],
     )
     memory = memory_of(tmp_path)
-    recap = asked(memory, tmp_path, "recap", start=BEGIN // S, end=BEGIN // S + 4)
+    recap = asked(memory, "recap", start=BEGIN // S, end=BEGIN // S + 4)
     [note] = [each for each in recap["notes"] if "foxglove.Log" in each]
     assert 'condition_type "equals", field "level", value 4 lists them' in note
-    recap = asked(memory, tmp_path, "recap", start=BEGIN // S + 3600, end=BEGIN // S + 3604)
+    recap = asked(memory, "recap", start=BEGIN // S + 3600, end=BEGIN // S + 3604)
     assert not [each for each in recap.get("notes", ()) if "foxglove.Log" in each]
 
 
@@ -324,8 +322,8 @@ def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
     memory = memory_of(tmp_path)
     asks = {"condition_type": "above", "field": "level", "value": "WARN", **more}
     topic = "condition_topic" if "value_topic" in more else "topic"
-    missing = asked(memory, tmp_path, name, **asks, **{topic: "/rosout"})
+    missing = asked(memory, name, **asks, **{topic: "/rosout"})
     assert (missing["error"], missing["reason"]) == ("no_data", "topic_not_recorded")
-    refused = asked(memory, tmp_path, name, **asks, **{topic: "/bumper"})
+    refused = asked(memory, name, **asks, **{topic: "/bumper"})
     assert refused["error"] == "invalid_arguments"
     assert "names of levels are not known of std_msgs/msg/Bool" in refused["detail"]

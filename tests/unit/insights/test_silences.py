@@ -48,22 +48,22 @@ def test_around_what_was_deleted_by_request_a_silence_stays_one(
 ) -> None:
     """91 s of silence: 10 s of it deleted leave a part that is long enough, and one that is not."""
     append_losses(bag_dir, [Loss(SEEN, (BEGIN + 109) * S, (BEGIN + 119) * S, 9, "forgotten")])
-    [left] = asked(memory, bag_dir, "memory_status")["silences"]
+    [left] = asked(memory, "memory_status")["silences"]
     assert (left["start"], left["end"]) == (BEGIN + 119, BEGIN + 190.000001)
     assert left["silent_s"] == pytest.approx(71.0)
 
 
 def test_a_recap_has_it_as_an_event(memory: Memory, bag_dir: Path) -> None:
-    reply = asked(memory, bag_dir, "recap", start=BEGIN, end=BEGIN + 300)
+    reply = asked(memory, "recap", start=BEGIN, end=BEGIN + 300)
     [event] = [each for each in reply["events"] if "silent" in each["text"]]
     assert event["text"] == f"{SEEN} was silent"
     assert (event["timestamp"], event["duration_s"]) == (BEGIN + 99.000001, pytest.approx(91.0))
     assert reply["counts"]["silences"] == 1
-    within = asked(memory, bag_dir, "recap", start=BEGIN + 120, end=BEGIN + 150)
+    within = asked(memory, "recap", start=BEGIN + 120, end=BEGIN + 150)
     assert [each["timestamp"] for each in within["events"] if "silent" in each["text"]] == [
         BEGIN + 120
     ]
-    before = asked(memory, bag_dir, "recap", start=BEGIN, end=BEGIN + 90)
+    before = asked(memory, "recap", start=BEGIN, end=BEGIN + 90)
     assert "silences" not in before["counts"]
 
 
@@ -79,7 +79,7 @@ def test_compare_counts_how_long_a_topic_was_silent_while_the_robot_was_on(tmp_p
         write_mcap(tmp_path / "run" / f"run_{begin}.mcap", messages)
     first = {"start": BEGIN, "end": BEGIN + morning + 1200}
     other = {"with_start": BEGIN + morning + 1200, "with_end": BEGIN + morning + 2399}
-    reply = asked(memory_of(tmp_path), tmp_path, "compare", **first, **other)
+    reply = asked(memory_of(tmp_path), "compare", **first, **other)
     assert reply["silent_s"] == {"/camera": {"this": 1200.0, "with": 0.0}}
 
 
@@ -102,7 +102,7 @@ def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
 
     monkeypatch.setattr("ros2_memory.insights.silences.cut_spans", cut_spans)
     memory = memory_of(tmp_path)
-    found = asked(memory, tmp_path, "memory_status")["silences"]
+    found = asked(memory, "memory_status")["silences"]
     assert [(each["topic"], each["start"] - BEGIN) for each in found] == [
         ("/late", pytest.approx(329)),
         ("/early", pytest.approx(319)),
@@ -111,7 +111,7 @@ def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
         ("/early", pytest.approx(59)),
     ]
     assert cut == {"/early": 1, "/late": 1}
-    asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 50)
+    asked(memory, "recap", start=BEGIN, end=BEGIN + 50)
     assert cut.total() == 2
-    asked(memory, tmp_path, "recap", start=BEGIN + 100, end=BEGIN + 150)
+    asked(memory, "recap", start=BEGIN + 100, end=BEGIN + 150)
     assert cut.total() > 2

@@ -50,7 +50,7 @@ def remembering(
 
 
 def shown(memory: Memory, folder: Path) -> dict[str, Any]:
-    reply: dict[str, Any] = asked(memory, folder, "memory_status")
+    reply: dict[str, Any] = asked(memory, "memory_status")
     return reply
 
 
@@ -126,7 +126,7 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     assert shown(memory, tmp_path)["doubts"] == sentence
     for until, notes in ((45, []), (60, [sentence])):
         window = {"start": BEGIN / S + 40, "end": BEGIN / S + until}
-        recap = asked(memory, tmp_path, "recap", **window)
+        recap = asked(memory, "recap", **window)
         assert [note for note in recap.get("notes", ()) if after in note] == notes
     (tmp_path / "later").mkdir()
     messages = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(55, 60)]
@@ -141,11 +141,11 @@ def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_p
     begin = BEGIN / S
     for start, count in ((0, 1), (12, 0), (25, 6)):
         window = {"start": begin + start, "end": begin + start + 15}
-        found = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", **window)
+        found = asked(memory, "get_topic_in_range", topic="/odom", **window)
         notes = [note for note in found.get("notes", ()) if "lost" in note]
         assert [int(note[0]) for note in notes] == [count] * bool(count)
     asks = {"start": begin, "end": begin + 20, "with_start": begin + 21, "with_end": begin + 45}
-    notes = asked(memory, tmp_path, "compare", **asks)["notes"]
+    notes = asked(memory, "compare", **asks)["notes"]
     assert "from start to end: 1 message lost before it was recorded: /odom (1)" in notes
     assert (
         "from with_start to with_end: 6 messages lost before they were recorded: /odom (6)" in notes
@@ -198,9 +198,9 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
         memory = with_store(memory, tmp_path)
     else:
         assert shown(memory, tmp_path)["doubts"] == SOUND
-        asked(memory, tmp_path, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 10)
+        asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 10)
     assert shown(memory, tmp_path)["doubts"].startswith("1 bag could not be read whole; data_time")
-    [note] = asked(memory, tmp_path, "data_time_range")["notes"]
+    [note] = asked(memory, "data_time_range")["notes"]
     assert note.startswith("rec/rec_0.mcap: damaged: ")
     write_mcap(bag, driven)
     memory.index.refresh()

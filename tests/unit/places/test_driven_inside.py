@@ -29,8 +29,8 @@ ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)
 
 def in_both_frames(memory: Memory, folder: Path, span: dict[str, float]) -> tuple[Any, Any]:
     """What was driven, with waypoints in the frame of the poses, and in the map."""
-    own = asked(memory, folder, "trajectory_summary", **span)
-    return own, asked(memory, folder, "trajectory_summary", frame_id="map", **span)
+    own = asked(memory, "trajectory_summary", **span)
+    return own, asked(memory, "trajectory_summary", frame_id="map", **span)
 
 
 def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_path: Path) -> None:
@@ -38,7 +38,7 @@ def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_pat
     memory = memory_of(tmp_path)
     span = {"start": BEGIN / S, "end": BEGIN / S + 1000}
     own, moved = in_both_frames(memory, tmp_path, span)
-    inside = asked(memory, tmp_path, "trajectory_summary", where=LEFT, frame_id="map", **span)
+    inside = asked(memory, "trajectory_summary", where=LEFT, frame_id="map", **span)
     assert own["frame_id"] == "odom"
     assert moved["frame_id"] == inside["frame_id"] == "map"
     assert moved["distance_m"] == own["distance_m"]
@@ -47,9 +47,7 @@ def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_pat
     ]
     # Before the first correction no transform leads to the map, and the first one holds.
     for each in moved["waypoints"][1::4]:
-        there = asked(
-            memory, tmp_path, "get_position_at", timestamp=each["timestamp"], frame_id="map"
-        )
+        there = asked(memory, "get_position_at", timestamp=each["timestamp"], frame_id="map")
         for name in ("x", "y", "yaw_deg"):
             assert each[name] == pytest.approx(there[name], abs=0.02)
     assert all(-1.1 <= each["x"] <= 2.1 for each in inside["waypoints"])
@@ -92,7 +90,7 @@ def test_what_was_driven_up_to_a_gap_was_not_driven_in_it(tmp_path: Path, recall
     write_splits(tmp_path, messages, 15)
     memory = memory_of(tmp_path, recalls=recalls)
     given = {"start": BEGIN / S, "end": BEGIN / S + 65, "where": {"x": [-1, 4], "y": [-1, 1]}}
-    inside = asked(memory, tmp_path, "trajectory_summary", **given)
+    inside = asked(memory, "trajectory_summary", **given)
     driven = [inside["distance_m"], inside["max_speed"]]
     assert driven == pytest.approx([3.0, 0.2], abs=0.02)
 
@@ -124,10 +122,10 @@ def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of
     memory = memory_of(tmp_path, recalls=recalls)
     window = {"start": BEGIN / S, "end": BEGIN / S + 90}
     where = {"x": [15, 20], "y": [-1, 1]}
-    inside = asked(memory, tmp_path, "trajectory_summary", where=where, **window)
+    inside = asked(memory, "trajectory_summary", where=where, **window)
     assert len(inside["waypoints"]) == 2
     for each in inside["waypoints"]:
-        there = asked(memory, tmp_path, "get_position_at", timestamp=each["timestamp"])
+        there = asked(memory, "get_position_at", timestamp=each["timestamp"])
         assert each["yaw_deg"] == there["yaw_deg"]
 
 
@@ -152,9 +150,7 @@ def test_it_is_the_pose_of_the_window_or_of_a_place_that_is_farthest(
         bounds = {"start": ROOMS_BEGIN + first, "end": ROOMS_BEGIN + first + 60}
         given: dict[str, Any] = {"where": ", ".join(rooms)} if rooms else {}
         point = {"x": x, "y": 1.0}
-        reply = asked(
-            memory, Path(name), "trajectory_summary", farthest_from=point, **bounds, **given
-        )
+        reply = asked(memory, "trajectory_summary", farthest_from=point, **bounds, **given)
         poses = {
             nth: math.hypot(world.x[nth] - x, 1.0)
             for nth in range(first, first + 61)
@@ -193,7 +189,7 @@ def test_what_is_no_point_is_named(
     memory: Memory, tmp_path: Path, given: dict[str, Any], said: str
 ) -> None:
     span = {"start": ROOMS_BEGIN, "end": ROOMS_BEGIN + 60}
-    reply = asked(memory, tmp_path, "trajectory_summary", **span, **given)
+    reply = asked(memory, "trajectory_summary", **span, **given)
     assert said in reply["detail"]
 
 

@@ -106,18 +106,18 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
     hello = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
 
     def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
-        return table(asked(memory, tmp_path, tool, **given))[row]
+        return table(asked(memory, tool, **given))[row]
 
-    places = asked(memory, tmp_path, "visits")["places"]
+    places = asked(memory, "visits")["places"]
     assert [(row["place"], row["exits"], row["minutes"]) for row in places] == [
         ("here", 1, 0.5),
         ("there", 1, 0.5),
     ]
     for name, first in (("here", 0), ("there", 5)):
-        seen = asked(memory, tmp_path, "visits", where=name)
+        seen = asked(memory, "visits", where=name)
         assert (seen["total"], seen["exits"], seen["minutes"]) == (1, 1, 0.5)
         assert cells("visits", "all", where=name, by="hour")["minutes"] == 0.5
-        [found] = asked(memory, tmp_path, "find_matches", where=name, **hello)["sightings"]
+        [found] = asked(memory, "find_matches", where=name, **hello)["sightings"]
         assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
         assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
 

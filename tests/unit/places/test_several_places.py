@@ -71,21 +71,19 @@ def test_what_happened_in_any_of_several_places_is_what_happened_in_one_of_them(
         memory = asked_of(bags, stored=stored)
         where = ", ".join(rooms)
         runs = world.runs_in(*rooms)
-        seen = asked(memory, bags, "find_matches", where=where, limit=100, **HELLO)
+        seen = asked(memory, "find_matches", where=where, limit=100, **HELLO)
         assert [
             (row["first_seen"] - BEGIN, row["last_seen"] - BEGIN, row["count"])
             for row in reversed(seen["sightings"])
         ] == [(run.first, run.last, run.messages) for run in runs]
-        visits = asked(memory, bags, "visits", where=where, limit=100)
+        visits = asked(memory, "visits", where=where, limit=100)
         assert [row["arrived"] - BEGIN for row in reversed(visits["visits"])] == [
             run.first for run in runs
         ]
-        driven = asked(
-            memory, bags, "trajectory_summary", where=where, start=BEGIN, end=BEGIN + 150
-        )
+        driven = asked(memory, "trajectory_summary", where=where, start=BEGIN, end=BEGIN + 150)
         assert driven["visits"] == len(runs)
         assert driven["distance_m"] == pytest.approx(world.metres_in(*rooms), abs=0.3)
-        by_place = table(asked(memory, bags, "visits", where=where, by="place"))
+        by_place = table(asked(memory, "visits", where=where, by="place"))
         assert [*by_place] == [*rooms, "(elsewhere)", "(unknown)", "all"]
         for room in rooms:
             own = world.runs_in(room)
@@ -115,9 +113,9 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
     memory: Memory, folder: Path, world: World, tool: str
 ) -> None:
     given: dict[str, Any] = {**(HELLO if tool == "find_matches" else {}), **SPAN}
-    rows = table(asked(memory, folder, tool, by="place", where=bounds("hall", "kitchen"), **given))
+    rows = table(asked(memory, tool, by="place", where=bounds("hall", "kitchen"), **given))
     assert [*rows] == ["hall", "kitchen", "(elsewhere)", "(unknown)", "all"]
-    named = table(asked(memory, folder, tool, by="place", where=["hall", "kitchen"], **given))
+    named = table(asked(memory, tool, by="place", where=["hall", "kitchen"], **given))
     assert rows == named
     if tool == "trajectory_summary":
         for room in ("hall", "kitchen"):
@@ -134,7 +132,7 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
 def test_two_spellings_of_a_place_are_one(memory: Memory, folder: Path) -> None:
     given = {**HELLO, **SPAN, "by": "place"}
     once, twice = (
-        asked(memory, folder, "find_matches", where=where, **given)
+        asked(memory, "find_matches", where=where, **given)
         for where in (["hall", "den"], ["hall", "den", "Hall "])
     )
     assert twice == once
@@ -161,7 +159,7 @@ def test_two_spellings_of_a_place_are_one(memory: Memory, folder: Path) -> None:
 def test_what_is_no_place_is_named_with_the_reason_and_what_to_do(
     memory: Memory, folder: Path, where: Any, said: str
 ) -> None:
-    reply = asked(memory, folder, "visits", where=where)
+    reply = asked(memory, "visits", where=where)
     assert reply["error"] == "invalid_arguments"
     assert said in reply["detail"]
 
@@ -179,7 +177,7 @@ def test_what_is_no_place_is_named_with_the_reason_and_what_to_do(
 def test_a_place_is_named_once_and_in_a_frame_of_the_robot(
     memory: Memory, folder: Path, given: dict[str, Any], said: str | None
 ) -> None:
-    reply = asked(memory, folder, "visits", **given)
+    reply = asked(memory, "visits", **given)
     assert (said is None) == ("error" not in reply)
     assert said is None or said in reply["detail"]
 
@@ -198,8 +196,8 @@ def test_of_several_conditions_on_other_topics_all_must_hold(
     ]
     given = {**HELLO, "topic": "/chatter" if by != "label" else SEEN, "limit": 100}
     given |= {"value": "" if by == "label" else "hello"} | ({} if by is None else {"by": by})
-    found = asked(memory, folder, "find_matches", **given, **{"while": both})
-    assert found == asked(memory, folder, "find_matches", **given, **{"while": json.dumps(both)})
+    found = asked(memory, "find_matches", **given, **{"while": both})
+    assert found == asked(memory, "find_matches", **given, **{"while": json.dumps(both)})
     runs = world.runs_in("hall")
     if by is None:
         assert [
@@ -207,7 +205,7 @@ def test_of_several_conditions_on_other_topics_all_must_hold(
             for row in reversed(found["sightings"])
         ] == [(run.first, run.last) for run in runs]
     else:
-        within = asked(memory, folder, "find_matches", **given, where="hall")
+        within = asked(memory, "find_matches", **given, where="hall")
         assert found["rows"] == within["rows"]
 
 
@@ -235,5 +233,5 @@ def test_what_no_message_of_another_topic_can_meet_is_refused(
     memory = memory_of(tmp_path, recalls=recalls)
     cup = {"topic": "/chatter", "condition_type": "contains", "value": "cup", "while": during}
     for by in ({}, {"by": "hour"}):
-        refused = asked(memory, tmp_path, "find_matches", **cup, **by)
+        refused = asked(memory, "find_matches", **cup, **by)
         assert said in refused["detail"]

@@ -51,8 +51,8 @@ def test_pauses_of_the_recording_are_no_unknown_time(tmp_path: Path) -> None:
     write_splits(tmp_path, later, name="second")
     memory = memory_of(tmp_path)
     for scope in ({"where": HERE}, {"while": CALM}):
-        assert "unknown_s" not in asked(memory, tmp_path, "find_matches", **PRESSED, **scope)
-    assert "unknown_s" not in asked(memory, tmp_path, "visits", **HERE)
+        assert "unknown_s" not in asked(memory, "find_matches", **PRESSED, **scope)
+    assert "unknown_s" not in asked(memory, "visits", **HERE)
 
 
 @pytest.mark.parametrize("latched", [False, True])
@@ -64,7 +64,7 @@ def test_what_a_seldom_topic_said_holds_in_another_run_only_if_it_is_latched(
     said = life(60, {"/mood": [(0, 30), (31, 60)]})
     later = [replace(one, log_time=one.log_time + 600 * S) for one in said]
     write_splits(tmp_path, later, name="second", layout=layout)
-    answer = asked(memory_of(tmp_path), tmp_path, "find_matches", **PRESSED, **{"while": CALM})
+    answer = asked(memory_of(tmp_path), "find_matches", **PRESSED, **{"while": CALM})
     begins = [row["first_seen"] - T0 for row in answer["sightings"]]
     assert begins == [600 if latched else 630, 0]
     assert answer.get("unknown_s") == (None if latched else 30)
@@ -77,13 +77,13 @@ def test_a_time_that_a_recording_has_twice_is_unknown_however_short_it_is(tmp_pa
     write_mcap(tmp_path / "run" / "run_0.mcap", messages[: len(messages) // 2])
     write_mcap(tmp_path / "run" / "run_1.mcap", later)
     memory = memory_of(tmp_path)
-    whole = table(asked(memory, tmp_path, "visits", **HERE, by="hour"))["all"]
+    whole = table(asked(memory, "visits", **HERE, by="hour"))["all"]
     told = [
         *(
-            asked(memory, tmp_path, "find_matches", **PRESSED, **scope)
+            asked(memory, "find_matches", **PRESSED, **scope)
             for scope in ({"where": HERE}, {"while": PRESSED})
         ),
-        asked(memory, tmp_path, "visits", **HERE),
+        asked(memory, "visits", **HERE),
         whole,
     ]
     assert [each["unknown_s"] for each in told] == pytest.approx([4.8] * 4, abs=0.05)
@@ -120,14 +120,12 @@ def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: 
         for given, name in (({"where": HERE}, "/odom"), ({"while": CALM}, "/mood")):
             if len(times[name]) < 20:
                 continue
-            found = asked(memory, bag_dir, "find_matches", **PRESSED, **given, **window)
+            found = asked(memory, "find_matches", **PRESSED, **given, **window)
             expected = brute(times[name], *bounds) / S
             assert found.get("unknown_s", 0) == pytest.approx(expected, abs=1e-3)
             assert ("unknown_s" in found) is (expected > 0)
-            by_hour = asked(
-                memory, bag_dir, "find_matches", **PRESSED, **given, **window, by="hour"
-            )
+            by_hour = asked(memory, "find_matches", **PRESSED, **given, **window, by="hour")
             assert table(by_hour)["all"].get("unknown_s", 0) == pytest.approx(expected, abs=0.06)
             if name == "/odom":
-                visited = asked(memory, bag_dir, "visits", **HERE, **window)
+                visited = asked(memory, "visits", **HERE, **window)
                 assert visited.get("unknown_s", 0) == found.get("unknown_s", 0)

@@ -54,7 +54,7 @@ def test_a_robot_that_is_there_still_has_not_departed(
     memory = replace(memory, limits=replace(memory.limits, now=now))
     if now == "wall":
         memory = at(memory, BEGIN + 75 * S)
-    shown = asked(memory, tmp_path, "visits", **THERE)
+    shown = asked(memory, "visits", **THERE)
     assert shown["there_now"] is True
     [visit] = shown["visits"]
     assert visit["departed"] is None
@@ -68,7 +68,7 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
     newest = BEGIN + round(49.8 * S)
     for later in (31 * S, 365 * 86_400 * S):
-        shown = asked(at(memory, newest + later), tmp_path, "visits", **THERE)
+        shown = asked(at(memory, newest + later), "visits", **THERE)
         assert "there_now" not in shown
         [visit] = shown["visits"]
         assert visit["departed"] == pytest.approx(newest / S)
@@ -102,14 +102,11 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
     [hint] = [each for each in found.notes if "x and y were taken in map" in each]
     assert hint.endswith('get_position_*: ask with frame_id "odom"')
     replies = [
-        asked(memory, tmp_path, "visits", by="hour", **pasted),
-        asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 9, where=pasted),
-        asked(
-            memory, tmp_path, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 9, where=pasted
-        ),
+        asked(memory, "visits", by="hour", **pasted),
+        asked(memory, "recap", start=BEGIN / S, end=BEGIN / S + 9, where=pasted),
+        asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 9, where=pasted),
         asked(
             memory,
-            tmp_path,
             "find_matches",
             topic="/odom",
             condition_type="above",
@@ -219,16 +216,16 @@ def test_by_transforms_alone_the_robot_is_what_moves_in_odometry(tmp_path: Path,
     ]
     write_mcap(tmp_path / "rec/rec_0.mcap", messages)
     memory = memory_of(tmp_path)
-    found = asked(memory, tmp_path, "get_position_at", timestamp=BEGIN / S + 40)
+    found = asked(memory, "get_position_at", timestamp=BEGIN / S + 40)
     assert found["x"] == pytest.approx(1.4 + 20.0, abs=0.1)
     # It is in places of its odometry, too, as where a topic has its poses.
     places = (Place("dock", "odom", Circle(10.0, 0.0, 1.0)), Place("hall", "map", Circle(11, 2, 1)))
     memory = replace(memory, limits=replace(memory.limits, places=places))
-    table = asked(memory, tmp_path, "visits")["places"]
+    table = asked(memory, "visits")["places"]
     assert [(row["place"], row["entries"], row["minutes"]) for row in table] == [
         ("dock", 1, 0.07),
         ("hall", 1, 0.07),
     ]
     for asks in ({"where": "dock"}, {"x": 10.0, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"}):
-        seen = asked(memory, tmp_path, "visits", **asks)
+        seen = asked(memory, "visits", **asks)
         assert (seen["frame_id"], seen["total"]) == ("odom", 1)

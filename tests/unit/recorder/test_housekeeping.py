@@ -299,7 +299,7 @@ def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
     memory = replace(memory, index=index)
 
     def ask(tool: str, **given: object) -> Any:
-        return asked(memory, tmp_path, tool, start=T0 / S, end=T0 / S + 24.5, **given)
+        return asked(memory, tool, start=T0 / S, end=T0 / S + 24.5, **given)
 
     assert ask("get_topic_in_range", topic="/odom")["total"] == 25
     for path in paths[:2]:
@@ -311,7 +311,7 @@ def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
     paths[2].unlink()
     assert ask("get_topic_in_range", topic="/odom")["error"] == "no_data"
     assert ask("trajectory_summary")["error"] == "no_data"
-    assert asked(memory, tmp_path, "list_recorded_topics") == []
+    assert asked(memory, "list_recorded_topics") == []
 
 
 class TestRemoval:

@@ -67,7 +67,7 @@ def bag_dir(deleted: Path, tmp_path: Path) -> Path:
 
 
 def ask(bag_dir: Path, tool: str, **given: object) -> Any:
-    return asked(memory_of(bag_dir, clock=SettableClock(NOW)), bag_dir, tool, **given)
+    return asked(memory_of(bag_dir, clock=SettableClock(NOW)), tool, **given)
 
 
 def test_splits_that_retention_deleted_around_a_moment_are_not_missing(bag_dir: Path) -> None:

@@ -92,7 +92,7 @@ def test_a_damaged_chunk_is_reported_where_what_is_asked_may_be_in_it(tmp_path: 
 
     def is_noted(tool: str, value: str = "person", **given: float) -> bool:
         asks = {"topic": "/*", "condition_type": "contains", "value": value, **given}
-        reply, again = (asked(each, tmp_path, tool, **asks) for each in (plain, recalled))
+        reply, again = (asked(each, tool, **asks) for each in (plain, recalled))
         assert reply == again
         return "a_0.mcap could not be read whole" in str(reply.get("notes"))
 
@@ -117,7 +117,7 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported
     plain = memory_of(tmp_path)
     for memory in (plain, with_store(plain, tmp_path)):
         asks = {"topic": "/dock", "condition_type": "contains", "value": "docked"}
-        found = asked(memory, tmp_path, "find_last_match", **asks)
+        found = asked(memory, "find_last_match", **asks)
         assert found["timestamp"] == 100
         assert "a_0.mcap could not be read whole" in found["notes"][0]
 

@@ -128,9 +128,7 @@ def test_a_message_index_that_is_wrong_costs_no_message_and_is_named(
         reader.newest(path, "/chatter", EVERYTHING)
     assert read_on(reader, path)[0] == [*range(count)]
     assert any("without its indexes" in note for note in reader.summarize(path).notes)
-    reply = asked(
-        memory_of(tmp_path), tmp_path, "get_topic_in_range", topic="/chatter", start=0, end=1
-    )
+    reply = asked(memory_of(tmp_path), "get_topic_in_range", topic="/chatter", start=0, end=1)
     assert reply["total"] == count
     assert reply["notes"][0].endswith(f"a.mcap contradicts itself: {note}")
 

@@ -133,7 +133,7 @@ def test_a_time_that_no_clock_shows_is_left_out_and_reported(tmp_path: Path, tim
     assert summary.notes == ("left out: 1 message without a possible log time",)
     # Its distance to the others may not fit into 64 bits.
     memory = memory_of(tmp_path, storage="rosbag2")
-    reply = asked(memory, tmp_path, "data_time_range")
+    reply = asked(memory, "data_time_range")
     assert (reply["bags"], reply["gaps"], reply["earliest"]) == (1, [], 0)
 
 

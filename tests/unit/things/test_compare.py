@@ -35,7 +35,7 @@ def compared(bag_dir: Path, messages: Sequence[Msg], **given: object) -> Any:
 
 
 def ask_compare(bag_dir: Path, **given: object) -> Any:
-    return asked(memory_of(bag_dir, limits=NAMED), bag_dir, "compare", **given)
+    return asked(memory_of(bag_dir, limits=NAMED), "compare", **given)
 
 
 def labels(reply: Any) -> dict[str, list[str]]:
@@ -161,7 +161,7 @@ LAST_DAY: Final = BEGIN + (DAYS - 1) * DAY
 
 
 def ask(bag_dir: Path, tool: str, **given: object) -> Any:
-    return asked(memory_of(bag_dir, limits=NAMED), bag_dir, tool, **given)
+    return asked(memory_of(bag_dir, limits=NAMED), tool, **given)
 
 
 def compare(bag_dir: Path) -> Any:

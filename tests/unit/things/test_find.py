@@ -76,7 +76,7 @@ def looked(
 
 def ask(bag_dir: Path, limits: QuerySettings = NAMED, **given: Any) -> Any:
     memory = memory_of(bag_dir, limits=limits)
-    return asked(memory, bag_dir, "find_things", **given)
+    return asked(memory, "find_things", **given)
 
 
 def told_of(bag_dir: Path, messages: Sequence[Msg], **given: Any) -> Any:
@@ -108,10 +108,10 @@ def test_things_of_a_robot_that_transforms_place_are_those_by_its_poses(
         write_splits(tmp_path / name, of_robot)
         limits = QuerySettings(pose_topic=topic)
         memory = memory_of(tmp_path / name, limits=limits, recalls=recalls)
-        found = asked(memory, tmp_path / name, "find_things")
+        found = asked(memory, "find_things")
         windows = {"start": BEGIN, "end": BEGIN + 60, "with_start": BEGIN + 120}
         asked_of = {**windows, "with_end": BEGIN + 180}
-        compared = asked(memory, tmp_path / name, "compare", **asked_of)
+        compared = asked(memory, "compare", **asked_of)
         replies.append((found, compared["frame_id"], compared["things"]))
     assert replies[0][0]["total"] > 1
     assert replies[0][0]["frame_id"] == ("odom" if map_off is None else "map")
@@ -230,7 +230,7 @@ def test_what_is_said_of_a_past_window_stays_said(tmp_path: Path, seen: list[See
 
     def answers() -> dict[str, Any]:
         memory = memory_of(tmp_path, limits=NAMED)
-        return {tool: asked(memory, tmp_path, tool, **q) for tool, q in questions.items()}
+        return {tool: asked(memory, tool, **q) for tool, q in questions.items()}
 
     then = answers()
     days = [
@@ -351,7 +351,7 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
     many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(36)]
     elsewhere = [("thing 00", 2.0, 5.0), *many[1:]]
     write_splits(tmp_path, [*looked(0, 8, HERE, *many), *looked(100, 108, HERE, *elsewhere)])
-    reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
+    reply = replied(memory_of(tmp_path, limits=NAMED), "find_things", {"limit": 100})
     answer = json.loads(reply.text)
     [moved] = [row for row in answer["things"] if row["label"] == "thing 00"]
     assert (moved["moved_times"], moved["since"]) == (1, moved["last_seen"] - 7.0)
@@ -372,7 +372,7 @@ def test_a_place_in_a_frame_in_which_nothing_is_known_is_named(tmp_path: Path) -
     )
     windows = {"start": BEGIN, "end": BEGIN + 5, "with_start": BEGIN + 5, "with_end": BEGIN + 10}
     memory = memory_of(tmp_path, limits=NAMED)
-    compared = asked(memory, tmp_path, "compare", where="kitchen", **windows)
+    compared = asked(memory, "compare", where="kitchen", **windows)
     assert any("kitchen is in map" in note for note in compared["notes"])
     assert "notes" not in ask(tmp_path)
 
@@ -468,9 +468,9 @@ def test_detections_that_cannot_be_decoded_are_no_silence_of_the_detector(
     write_splits(tmp_path, messages, 30, "rec")
     memory = memory_of(tmp_path)
     whole = {"start": BEGIN, "end": BEGIN + 15, "with_start": BEGIN + 14.5, "with_end": BEGIN + 29}
-    found = asked(memory, tmp_path, "find_things")
+    found = asked(memory, "find_things")
     assert found["labels"] == ({"cup": 1} if every == 2 else {})
-    for reply in (found, asked(memory, tmp_path, "compare", **whole)):
+    for reply in (found, asked(memory, "compare", **whole)):
         assert "messages of /vision/scene/scene_objects could not be decoded, so" in str(reply)
     assert "no things are known" not in str(found)
 
@@ -491,7 +491,7 @@ def test_a_detector_that_repeats_one_message_looks_at_nothing(
     things = reply["things"]
     [hangs] = [note for note in reply["notes"] if "seems to hang" in note]
     assert hangs.startswith(f"/vision/scene/scene_objects repeats its message of {BEGIN + 90}.")
-    assert hangs in str(asked(memory_of(tmp_path), tmp_path, "memory_status"))
+    assert hangs in str(asked(memory_of(tmp_path), "memory_status"))
     assert {each["label"]: each["still_there"] for each in things} == {
         "cup": {"in_view": BEGIN + 89},
         "crate": {"not_looked_at_since": BEGIN + 59},

@@ -153,7 +153,7 @@ def test_a_reply_says_first_where_it_repeats_what_messages_say(
     memory: Memory, bag_dir: Path, what: str
 ) -> None:
     tool, given, places = CALLS[what]
-    found = asked(memory, bag_dir, tool, **given)
+    found = asked(memory, tool, **given)
     require_marked(found)
     assert {*places} <= {*found["quoted"]}
 
@@ -190,7 +190,7 @@ def test_a_frame_that_is_named_by_a_sentence_is_marked(
             tf(at, transform(at, ATTACK + "frame_id", ATTACK + "child", (n / 10, 0, 0))),
         ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    found = asked(memory_of(tmp_path), tmp_path, tool, **given)
+    found = asked(memory_of(tmp_path), tool, **given)
     # Notes are sentences of this program, and name frames as they are.
     require_marked({key: part for key, part in found.items() if key != "notes"})
 
@@ -199,7 +199,7 @@ def test_a_frame_that_is_named_by_a_sentence_is_marked(
 def test_a_reply_that_is_shortened_keeps_its_mark(bag_dir: Path, most: int) -> None:
     memory = memory_of(bag_dir)
     for tool, given, _ in CALLS.values():
-        text = replied(memory, bag_dir, tool, given, max_chars=most).text
+        text = replied(memory, tool, given, max_chars=most).text
         assert len(text) <= most
         assert json.loads(text)["quoted"]
 

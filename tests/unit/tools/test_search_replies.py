@@ -61,25 +61,21 @@ def test_that_a_long_array_was_not_searched_is_said_whatever_the_newest_is(
     memory = memory_of(tmp_path, recalls=recalls)
     note = f"/octets: where data is long it is only summarised, last at {T0_S + 15}.000000"
     given = {"topic": "/octets", **wanted}
-    never = asked(memory, tmp_path, "find_last_match", **given)
+    never = asked(memory, "find_last_match", **given)
     assert never["timestamp"] is None
     assert any(said.startswith(note) for said in never["notes"])
-    none = asked(memory, tmp_path, "find_matches", **given)
+    none = asked(memory, "find_matches", **given)
     assert (none["total"], none["notes"]) == (0, never["notes"])
     bumped = {"topic": "/bumper", "condition_type": "equals", "value": True, "while": given}
-    assert any(
-        said.startswith(note) for said in asked(memory, tmp_path, "find_matches", **bumped)["notes"]
-    )
+    assert any(said.startswith(note) for said in asked(memory, "find_matches", **bumped)["notes"])
     window = {"topic": "/octets", "fields": ["data"], "start": T0_S, "end": T0_S + 30}
     for by in ({}, {"by": "hour"}):
-        numbers = asked(memory, tmp_path, "get_topic_in_range", **window, **by)
+        numbers = asked(memory, "get_topic_in_range", **window, **by)
         assert any(said.startswith(note) for said in numbers["notes"])
     # After that all was searched.
-    later = asked(memory, tmp_path, "find_matches", **given, start=T0_S + 16)
+    later = asked(memory, "find_matches", **given, start=T0_S + 16)
     assert (later["total"], "notes" in later) == (0, False)
-    newest = asked(
-        memory, tmp_path, "find_last_match", **given | {"condition_type": "equals", "value": 7}
-    )
+    newest = asked(memory, "find_last_match", **given | {"condition_type": "equals", "value": 7})
     assert "notes" not in newest
 
 
@@ -92,10 +88,10 @@ def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_nev
     (bag_dir / "rec" / "rec_0.mcap").unlink()
     wanted = {"topic": "/rosout", "condition_type": "contains", "value": "never"}
     memory = memory_of(bag_dir, recalls=recalls)
-    assert asked(memory, bag_dir, "find_last_match", **wanted) is None
+    assert asked(memory, "find_last_match", **wanted) is None
     (bag_dir / "rec" / "rec_1.mcap").rename(bag_dir / "rec" / "rec_0.mcap")
     memory = memory_of(bag_dir, recalls=recalls)
-    assert asked(memory, bag_dir, "find_last_match", **wanted)["notes"]
+    assert asked(memory, "find_last_match", **wanted)["notes"]
 
 
 @pytest.mark.parametrize(
@@ -116,14 +112,14 @@ def test_that_recording_was_interrupted_is_said_where_nothing_was_found(
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", [*beating, *told])
     wanted = {**topics, "condition_type": "contains", "value": "never"}
     memory = memory_of(tmp_path, recalls=recalls)
-    assert asked(memory, tmp_path, tool, **wanted) is None
+    assert asked(memory, tool, **wanted) is None
     (tmp_path / ".episodic").mkdir(exist_ok=True)
     append_losses(tmp_path, [Loss("*", T0 + 10 * S, T0 + 30 * S, 0, "died")])
-    never = asked(memory_of(tmp_path, recalls=recalls), tmp_path, tool, **wanted)
+    never = asked(memory_of(tmp_path, recalls=recalls), tool, **wanted)
     assert (never["timestamp"], never["value"]) == (None, None)
     [note] = never["notes"]
     assert note.endswith("(20.1 s), because ros2 bag record died")
-    early = asked(memory_of(tmp_path, recalls=recalls), tmp_path, tool, **wanted, before=T0_S + 5)
+    early = asked(memory_of(tmp_path, recalls=recalls), tool, **wanted, before=T0_S + 5)
     assert early is None
 
 
@@ -157,4 +153,4 @@ def test_a_bag_that_was_read_in_spite_of_its_lies_was_read(
 ) -> None:
     lie(bag_dir / "rec" / "rec_1.mcap")
     wanted = {**topics, "condition_type": "contains", "value": "scissors"}
-    assert asked(memory_of(bag_dir, recalls=recalls), bag_dir, tool, **wanted) is None
+    assert asked(memory_of(bag_dir, recalls=recalls), tool, **wanted) is None

@@ -73,9 +73,9 @@ def test_the_listing_stays_within_its_size(additions: bool, most: int) -> None:
 
 def test_recap_takes_exactly_one_form_of_a_window(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [odom(10**18, 0.0, 0.0)])
-    both = replied(memory_of(tmp_path), tmp_path, "recap", {"last_s": 5, "end": 1e9})
+    both = replied(memory_of(tmp_path), "recap", {"last_s": 5, "end": 1e9})
     assert "give one of the three" in both.text
-    half = replied(memory_of(tmp_path), tmp_path, "recap", {"start": 1e9})
+    half = replied(memory_of(tmp_path), "recap", {"start": 1e9})
     assert "start and end must both be given" in half.text
     assert "last_s is missing" in refusal("recap")
     assert "last_s and start were both given" in refusal("recap", last_s=5, start=0, end=1)

@@ -25,11 +25,11 @@ def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does
     write_mcap(tmp_path / "bag.mcap", [text(at, "here") for at in hours])
     memory = memory_of(tmp_path)
     window = {"topic": "/chatter", "start": "2026-11-16", "end": "2026-11-18"}
-    assert asked(memory, tmp_path, "get_topic_in_range", **window)["total"] == 4
+    assert asked(memory, "get_topic_in_range", **window)["total"] == 4
     window["end"] = "2026-11-18T00:00"
-    assert asked(memory, tmp_path, "get_topic_in_range", **window)["total"] == 2
+    assert asked(memory, "get_topic_in_range", **window)["total"] == 2
     wanted = {"topic": "/chatter", "condition_type": "contains", "value": "here"}
-    found = asked(memory, tmp_path, "find_last_match", before="2026-11-18", **wanted)
+    found = asked(memory, "find_last_match", before="2026-11-18", **wanted)
     assert found["timestamp"] == hours[1] / NS_PER_S
 
 
@@ -75,17 +75,17 @@ def utc(seconds: int, decimals: str = "") -> str:
 
 def test_at_a_text_is_up_to_the_end_of_its_last_decimal(drive: Memory, tmp_path: Path) -> None:
     def x_at(timestamp: object, **given: object) -> object:
-        return asked(drive, tmp_path, "get_position_at", timestamp=timestamp, **given).get("x")
+        return asked(drive, "get_position_at", timestamp=timestamp, **given).get("x")
 
     assert [x_at(utc(5)), x_at(utc(5, ".0")), x_at(utc(5, ".0458"))] == [5.9, 5.0, 5.0]
     assert [x_at(utc(5, ".045890")), x_at(T0 + 5), x_at(str(T0 + 5))] == [4.9, 4.9, 4.9]
-    several = asked(drive, tmp_path, "get_position_at", timestamps=[utc(5), T0 + 5])
+    several = asked(drive, "get_position_at", timestamps=[utc(5), T0 + 5])
     assert [each["x"] for each in several["results"]] == [5.9, 4.9]
     # The tolerance counts from the begin of the text.
     assert x_at(utc(20), tolerance_s=0.06) == 19.9
     assert x_at(utc(20), tolerance_s=0.05) is None
     assert "tolerance_s of at least 0.055" in str(
-        asked(drive, tmp_path, "get_position_at", timestamp=utc(20), tolerance_s=0.05)
+        asked(drive, "get_position_at", timestamp=utc(20), tolerance_s=0.05)
     )
 
 
@@ -93,9 +93,7 @@ def test_a_window_ends_where_its_end_begins_unless_it_starts_there(
     drive: Memory, tmp_path: Path
 ) -> None:
     def count(start: str, end: str) -> object:
-        return asked(drive, tmp_path, "get_topic_in_range", topic="/odom", start=start, end=end)[
-            "total"
-        ]
+        return asked(drive, "get_topic_in_range", topic="/odom", start=start, end=end)["total"]
 
     minute, weekday = utc(10)[:-4] + "Z", f"{datetime.fromtimestamp(T0 + 5, UTC):%a} "
     assert [count(utc(0), utc(5)), count(utc(0), minute)] == [50, 100]
