@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
-from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.errors import BagError, RefusedError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span, unix_from_ns
@@ -249,14 +250,20 @@ def missing_data(view: View) -> Iterator[str]:
         if number:
             yield f"{counted(number, one, several)} {what}"
     yield from describe_absent(view.memory.absent_splits(snapshot))
-    segments = snapshot.timeline.recorded_segments
-    newest = max(segments, key=lambda segment: segment.latest, default=None)
-    if newest is not None and (alone := view.memory.reader.times_alone(newest.newest.path)):
+    if alone := [topic for topic in view.timeline.topics() if _has_times_alone(view, topic)]:
         topics = counted(len(alone), "topic")
-        yield f"of {topics} there are only the times here: {listed(sorted(alone))}"
-    if undecodable := {undecodable.topic for undecodable in undecodable_topics(view)}:
+        yield f"of {topics} there are only the times here: {listed(alone)}"
+    if undecodable := {row.topic for row in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
+
+
+def _has_times_alone(view: View, topic: str) -> bool:
+    """Returns whether the first bag of a topic has no payloads of it: in a lake the oldest are."""
+    first = (view.timeline.first_with(topic, name) for name in view.timeline.types_of(topic))
+    with suppress(BagError):  # it was deleted just now
+        return any(topic in view.memory.reader.times_alone(bag.path) for bag in first)
+    return False
 
 
 def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:

@@ -209,6 +209,20 @@ def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path:
         assert reply(fleet, tool, {**given, **of_camera})["error"] == "not_in_lake"
 
 
+def test_a_status_names_topics_of_which_the_lake_has_times_alone_though_not_in_its_newest_bag(
+    tmp_path: Path,
+) -> None:
+    draw = Random(0)
+    long = [
+        text((START_S + nth) * NS_PER_S, draw.randbytes(2000).hex(), "/camera") for nth in range(30)
+    ]
+    write_mcap(tmp_path / "roof" / "rec" / "rec_0.mcap", long)
+    write_bag(tmp_path / "roof", 9)
+    ship_from(tmp_path, "roof")
+    doubts = reply(served(tmp_path), "memory_status", {"robot": "roof"})["doubts"]
+    assert "of 1 topic there are only the times here: /camera" in doubts
+
+
 def _with_a_later_robot(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
     """The fleet of a server that was started before a robot was shipped for the first time."""
     monkeypatch.setattr("ros2_memory.bootstrap_fleet._JOINED_AGAIN_S", 0.0)
