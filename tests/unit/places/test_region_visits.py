@@ -81,7 +81,7 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
     assert any("yard is left out" in note for note in found.notes)
 
 
-def spots(memory: Memory, **where: Circle) -> Memory:
+def spots(memory: Memory, **where: Circle | Rectangle) -> Memory:
     places = tuple(Place(name, "odom", region) for name, region in where.items())
     return replace(memory, limits=replace(memory.limits, places=places))
 
@@ -120,6 +120,26 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         [found] = asked(memory, "find_matches", where=name, **hello)["sightings"]
         assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
         assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
+
+
+def test_a_place_that_the_robot_passes_more_often_than_poses_are_always_read_for_has_no_visit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It drives to and fro in an arc past the shelf, through the door: its track is straighter."""
+    along = [*range(20), *[20] * 10, *range(20, 0, -1), *[0] * 10]
+    poses = [
+        odom(BEGIN + nth * S // 2, at / 2, -0.045 * math.sin(math.pi * at / 20))
+        for nth, at in enumerate(along * 60)
+    ]
+    write_splits(tmp_path, poses, 300)
+    shelf, door = Rectangle(4.0, 6.0, -0.02, 1.0), Rectangle(3.0, 7.0, -1.0, 1.0)
+    memory = spots(memory_of(tmp_path), shelf=shelf, door=door)
+    rows = asked(memory, tmp_path, "visits")["places"]
+    assert [(row["place"], row["entries"]) for row in rows] == [("door", 120), ("shelf", 0)]
+    monkeypatch.setattr("ros2_memory.places.visits._MOST_CONFIRMED", 40)
+    reply = asked(memory, tmp_path, "visits", where="shelf")
+    assert reply["total"] == 20
+    assert any(note.startswith("20 older visits may be none") for note in reply["notes"])
 
 
 def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
