@@ -134,10 +134,10 @@ def test_a_place_that_the_robot_passes_more_often_than_poses_are_always_read_for
     write_splits(tmp_path, poses, 300)
     shelf, door = Rectangle(4.0, 6.0, -0.02, 1.0), Rectangle(3.0, 7.0, -1.0, 1.0)
     memory = spots(memory_of(tmp_path), shelf=shelf, door=door)
-    rows = asked(memory, tmp_path, "visits")["places"]
+    rows = asked(memory, "visits")["places"]
     assert [(row["place"], row["entries"]) for row in rows] == [("door", 120), ("shelf", 0)]
     monkeypatch.setattr("ros2_memory.places.visits._MOST_CONFIRMED", 40)
-    reply = asked(memory, tmp_path, "visits", where="shelf")
+    reply = asked(memory, "visits", where="shelf")
     assert reply["total"] == 20
     assert any(note.startswith("20 older visits may be none") for note in reply["notes"])
 
