@@ -18,7 +18,7 @@ from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import describe_misdated, note_unread
 from ros2_memory.history.no_data import require_recorded
-from ros2_memory.history.robots import note_robots
+from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, clamped, open_search
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, UsualPlace
@@ -88,7 +88,7 @@ def find_things(
         raise InvalidArgumentsError(
             f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
         )
-    note_robots(view, view.pose_topic, window)
+    note_robots_on(view, [view.pose_topic] if view.has_poses else view.moving_topics, window)
     undecoded = note_undecoded(view, window)
     view.notes.add(*describe_hung(view, window))
     known = known_things(view, lowest, window)

@@ -118,6 +118,16 @@ def test_things_of_a_robot_that_transforms_place_are_those_by_its_poses(
     assert replies[1] == replies[2] == replies[0]
 
 
+@pytest.mark.parametrize("topic", ["/odom", "/tf"])
+def test_things_of_two_robots_at_once_are_said_to_be_mixed(tmp_path: Path, topic: str) -> None:
+    for name, robot in (("wren", HERE), ("robin", (5.0, 0.0, 0.0))):
+        seen = looked(0, 60, robot, ("cup", 3.0, 0.0))
+        own = [message for message in seen if topic == "/odom" or message.topic != "/odom"]
+        write_splits(tmp_path, own, name=name)
+    notes = ask(tmp_path)["notes"]
+    assert any(f"2 recordings have different messages on {topic} at" in note for note in notes)
+
+
 CUP_AS_JSON = json.dumps(
     {"frame_id": "map", "detections": [{"label": "cup", "position": {"x": 3, "y": 0, "z": 1}}]}
 )
