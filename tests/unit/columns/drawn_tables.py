@@ -306,7 +306,8 @@ def _quaternion(random: Random) -> object:
             (0.0, 0.0, 1.0, 0.0),
             (math.nan, 0.0, 0.0, 1.0),
             (1e200, 0.0, 0.0, 1e200),
-            *[tuple(random.gauss(0, 1) for _ in range(4))] * 4,
+            # Longer than what stored parts are rounded by: else it has no angles any more.
+            *[tuple(random.choice((-1, 1)) * random.uniform(0.1, 1) for _ in range(4))] * 4,
             (0.0, 0.0, math.sin(0.4), math.cos(0.4)),
         ]
     )
