@@ -50,7 +50,7 @@ _WITHOUT_KEYS: Final = {
     "records: unset MEMORY_DEPLOYMENT if it is replay or query_only",
     "storage": "storage=mcap has no such setting; leave it out, or choose storage=rosbag2",
 }
-"""By section, what is said of a key where the chosen adapter has none."""
+"""By section, why a key is refused where the chosen adapter has none."""
 
 
 class OpenSecretError(ValueError):

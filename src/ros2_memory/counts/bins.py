@@ -434,7 +434,7 @@ class BinnedWindow:
         if self.bins.day_of is None:
             return set()
         edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
-        recorded_days, cut_days = set(), set(days[:1] if self._begins_after_others() else ())
+        recorded_days, cut_days = set(), set(days[:1] if self._is_first_day_cut() else ())
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
             if length_in(self.gaps, start, stop) < stop - start:
                 recorded_days.add(day)
@@ -442,7 +442,7 @@ class BinnedWindow:
                 cut_days.add(day)
         return recorded_days - cut_days
 
-    def _begins_after_others(self) -> bool:
+    def _is_first_day_cut(self) -> bool:
         """Returns whether something was recorded in the first local day before the window."""
         start = self.window.start
         start_s = start // NS_PER_S

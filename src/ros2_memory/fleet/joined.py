@@ -147,6 +147,6 @@ def _timeline_of_both(
 def _is_needed(day: BagFile, deleted: Sequence[Span], lost: Sequence[Span]) -> bool:
     """Returns whether what stayed of a day may be of bags that were `lost`: deleted, not shipped.
 
-    It is not known of a day that is older than the list of what was deleted.
+    True also of a day before the oldest entry of `deleted`, of which this is unknown.
     """
     return not lies_inside(deleted, day.start) or overlaps_any(lost, day.start, day.end)
