@@ -286,20 +286,3 @@ def test_a_position_is_in_places_of_several_frames_the_smallest_first(tmp_path: 
     memory = memory_of(tmp_path, limits=QuerySettings(places=places))
     reply = asked(memory, "get_position_at", timestamp=T0_S + 1)
     assert (reply["in"], reply["also_in"]) == ("dock", ["pen", "yard"])
-
-
-def test_a_frame_that_is_known_at_other_times_is_no_data_and_another_is_refused(
-    tmp_path: Path,
-) -> None:
-    messages = [odom(T0 + second * S, second, 0.0) for second in range(60)]
-    messages += [tf(T0 + s * S, transform(T0 + s * S, "map", "odom", (1, 0, 0))) for s in range(20)]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    memory = memory_of(tmp_path)
-    early, late = {"timestamp": T0_S + 9}, {"timestamp": T0_S + 50}
-    assert asked(memory, "get_position_at", frame_id="map", **early)["x"] == 10
-    refused = asked(memory, "get_position_at", frame_id="map", **late)
-    frames = {"parent": "map", "child": "odom"}
-    why = asked(memory, "get_transform_at", **frames, **late)
-    assert (refused["error"], refused["reason"]) == ("no_data", why["reason"])
-    other = asked(memory, "get_position_at", frame_id="moon", **late)
-    assert other["error"] == "invalid_arguments"

@@ -137,15 +137,11 @@ def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | No
     """Returns a pose in the map where transforms lead there, else as it is; or in `frame_id`.
 
     Raises:
-        InvalidArgumentsError: no transform ever leads to `frame_id`, which was asked for.
-        NoDataError: none does at that time.
-        QueryTimeoutError: the call's time is over before it is known whether any does.
+        InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
     """
     target = frame_id or view.limits.map_frame
     there = None if not target else pose_in(view, pose, target, time, recording)
     if there is None and frame_id is not None:
-        if connects(view, (frame_id, pose.frame_id)):
-            transform_at(view, frame_id, pose.frame_id, time, recording)  # raises the reason
         raise InvalidArgumentsError(_unreachable(frame_id, pose.frame_id))
     return pose if there is None else there
 
