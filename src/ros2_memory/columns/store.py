@@ -512,10 +512,14 @@ class ColumnStore(Database):
 
         def write(connection: sqlite3.Connection) -> bool:
             cursor = connection.execute(
-                "UPDATE bag SET sidecar_ns = ?1 WHERE sidecar_ns <> ?1 AND path = ?2 AND size = ?3"
-                " AND mtime_ns = ?4 AND counts = ?5"
-                " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
-                (key.sidecar_ns, *key[:3], bag.summary.data, bag.summary.schema.to_json()),
+                "UPDATE bag SET sidecar_ns = :sidecar_ns WHERE sidecar_ns <> :sidecar_ns"
+                " AND path = :path AND size = :size AND mtime_ns = :mtime_ns AND counts = :counts"
+                " AND summary = (SELECT id FROM summary WHERE topics = :topics)",
+                {
+                    **key._asdict(),
+                    "counts": bag.summary.data,
+                    "topics": bag.summary.schema.to_json(),
+                },
             )
             return cursor.rowcount > 0
 
@@ -606,18 +610,18 @@ def _insert_fragment(
     """
     inserted = connection.execute(
         "INSERT INTO fragment (kind, settings, start_ns, parts, data)"
-        " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="
-        " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))"
+        " SELECT ?, ?, ?, ?, ? WHERE json_array_length(?) ="
+        " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?)))"
         " ON CONFLICT DO UPDATE SET data = excluded.data"
         " WHERE data <> excluded.data RETURNING id",
-        (*identity, parts, data),
+        (*identity, parts, data, parts, parts),
     ).fetchall()
     for (number,) in inserted:
         # What followed before there were all of these parts is not asked for again.
         older = connection.execute(
-            "DELETE FROM fragment WHERE kind = ?1 AND settings = ?2 AND start_ns = ?3"
-            " AND id <> ?4 AND id IN (SELECT fragment FROM fragment_part"
-            " WHERE part IN (SELECT value FROM json_each(?5))) RETURNING id",
+            "DELETE FROM fragment WHERE kind = ? AND settings = ? AND start_ns = ?"
+            " AND id <> ? AND id IN (SELECT fragment FROM fragment_part"
+            " WHERE part IN (SELECT value FROM json_each(?))) RETURNING id",
             (*identity, number, parts),
         ).fetchall()
         connection.executemany("DELETE FROM fragment_part WHERE fragment = ?", older)
