@@ -453,8 +453,8 @@ def as_command(name: str) -> Callable[[Command], Command]:
     def made(command: Command) -> Command:
         parameters = signature(command).parameters
         groups = {
-            name: parameter.annotation
-            for name, parameter in parameters.items()
+            parameter.name: parameter.annotation
+            for parameter in parameters.values()
             if hasattr(parameter.annotation, "__dataclass_fields__")
         }
 
@@ -468,9 +468,11 @@ def as_command(name: str) -> Callable[[Command], Command]:
 
         options = [
             option.replace(kind=option.KEYWORD_ONLY, annotation=_declared(option))
-            for name, parameter in parameters.items()
+            for parameter in parameters.values()
             for option in (
-                signature(groups[name]).parameters.values() if name in groups else [parameter]
+                signature(groups[parameter.name]).parameters.values()
+                if parameter.name in groups
+                else [parameter]
             )
         ]
         run.__signature__ = Signature(options)  # type: ignore[attr-defined]  # typer reads it
