@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -93,17 +94,29 @@ def test_readmes_first_line_works_where_the_distribution_manages_python(
     assert re.search(r"^(\d+) of \1 answers are right", done.stdout, re.MULTILINE)
 
 
-def older_python(folder: Path) -> Path:
-    """A folder whose `python3` is older than is supported, as that of Ubuntu 22.04."""
+def python_of(minors: Sequence[int], folder: Path) -> Path:
+    """A folder whose `python3` is of one of these minor versions, the first that is here."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     places = [*map(Path, os.get_exec_path()), *pyenv.glob("versions/3.*/bin")]
-    for program in (place / f"python3.{minor}" for minor in (10, 9) for place in places):
+    for program in (place / f"python3.{minor}" for minor in minors for place in places):
         # A shim of pyenv may be there and lead nowhere.
         if program.exists() and not subprocess.run([program, "-c", ""], check=False).returncode:
             folder.mkdir()
             (folder / "python3").symlink_to(program)
             return folder
-    pytest.skip("neither Python 3.10 nor 3.9 is on this machine")
+    names = ", ".join(f"3.{minor}" for minor in minors)
+    pytest.skip(f"none of these versions of Python is on this machine: {names}")
+
+
+def test_readmes_first_line_works_with_the_python_of_ubuntu_24_04(
+    clone: Path, tmp_path: Path
+) -> None:
+    """Or with a newer one: some of what 3.11 takes, these do not."""
+    assert FIRST
+    programs = python_of((12, 13, 14), tmp_path / "newer")
+    done = ran(f"{FIRST[0]} --once --port 0", clone, programs)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"^(\d+) of \1 answers are right", done.stdout, re.MULTILINE)
 
 
 def test_an_older_python_is_refused_by_name_and_the_how_to_gets_a_newer_one(
@@ -111,7 +124,7 @@ def test_an_older_python_is_refused_by_name_and_the_how_to_gets_a_newer_one(
 ) -> None:
     assert FIRST
     assert HUMBLE
-    programs = older_python(tmp_path / "older")
+    programs = python_of((10, 9), tmp_path / "older")
     refused = ran(FIRST[0], clone, programs)
     assert refused.returncode != 0
     assert re.search(r"requires a different Python: 3\.\d+\.\d+ not in '>=3\.11'", refused.stderr)
