@@ -56,6 +56,7 @@ def test_what_ros_recorded_is_opened_by_rosbags_without_its_first_file(
 ) -> None:
     recording = tmp_path / name
     shutil.copytree(RECORDED / name, recording)
+    recording.chmod(0o700)  # the shared folder may be read-only, and the copy is as that
     first = min(recording.glob("*_0.*"))
     first.unlink()
     assert correct(recording, Rosbag2Reader())
