@@ -206,10 +206,6 @@ class Database:
                 self._opened.connection.close()
                 self._opened = None
 
-    def __del__(self) -> None:
-        # Since Python 3.13 a connection that is dropped unclosed is a ResourceWarning.
-        self.close()
-
     def read(self, ask: Callable[[sqlite3.Connection], T], unknown: T) -> T:
         """Returns what `ask` reads; `unknown` where the database cannot be read."""
         with self._lock:
