@@ -204,7 +204,7 @@ def _stands_of_slices(view: View, topic: str, window: TimeWindow) -> Iterator[tu
     return slices_by_poses(view, topic, window, STANDS, make, failures=[], beside=BESIDE_NS)
 
 
-def drive_made(view: View, window: TimeWindow) -> Iterator[Ns]:
+def make_drive_slices(view: View, window: TimeWindow) -> Iterator[Ns]:
     """Makes the slices of the path in a window, and of where the robot stood, the newest first.
 
     Yields the log time (ns) of each.

@@ -123,7 +123,7 @@ def events_back(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns
     return joined_back(view, opened, EVENTS, make, lambda stretch: stretch.key(topic))
 
 
-def events_made(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterator[Ns]:
+def make_events(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterator[Ns]:
     """Makes the events of the parts of some topics in a window, the newest first.
 
     Yields a log time (ns) of each.

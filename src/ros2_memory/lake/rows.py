@@ -49,7 +49,7 @@ from ros2_memory.lake.tables import KEYS, ROWS_VERSION, TABLES, Row, ShippedBag,
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.things.labels import Labels
-from ros2_memory.things.seen import Watching, may_have_detections
+from ros2_memory.things.seen import SightReader, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -121,7 +121,7 @@ class RowMaker:
     def __init__(self, memory: Memory, config: str, whole: Collection[str]) -> None:
         self._memory, self._config, self._whole = memory, config, whole
         self._view = View(memory, Call())
-        self._watching = Watching(self._view)
+        self._sight_reader = SightReader(self._view)
         self._detections = DetectionRows(self._view)
         self._thing = cache(Labels(memory.limits.labels).key)
 
@@ -154,7 +154,7 @@ class RowMaker:
         poses = poses_by_bag(self._view, posed, files)
         events = self._events(window, files)
         things: dict[BagFile, list[Row]] = defaultdict(list)
-        for bag, frame, sights in self._watching.by_bag([*bags]):
+        for bag, frame, sights in self._sight_reader.sights_by_bag([*bags]):
             things[bag] += self._things(frame, sights)
         seen: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
         for topic in dict.fromkeys(chain(*(topics for _, topics in events.values()))):

@@ -29,11 +29,11 @@ from ros2_memory.core.timebase import Ns, ns_from_unix
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.insights.changes_before import topics_with_changes
-from ros2_memory.insights.drive import drive_made
-from ros2_memory.insights.topic_events import events_made
+from ros2_memory.insights.drive import make_drive_slices
+from ros2_memory.insights.topic_events import make_events
 from ros2_memory.places.pose_frames import make_tracks
 from ros2_memory.queries import list_recorded_topics
-from ros2_memory.things.seen import Watching
+from ros2_memory.things.seen import SightReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -281,10 +281,10 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
     view = View(memory, Call(stored=True))
     deque(view.sessions.static_back(window), maxlen=0)
     fragments = [
-        drive_made(view, window),
+        make_drive_slices(view, window),
         make_tracks(view, window),
-        events_made(view, window, topics_with_changes(view)),
-        Watching(view).made(window, is_joined=is_joined),
+        make_events(view, window, topics_with_changes(view)),
+        SightReader(view).make_sights(window, is_joined=is_joined),
     ]
     if not is_joined:
         fragments.append(memory.scanner.outlines_made(view.timeline, window))

@@ -26,13 +26,13 @@ from ros2_memory.things.instances import (
     Instance,
     Mover,
     PlacedStay,
+    count_labels,
+    count_names,
     most_at_once,
-    named,
-    spellings,
 )
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.routine import usual_places
-from ros2_memory.things.unseen import Asked, describe_hung, note_undecoded, notes_on
+from ros2_memory.things.unseen import ThingsQuestion, describe_hung, note_undecoded, notes_on
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -63,9 +63,9 @@ def find_things(
 ) -> Things:
     """Returns the things of some labels, or all, that were seen in a window, those seen last first.
 
-    A thing counts where it was at the window's end. `where` takes those that are in a region then;
-    of what moves by itself, what was seen in it. Slices (10 s) count as a whole. `near` takes those
-    near a point, or near another thing of a label.
+    A thing counts where it was at the window's end. `where` selects the things inside a region
+    then; people and pets count if they were seen in it. `near` selects the things near a point, or
+    near another thing with a label. Slices (10 s) count as a whole.
 
     Raises:
         InvalidArgumentsError: the bounds make no window, `where` or `near` is no region, or
@@ -75,14 +75,15 @@ def find_things(
     """
     limits = memory.limits
     region = None if where is None else parse_where(limits, where)
-    beside = None if near is None else parse_near(limits, near)
-    span = TimeRange(start_s, end_s)
-    view, now, whole = open_search(memory, call, span)
-    asked_for = whole
-    if end_s is None and whole.asked()[0] < (ahead := view.snapshot.dating.ahead_from):
-        asked_for = TimeWindow(whole.start, ahead)
-    require_recorded(view, asked_for)
-    window = clamped(view, asked_for)
+    nearness = None if near is None else parse_near(limits, near)
+    view, now, asked_window = open_search(memory, call, TimeRange(start_s, end_s))
+    searched = asked_window
+    ahead_from = view.snapshot.dating.ahead_from
+    if end_s is None and asked_window.asked()[0] < ahead_from:
+        # A wrong clock dated the rest.
+        searched = TimeWindow(asked_window.start, ahead_from)
+    require_recorded(view, searched)
+    window = clamped(view, searched)
     lowest = limits.min_score if min_score is None else min_score
     if lowest > 1:
         raise InvalidArgumentsError(
@@ -92,37 +93,37 @@ def find_things(
     undecoded = note_undecoded(view, window)
     view.notes.add(*describe_hung(view, window))
     known = known_things(view, lowest, window)
-    view.notes.retract_outside(whole)
+    view.notes.retract_outside(asked_window)
     note_other_frames(view, known, region)
-    asked = {known.labels.key(label): label for label in labels}
-    places = places_asked(limits, region, known.frames)
-    looked = known.estimate.looks.last
-    latest_look = int(looked[looked < window.stop].max(initial=0))
-    finder = _Finder(known, window, region, places, now, latest_look)
-    found = sorted(finder.find(asked), key=lambda row: (-row.last, row.label, row.place))
-    if beside is not None:
-        anywhere = replace(finder, where=None)
-        key = known.labels.key(beside.label)
-        others = [*anywhere.find({key})] if beside.label else []
-        found = [*beside.those_near(found, others)]
-        view.notes.add(*beside.lack(found, others))
-        asked |= {key: beside.label} if beside.label and not others else {}
-    note_unread(view, whole, nothing=not found, gaps=not found)
-    if not found and asked_for != whole:
+    wanted = {known.labels.key(label): label for label in labels}
+    finder = _Finder(known, window, region, places_asked(limits, region, known.frames), now)
+    found = sorted(finder.find(wanted), key=lambda thing: (-thing.last, thing.label, thing.place))
+    if nearness is not None:
+        landmarks: list[_FoundThing] = []
+        if nearness.label:
+            key = known.labels.key(nearness.label)
+            landmarks = [*replace(finder, where=None).find({key})]
+            if not landmarks:
+                wanted[key] = nearness.label
+        found = [*nearness.select(found, landmarks)]
+        view.notes.add(*nearness.describe_lack(found, landmarks))
+    note_unread(view, asked_window, nothing=not found, gaps=not found)
+    if not found and searched != asked_window:
         view.notes.add(describe_misdated(view.snapshot.misdated))
-    shown = tuple(map(finder.described, found[:limit]))
+    shown = tuple(finder.describe(thing) for thing in found[:limit])
     totals: Counter[str] = Counter()
     for thing in found:
         totals[thing.label] += thing.at_once or 1
-    bounds = ["window"] * (start_s is not None or end_s is not None)
-    bounds += ["region"] * (region is not None or beside is not None)
-    question = Asked(
-        labels=asked,
-        found=frozenset(key for row in found for key in row.keys),
-        vague=frozenset(row.label for row in found if known.estimate.is_vague(row.rows)),
+    question = ThingsQuestion(
+        labels=wanted,
+        found=frozenset(key for thing in found for key in thing.keys),
+        vague=frozenset(thing.label for thing in found if known.estimate.is_vague(thing.rows)),
         window=window,
-        inside=f" in this {' and '.join(bounds)}" if bounds else "",
-        min_score=f"min_score {lowest:g}" + " (data.min_score)" * (min_score is None),
+        bounds=_bounds_text(
+            has_window=start_s is not None or end_s is not None,
+            has_region=region is not None or nearness is not None,
+        ),
+        min_score=f"min_score {lowest:g}{' (data.min_score)' if min_score is None else ''}",
         undecoded=undecoded,
     )
     return Things(
@@ -136,24 +137,38 @@ def find_things(
     )
 
 
+def _bounds_text(*, has_window: bool, has_region: bool) -> str:
+    """Returns " in this window and region", with the bounds that the question has."""
+    bounds = []
+    if has_window:
+        bounds.append("window")
+    if has_region:
+        bounds.append("region")
+    return f" in this {' and '.join(bounds)}" if bounds else ""
+
+
 def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
+    """Returns the frame of the first thing; without one, the frame that things would be in."""
     if shown:
         return shown[0].frame_id
-    # Without a map, the frame of the newest odometry; nothing where no detector published.
-    return known.frames[0] if known.has_map else "".join(known.frames[1:][-1:])
+    if known.has_map:
+        return known.frames[0]
+    # The newest odometry; there is none where no detector published.
+    odometry = known.frames[1:]
+    return odometry[-1] if odometry else ""
 
 
 class _FoundThing(NamedTuple):
-    """A thing of a question, which is described where it is shown: there may be thousands.
+    """A thing that a question selects. Only those that are shown are described: of thousands, few.
 
     Attributes:
-        label: to show; `keys` are those of all its names.
-        last: when it was seen last in the window.
+        label: the name to show; `keys` are the keys of all its names.
+        last: when it was last seen in the window.
         place: where it was then (m, in the frame of its epoch).
-        at_once: how many are there; None where one is.
-        rows: its spots in the window; `newest` are those of its place.
-        also_at: of people and pets, the places (m) of the others in the newest slice.
-        near_m: how far it is from what it was to be near.
+        at_once: how many were seen there at once; None for one.
+        rows: its spots in the window; `newest` are its spots at `place`.
+        also_at: for people and pets, the places (m) of the others in the newest slice.
+        near_m: its distance from the point or the thing that `near` names.
     """
 
     thing: Instance | Mover
@@ -167,43 +182,58 @@ class _FoundThing(NamedTuple):
     also_at: tuple[Vector3, ...] = ()
     near_m: float | None = None
 
+    @property
+    def places(self) -> tuple[Vector3, ...]:
+        """Every place (m) at its newest sighting."""
+        return (self.place, *self.also_at)
+
 
 class Near(NamedTuple):
-    """What things are to be near: the middle of a circle or, of a label, other things.
+    """The argument `near`: a circle or, with a label, the radius around each thing of that label.
 
-    Of a label only the circle's radius counts.
+    The things of the label are called landmarks.
     """
 
     circle: Circle
     label: str
 
-    def those_near(
-        self, found: Iterable[_FoundThing], others: Sequence[_FoundThing]
+    def select(
+        self, things: Iterable[_FoundThing], landmarks: Sequence[_FoundThing]
     ) -> Iterator[_FoundThing]:
-        """Yields those near the circle's middle, or one of the others, each with its distance."""
-        for thing in found:
-            points = [(self.circle.x, self.circle.y)]
-            if self.label:
-                points = [
-                    place[:2]
-                    for other in others
-                    if other.thing is not thing.thing and other.thing.epoch == thing.thing.epoch
-                    for place in (other.place, *other.also_at)
-                ]
-            near = [
-                (away_m, place)
-                for place in (thing.place, *thing.also_at)
-                for away_m in [min((math.dist(place[:2], at) for at in points), default=math.inf)]
-                if away_m <= self.circle.radius_m
-            ]
-            if near:
-                near_m, place = min(near)
-                at_once = min(thing.at_once or 1, len(near)) if thing.also_at else thing.at_once
-                yield thing._replace(near_m=near_m, place=place, at_once=at_once)
+        """Yields the things near the circle's middle, or near a landmark, with their distances."""
+        for thing in things:
+            points = self._points_for(thing, landmarks)
+            near: list[tuple[float, Vector3]] = []
+            for place in thing.places:
+                away_m = min((math.dist(place[:2], point) for point in points), default=math.inf)
+                if away_m <= self.circle.radius_m:
+                    near.append((away_m, place))
+            if not near:
+                continue
+            near_m, place = min(near)
+            at_once = thing.at_once
+            if thing.also_at:
+                at_once = min(at_once or 1, len(near))
+            yield thing._replace(near_m=near_m, place=place, at_once=at_once)
 
-    def lack(self, found: Sequence[_FoundThing], others: Sequence[_FoundThing]) -> Iterator[str]:
-        """Yields why nothing was found near it."""
-        if self.label and not others:
+    def _points_for(
+        self, thing: _FoundThing, landmarks: Sequence[_FoundThing]
+    ) -> list[tuple[float, float]]:
+        """Returns the points (m) that a thing may be near: no thing is near itself."""
+        if not self.label:
+            return [(self.circle.x, self.circle.y)]
+        return [
+            (x, y)
+            for landmark in landmarks
+            if landmark.thing is not thing.thing and landmark.thing.epoch == thing.thing.epoch
+            for x, y, _ in landmark.places
+        ]
+
+    def describe_lack(
+        self, found: Sequence[_FoundThing], landmarks: Sequence[_FoundThing]
+    ) -> Iterator[str]:
+        """Yields why nothing was found near the point or the landmarks."""
+        if self.label and not landmarks:
             yield f"near: there is no thing {abbreviate(self.label)} in this window"
         elif not found:
             within = f"within {self.circle.radius_m:g} m"
@@ -211,10 +241,10 @@ class Near(NamedTuple):
 
 
 def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
-    """Returns what a value of the argument `near` means: a label, or a point with a radius.
+    """Returns the argument `near` parsed: a label, or a point with a radius.
 
     Raises:
-        InvalidArgumentsError: it is neither.
+        InvalidArgumentsError: the value is neither.
     """
     at: JsonValue = {"label": value} if isinstance(value, str) else value
     label: JsonValue = ""
@@ -231,15 +261,21 @@ def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
     )
 
 
+class _StayInWindow(NamedTuple):
+    """A stay of a thing, and the spots of it that were seen in the window."""
+
+    stay: PlacedStay
+    rows: Ints
+
+
 @dataclass(frozen=True, slots=True)
 class _Finder:
     """Selects the things of a question, and describes them.
 
     Attributes:
-        where: the region they are to be in; None for all.
-        places: the named ones.
+        where: the region that the things must be in; None for anywhere.
+        places: the named places.
         now: the time of the call (ns).
-        latest_look: when the last of the looks that end before the window does ended (ns).
     """
 
     known: KnownThings
@@ -247,49 +283,56 @@ class _Finder:
     where: Where | None
     places: tuple[Place, ...]
     now: Ns
-    latest_look: Ns
 
     def find(self, keys: Collection[str]) -> Iterator[_FoundThing]:
-        """Yields the things of these keys, or all where there are none."""
-        estimate, labels = self.known.estimate, self.known.labels
-        things: list[Instance | Mover] = [*estimate.instances, *estimate.movers]
-        for thing in things:
-            names = thing.labels if isinstance(thing, Instance) else self._labels(thing.spots)
-            own_keys = {labels.key(name) for name in names}
-            if keys and own_keys.isdisjoint(keys):
-                continue
-            if isinstance(thing, Instance):
-                yield from self._found_instance(thing, own_keys)
-            else:
-                yield from self._found_mover(thing, own_keys)
+        """Yields the things with one of the keys; without keys, all things."""
+        estimate = self.known.estimate
+        for instance in estimate.instances:
+            own_keys = self._keys_of(instance.labels)
+            if not keys or not own_keys.isdisjoint(keys):
+                yield from self._locate_instance(instance, own_keys)
+        for mover in estimate.movers:
+            own_keys = self._keys_of(self._count_names(mover.spots))
+            if not keys or not own_keys.isdisjoint(keys):
+                yield from self._locate_mover(mover, own_keys)
 
-    def _parts(self, instance: Instance) -> list[tuple[PlacedStay, Ints]]:
-        """Returns the stays of a thing in the window, each with its spots."""
-        return [
-            (stay, rows)
-            for stay in instance.stays
-            if len(rows := self.known.estimate.seen_in(stay.spots, self.window))
-        ]
+    def _keys_of(self, names: Iterable[str]) -> set[str]:
+        return {self.known.labels.key(name) for name in names}
 
-    def _found_instance(self, instance: Instance, keys: Collection[str]) -> Iterator[_FoundThing]:
-        """Yields a thing if it was seen in the window, and was inside the region at its end."""
-        estimate, parts = self.known.estimate, self._parts(instance)
-        if not parts:
+    def _stays_in_window(self, instance: Instance) -> list[_StayInWindow]:
+        stays = []
+        for stay in instance.stays:
+            rows = self.known.estimate.seen_in(stay.spots, self.window)
+            if len(rows):
+                stays.append(_StayInWindow(stay, rows))
+        return stays
+
+    def _locate_instance(self, instance: Instance, keys: Collection[str]) -> Iterator[_FoundThing]:
+        """Yields a thing if the window has seen it, and it was inside the region at the end."""
+        estimate, stays = self.known.estimate, self._stays_in_window(instance)
+        if not stays:
             return
-        stay, newest = parts[-1]
+        stay, newest = stays[-1]
         frame = self.known.frames[instance.epoch]
         if self.where is not None and not self.where.contains(frame, *stay.at[:2]):
             return
-        rows = np.concatenate([rows for _, rows in parts])
-        number = estimate.side_by_side(newest)
-        at_once = number if number > 1 else None
-        last = int(estimate.spots[rows, Spot.LAST].max())
-        yield _FoundThing(instance, instance.label, keys, last, stay.at, at_once, rows, newest)
+        rows = np.concatenate([part.rows for part in stays])
+        count = estimate.side_by_side(newest)
+        yield _FoundThing(
+            instance,
+            instance.label,
+            keys,
+            last=int(estimate.spots[rows, Spot.LAST].max()),
+            place=stay.at,
+            at_once=count if count > 1 else None,
+            rows=rows,
+            newest=newest,
+        )
 
-    def _found_mover(self, mover: Mover, keys: Collection[str]) -> Iterator[_FoundThing]:
-        """Yields a mover: where it was last seen, inside the region if one is given."""
+    def _locate_mover(self, mover: Mover, keys: Collection[str]) -> Iterator[_FoundThing]:
+        """Yields a mover where it was last seen, if the window has seen it inside the region."""
         estimate = self.known.estimate
-        rows = self.known.seen_there(mover, self.window, self.where)
+        rows = self.known.seen_inside(mover, self.window, self.where)
         if not len(rows):
             return
         spots = estimate.spots[rows]
@@ -300,16 +343,16 @@ class _Finder:
             mover,
             estimate.names[mover.key],
             keys,
-            int(spots[newest, Spot.LAST]),
-            places[newest],
-            most_at_once(spots),
-            rows,
-            rows[[newest]],
+            last=int(spots[newest, Spot.LAST]),
+            place=places[newest],
+            at_once=most_at_once(spots),
+            rows=rows,
+            newest=rows[[newest]],
             also_at=tuple(places[number] for number in in_slice if number != newest),
         )
 
-    def described(self, found: _FoundThing) -> Thing:
-        """Returns a thing as it is shown."""
+    def describe(self, found: _FoundThing) -> Thing:
+        """Returns a thing as replies show it."""
         estimate, thing, rows = self.known.estimate, found.thing, found.rows
         frame, spots = self.known.frames[thing.epoch], estimate.spots[rows]
         best, median = self._scores(rows)
@@ -331,41 +374,45 @@ class _Finder:
             near_m=found.near_m,
         )
         if isinstance(thing, Mover):
-            return replace(shown, moves=True, usually=self._usually(frame, rows))
-        parts = self._parts(thing)
-        last, newest = parts[-1]
-        # The stays at one place in a row, as one.
-        stays = [
-            self.known.stay(
-                np.concatenate([rows for _, rows in group]), group[-1][0].at, frame, self.places
-            )
-            for group in _by_place(parts)
-        ]
-        labels = self._labels(rows)
-        rows_of_all = np.concatenate([stay.spots for stay in thing.stays])
-        written = spellings(estimate, estimate.counts, rows_of_all)
+            return replace(shown, moves=True, usually=self._usual_places(frame, rows))
+        return self._with_history(shown, thing, rows)
+
+    def _with_history(self, shown: Thing, instance: Instance, rows: Ints) -> Thing:
+        """Returns a described thing with its names, its stays, and whether it is still there."""
+        estimate, stays = self.known.estimate, self._stays_in_window(instance)
+        newest = stays[-1]
+        moved = []
+        for group in _grouped_by_place(stays):
+            rows_there = np.concatenate([part.rows for part in group])
+            place = group[-1].stay.at
+            moved.append(self.known.describe_stay(rows_there, place, shown.frame_id, self.places))
+        has_moved = len(moved) > 1
+        labels = self._count_names(rows)
+        rows_of_all = np.concatenate([stay.spots for stay in instance.stays])
         misread = Counter[str]()
-        for stay in thing.stays:
-            misread.update(stay.also)
+        for stay in instance.stays:
+            misread.update(stay.misread_as)
         return replace(
             shown,
             labels=tuple(labels.items()) if len(labels) > 1 else (),
-            also_seen_as=_commonest(written, thing.labels),
-            misread_as=_commonest(misread, thing.labels),
-            spread_m=last.dev_mm / _MM,
-            still_there=self._still_there(thing, last, newest),
-            moved=tuple(stays) if len(stays) > 1 else (),
-            usually=self._usually(frame, rows) if len(stays) > 1 else None,
+            also_seen_as=_commonest(
+                count_labels(estimate, estimate.counts, rows_of_all), instance.labels
+            ),
+            misread_as=_commonest(misread, instance.labels),
+            spread_m=newest.stay.dev_mm / _MM,
+            still_there=self._still_there(instance, newest),
+            moved=tuple(moved) if has_moved else (),
+            usually=self._usual_places(shown.frame_id, rows) if has_moved else None,
         )
 
-    def _labels(self, rows: Ints) -> dict[str, int]:
-        """Returns how often each label has these spots, the commonest first."""
+    def _count_names(self, rows: Ints) -> dict[str, int]:
+        """Returns how often each name was seen in some spots, the commonest name first."""
         estimate = self.known.estimate
-        written = spellings(estimate, estimate.counts, rows)
-        return named(written, self.known.labels, estimate.names)
+        labels = count_labels(estimate, estimate.counts, rows)
+        return count_names(labels, self.known.labels, estimate.names)
 
-    def _usually(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:
-        """Returns where a thing usually is, by its spots."""
+    def _usual_places(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:
+        """Returns where a thing usually is, by its spots, with the named places there."""
         spots = self.known.estimate.spots[rows]
         spots = spots[np.argsort(spots[:, Spot.LAST], kind="stable")]
         now = min(self.now, self.window.stop)
@@ -378,10 +425,10 @@ class _Finder:
         )
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
-        """Returns the best score of some spots, and their median to 0.05, the width of a bin.
+        """Returns the best and the median score of the detections that count; None without scores.
 
-        Of detections that count; None where none of them has a score. The median is the best score
-        in its bin, where that is known: of spots with none in a higher one.
+        The median is known to 0.05, the width of a bin. Where a spot has its best score in that
+        bin, the median is the highest such score.
         """
         best = self.known.estimate.spots[rows, Spot.BEST]
         _, bins, n = self.known.estimate.scores.rows_of(rows)
@@ -393,10 +440,10 @@ class _Finder:
         median = int(in_bin.max()) if len(in_bin) else (middle + 0.5) * 1000 / SCORE_BINS
         return int(best.max()) / 1000, min(median, int(best.max())) / 1000
 
-    def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
-        """Returns the state of a thing since it was last seen in the window, by all sightings."""
-        spots = self.known.estimate.spots[rows]
-        last, by_all = int(spots[:, Spot.LAST].max()), self.known.by_all
+    def _still_there(self, instance: Instance, newest: _StayInWindow) -> StillThere | None:
+        """Returns what all sightings say of a thing since it was last seen in the window."""
+        spots = self.known.estimate.spots[newest.rows]
+        last, by_all, stay = int(spots[:, Spot.LAST].max()), self.known.by_all, newest.stay
         if by_all is not self.known:
             newest_first = np.argsort(-spots[:, Spot.LAST], kind="stable")
             same = by_all.estimate.stay_with(spots[newest_first])
@@ -411,30 +458,28 @@ class _Finder:
             looks, missed = by_all.estimate.missing(instance, stay)
         if missed is not None:
             return StillThere("not_seen_where_expected", missed, looks)
-        if last + _JUST_NOW_NS >= self.latest_look:
+        looked = self.known.estimate.looks.last
+        if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
             return StillThere("in_view", last)
-        # Of a later look nothing is known where the estimate ends.
+        # The estimate may end before the thing was looked at again.
         return StillThere("not_looked_at_since", last) if by_all.until == MAX_NS else None
 
 
-def _commonest(names: Counter[str], without: Collection[str]) -> tuple[str, ...]:
-    others = [name for name in names if name not in without]
-    return tuple(sorted(others, key=lambda name: (-names[name], name))[:_MOST_NAMES])
+def _commonest(counts: Counter[str], without: Collection[str]) -> tuple[str, ...]:
+    others = [name for name in counts if name not in without]
+    return tuple(sorted(others, key=lambda name: (-counts[name], name))[:_MOST_NAMES])
 
 
-def _by_place(
-    parts: Sequence[tuple[PlacedStay, Ints]],
-) -> list[list[tuple[PlacedStay, Ints]]]:
-    """Returns the stays in groups of those that follow each other at one place.
+def _grouped_by_place(stays: Sequence[_StayInWindow]) -> list[list[_StayInWindow]]:
+    """Returns stays in groups: those that follow each other at one place are one group.
 
-    One after whose end the place was seen without the thing ends a group: it was taken away, and
-    brought back.
+    A stay that was seen to end also ends its group: the thing was taken away and brought back.
     """
-    groups: list[list[tuple[PlacedStay, Ints]]] = []
+    groups: list[list[_StayInWindow]] = []
     last: PlacedStay | None = None
-    for part in parts:
-        if last is None or last.place != part[0].place or last.left is not None:
+    for part in stays:
+        if last is None or last.place != part.stay.place or last.left is not None:
             groups.append([])
         groups[-1].append(part)
-        last = part[0]
+        last = part.stay
     return groups

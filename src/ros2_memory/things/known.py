@@ -12,7 +12,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
@@ -24,9 +23,9 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.results import ThingStay
-from ros2_memory.things.instances import Estimate, Mover, estimate
+from ros2_memory.things.estimation import estimate
 from ros2_memory.things.labels import Labels
-from ros2_memory.things.seen import SIGHTS_NS, SeenStretch, Watching, spots_in
+from ros2_memory.things.seen import SIGHTS_NS, SeenStretch, SightReader, spots_in
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
+    from ros2_memory.things.instances import Estimate, Mover
 
 T = TypeVar("T", bound="Hashable")
 _Part: TypeAlias = "list[SeenStretch[Session]]"
@@ -43,29 +43,29 @@ _Odometry: TypeAlias = "tuple[str, Session | None]"
 """A frame, and the session in which its coordinates hold; None of the map, where they always do."""
 
 _MOST_SPOTS: Final = 150_000
-"""Places of a label in a slice that are looked at together: a home robot has 50,000 in a week."""
+"""Spots that one estimate compares: a home robot has 50,000 in a week."""
 _ESTIMATING_S: Final = 6.0
 _FEWER: Final = 4
-"""Where that takes longer, so many times fewer are looked at, from then on."""
+"""After an estimate that takes longer, the next ones compare a fourth as many spots."""
 _QUICK: Final = 8
-"""Where it takes less than this part of it, twice as many are looked at the next time."""
+"""After an estimate that takes less than an eighth of that, the next compares twice as many."""
 _KEPT_BYTES: Final = 500
-"""About how much memory it takes to remember a number."""
+"""About how much memory a cached number takes."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownThings:
-    """The estimate of a memory.
+    """The estimate of a memory's things.
 
     Attributes:
         labels: maps labels to keys.
-        frames: by epoch, the frame of its places; epoch 0 is the map.
+        frames: the frame of each epoch's places; epoch 0 is the map.
         has_map: whether any sights are in the map.
-        since: how far back it reaches, where not all bags could be read in time, or there are too
-            many sightings; else None.
-        crowded: whether it begins there because there are too many sightings before.
-        until: where it ends; later sightings are none of it.
-        later: the things by all sightings, of an estimate that ends before the last one.
+        since: where the estimate begins, if there was no time to read older bags, or if there are
+            too many sightings; None if it has all.
+        crowded: whether it begins there because of too many sightings.
+        until: where the estimate ends: later sightings do not count.
+        later: the things by all sightings, if this estimate ends before the last one.
     """
 
     estimate: Estimate
@@ -79,12 +79,12 @@ class KnownThings:
 
     @property
     def by_all(self) -> KnownThings:
-        """The things by all sightings; where there are too many of these, by those of this one."""
+        """The things by all sightings; this estimate if there are too many to compare."""
         return self.later or self
 
     @property
     def reach(self) -> str:
-        """Of which time it is, as the end of a sentence; empty where it is of all."""
+        """The time of the estimate as the end of a sentence; empty for all of history."""
         since = "" if self.since is None else unix_text(self.since)
         if self.until == MAX_NS:
             return f" since {since}" if since else ""
@@ -94,10 +94,10 @@ class KnownThings:
         """Returns whether the things of a whole window are known."""
         return self.since is None or self.since <= window.start
 
-    def seen_there(
+    def seen_inside(
         self, mover: Mover, window: TimeWindow, where: Where | None, before: Ns = MAX_NS
     ) -> Ints:
-        """Returns the spots of a mover in a region, of slices as `Estimate.seen_in` takes them."""
+        """Returns the spots of a mover in a region and a window; see `Estimate.seen_in`."""
         rows = self.estimate.seen_in(mover.spots, window, before)
         if where is None:
             return rows
@@ -105,8 +105,10 @@ class KnownThings:
         places = (self.estimate.spots[rows][:, [Spot.X, Spot.Y]] / 1000).tolist()
         return rows[[where.contains(frame, x, y) for x, y in places]]
 
-    def stay(self, rows: Ints, place: Vector3, frame: str, places: Sequence[Place]) -> ThingStay:
-        """Returns some spots as the stay of a thing at a place (m) of a frame."""
+    def describe_stay(
+        self, rows: Ints, place: Vector3, frame: str, places: Sequence[Place]
+    ) -> ThingStay:
+        """Returns spots as a stay at a place (m) in a frame, as replies show it."""
         spots = self.estimate.spots[rows]
         return ThingStay(
             start=int(spots[:, Spot.FIRST].min()),
@@ -128,7 +130,9 @@ def known_things(view: View, min_score: float, window: TimeWindow) -> KnownThing
     ahead = view.snapshot.dating.ahead_from
     by_all = _Loader(view, min_score, ahead if window.stop <= ahead else MAX_NS)
     known = by_all.known() if by_all.reaches(window.start) else None
-    if (known is None or known.crowded or known.since is None) and until <= (latest or until):
+    is_past = latest is None or until <= latest
+    is_out_of_time = known is not None and known.since is not None and not known.crowded
+    if is_past and not is_out_of_time:
         then = _Loader(view, min_score, MAX_NS, until).known()
         if known is not None and known.reaches_back(window):
             return replace(then, later=known) if then.reaches_back(window) else known
@@ -146,7 +150,7 @@ def known_things(view: View, min_score: float, window: TimeWindow) -> KnownThing
 
 
 def note_other_frames(view: View, known: KnownThings, region: Where | None) -> None:
-    """Notes the places that are asked for in frames in which no thing is known."""
+    """Notes the places of a region whose frames have no known things."""
     frames = dict.fromkeys(known.frames if known.has_map else known.frames[1:])
     if region is None or not frames:
         return
@@ -165,24 +169,23 @@ class _TakesTooLongError(Exception):
 class _Loader:
     """Gathers the sights of all bags of a view, the newest first, and estimates things by them.
 
-    What was found last is remembered for each timeline: of all sightings, and of those before one
-    other time.
+    For each timeline the cache has two results: one by all sightings, and one of a past time.
 
     Args:
         view: has the bags.
         min_score: detections with a lower score do not count.
-        ahead: what is dated later is left out: a clock was wrong, unless that is asked for.
-        until: likewise, of an estimate of a time before.
+        ahead: sightings that are dated later are left out, since a wrong clock dated them.
+        until: the end of an estimate of a past time.
     """
 
     def __init__(self, view: View, min_score: float, ahead: Ns, until: Ns = MAX_NS) -> None:
-        spellings = view.limits.labels
-        described = tuple(sorted((name, tuple(others)) for name, others in spellings.items()))
-        key = (min_score, described, view.limits.map_frame, view.pose_topic, ahead)
+        labels = view.limits.labels
+        labels_key = tuple(sorted((name, tuple(others)) for name, others in labels.items()))
+        key = (min_score, labels_key, view.limits.map_frame, view.pose_topic, ahead)
         self._view = view
         self._cache = view.memory.scanner.caches.things
         self._min_score = min_score
-        self._labels = Labels(spellings)
+        self._labels = Labels(labels)
         self._ahead = ahead
         self._until = until
         self._things_key = ("things", until == MAX_NS, *key)
@@ -191,10 +194,10 @@ class _Loader:
         self._notes_before = view.notes.added
 
     def reaches(self, moment: Ns) -> bool:
-        """Returns whether there are not too many sightings after a moment to compare them.
+        """Returns whether the sightings after a moment are few enough to compare.
 
         Raises:
-            QueryTimeoutError: as by `known`.
+            QueryTimeoutError: as in `known`.
         """
         cached = self._cached
         if cached is not None:
@@ -206,7 +209,7 @@ class _Loader:
         return since <= moment
 
     def known(self) -> KnownThings:
-        """Returns the things in all that could be read, and compared in time.
+        """Returns the things in all sights that could be read, and compared, in time.
 
         Raises:
             QueryTimeoutError: the call's time is over before any bag was read.
@@ -221,20 +224,20 @@ class _Loader:
 
     @property
     def _cached(self) -> KnownThings | Ns | None:
-        """The things that are known, or since when there are too many sightings."""
+        """The cached things, or the time (ns) after which there are too many sightings, or None."""
         timeline, known = self._cache.get(self._things_key) or (None, None)
         if timeline is not self._view.timeline:
             return None
         return known if isinstance(known, KnownThings | int) else None
 
     def _put(self, known: KnownThings | Ns) -> None:
-        """Caches the answer, unless an open bag or a failure had a part in it."""
+        """Caches a result, unless an open bag or a failure took part in it."""
         if not self._view.call.used_active and self._view.notes.added == self._notes_before:
             size = _KEPT_BYTES if isinstance(known, int) else known.estimate.memory_bytes
             self._cache.put(self._things_key, (self._view.timeline, known), size)
 
     def _estimated_in_time(self) -> KnownThings:
-        """Returns the things by the newest sightings, of as many as can be compared in time."""
+        """Returns the things by the newest sightings, as many as can be compared in time."""
         parts, crowded = self._gathered
         most = self._most_spots
         if self._read_from is not None:
@@ -251,14 +254,14 @@ class _Loader:
                 self._put_most(most)
                 parts, crowded = _newest_within(parts, most), True
             else:
-                # It may have been the machine that was slow for a while.
+                # The machine may have been slow for a while: try more the next time.
                 if most < _MOST_SPOTS and time.monotonic() - begun_s < _ESTIMATING_S / _QUICK:
                     self._put_most(min(2 * most, _MOST_SPOTS))
                 return known
 
     @property
     def _most_spots(self) -> int:
-        """How many spots can be compared in time, as far as is known."""
+        """How many spots can be compared in time, by the estimates before."""
         _, most = self._cache.get(self._most_key) or (None, None)
         return most if isinstance(most, int) else _MOST_SPOTS
 
@@ -267,16 +270,16 @@ class _Loader:
 
     @cached_property
     def _gathered(self) -> tuple[list[_Part], bool]:
-        """The newest stretches, in order, and whether they have as many spots as are compared.
+        """The newest stretches, in order of time, and whether there are too many spots to add more.
 
-        Where reading older ones takes too long, `_read_from` is the start of the oldest.
+        If there is no time to read older stretches, `_read_from` is where the oldest one begins.
         """
         most = self._most_spots
         parts: list[_Part] = []
         reading = self._view.call.partial_after(READING_S)
         spots = 0
         try:
-            for part in Watching(self._view).newest_first(min(self._ahead, self._until), most):
+            for part in SightReader(self._view).newest_first(min(self._ahead, self._until), most):
                 if spots >= most:
                     return parts[::-1], True
                 if parts and reading.expired():
@@ -291,14 +294,14 @@ class _Loader:
         return parts[::-1], False
 
     def _things_in(self, parts: Sequence[_Part], *, crowded: bool) -> KnownThings:
-        """Returns the things in some stretches; `crowded` if there are too many before these.
+        """Returns the things in stretches. `crowded`: too many sightings are before these.
 
         Raises:
-            _TakesTooLongError: that takes longer than an answer may, and fewer would do.
+            _TakesTooLongError: an answer may not take so long, and fewer stretches would do.
         """
-        stretches = _of_detectors([stretch for part in parts for stretch in part])
+        stretches = _detector_stretches([stretch for part in parts for stretch in part])
         epoch_of, frames = self._epochs(stretches)
-        session_of = _numbers(
+        session_of = _numbered_in_time(
             pair for part in stretches for pair in zip(part.starts, part.sessions, strict=True)
         )
         sections = [
@@ -310,7 +313,7 @@ class _Loader:
         estimating = self._view.call.partial_after(_ESTIMATING_S)
 
         def go_on() -> None:
-            if self._read_from is None:  # else the call's time may be over, and this is its answer
+            if self._read_from is None:  # else the call's time is over, and this is its answer
                 self._view.bags.check_deadline()
             if len(parts) > 1 and estimating.expired():
                 raise _TakesTooLongError
@@ -331,44 +334,57 @@ class _Loader:
         )
 
     def _epochs(self, stretches: _Part) -> tuple[dict[_Odometry, int], tuple[str, ...]]:
-        """Returns the number of each epoch, and the frame of each.
+        """Returns the number of each epoch, and the frames by number.
 
-        All that is in the map is of epoch 0. Odometry starts again in each session.
+        Everything in the map is in epoch 0. Odometry begins again in each session.
         """
         placed: list[tuple[Ns, _Odometry]] = [(MIN_NS, (self._view.limits.map_frame or "", None))]
-        for sessions, starts, frame, *_ in stretches:
-            placed += zip(starts, (self._odometry(one, frame) for one in sessions), strict=True)
-        numbers = _numbers(placed)
+        for stretch in stretches:
+            for start, session in zip(stretch.starts, stretch.sessions, strict=True):
+                placed.append((start, self._odometry(session, stretch.frame_id)))
+        numbers = _numbered_in_time(placed)
         return numbers, tuple(frame for frame, _ in numbers)
 
     def _odometry(self, session: Session, frame: str) -> _Odometry:
         return frame, None if frame == self._view.limits.map_frame else session
 
 
-def _numbers(timed: Iterable[tuple[Ns, T]]) -> dict[T, int]:
-    """Returns the numbers of values that begin at some times, in the order of these."""
+def _numbered_in_time(timed: Iterable[tuple[Ns, T]]) -> dict[T, int]:
+    """Returns a number for each distinct value, in the order of the values' times."""
     in_time = dict.fromkeys(value for _, value in sorted(timed, key=itemgetter(0)))
     return {value: number for number, value in enumerate(in_time)}
 
 
 def _begin(part: _Part) -> Ns:
-    """Returns when the first ten minutes of a part begin."""
+    """Returns the start (ns) of the oldest ten minutes of a part."""
     return min(stretch.starts[0] for stretch in part)
 
 
-def _of_detectors(stretches: _Part) -> _Part:
-    """Returns stretches with the sights of topics that have detections in any of them."""
-    every_topic = [of_topic for stretch in stretches for of_topic in stretch.sights]
-    detectors = {topic for of_topic in every_topic if of_topic.detects for topic in of_topic.topics}
-    found = []
+def _detector_stretches(stretches: _Part) -> _Part:
+    """Returns the stretches with the sights of detectors alone: topics that detect in any of them.
+
+    Sights without a topic stay: they have the fixes.
+    """
+    detectors = set[str]()
     for stretch in stretches:
-        sights = tuple(part for part in stretch.sights if detectors.issuperset(part.topics))
-        if any(part.topics for part in sights):
-            found.append(stretch._replace(sights=sights))
-    return found
+        for sights in stretch.sights:
+            if sights.detects:
+                detectors.update(sights.topics)
+    of_detectors = []
+    for stretch in stretches:
+        every = tuple(sights for sights in stretch.sights if detectors.issuperset(sights.topics))
+        if any(sights.topics for sights in every):
+            of_detectors.append(stretch._replace(sights=every))
+    return of_detectors
 
 
 def _newest_within(parts: Sequence[_Part], most: int) -> list[_Part]:
-    """Returns the newest parts that have at most so many spots, at least one."""
-    totals = accumulate(spots_in(part) for part in reversed(parts))
-    return [*parts[-max(sum(total <= most for total in totals), 1) :]]
+    """Returns the newest parts with at most `most` spots in all, and the newest in any case."""
+    newest = [parts[-1]]
+    spots = spots_in(parts[-1])
+    for part in reversed(parts[:-1]):
+        spots += spots_in(part)
+        if spots > most:
+            break
+        newest.append(part)
+    return newest[::-1]

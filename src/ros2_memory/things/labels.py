@@ -66,23 +66,23 @@ _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
 
 def plain(label: str) -> str:
-    """Returns a label in lower case with single spaces, its accents as parts of their letters."""
+    """Returns a label in lower case with single spaces; accents are decomposed."""
     return caseless(_SPACING.sub(" ", label).strip())
 
 
 def singular(label: str) -> str:
-    """Returns a label as `plain`, its last word in the singular, as far as simple rules know it."""
+    """Returns a label as `plain`, with its last word in the singular by simple English rules."""
     before, space, word = plain(label).rpartition(" ")
     return before + space + _singular(word)
 
 
 def last_word(key: str) -> str:
-    """Returns what a key is a kind of: "mug" of "coffee mug"."""
+    """Returns the kind that a key names: "mug" for "coffee mug"."""
     return key.rpartition(" ")[2]
 
 
 def moves_by_itself(key: str) -> bool:
-    """Whether a key names people or pets."""
+    """Returns whether a key names people or pets."""
     return key not in _NO_ANIMALS and last_word(key) in _MOVES_BY_ITSELF
 
 
@@ -102,7 +102,7 @@ class Labels:
     """Maps labels as detectors write them to keys, which are equal for equal things.
 
     Args:
-        spellings: other spellings, by the name that is to be shown.
+        spellings: other spellings of each name to show.
     """
 
     def __init__(self, spellings: Mapping[str, Iterable[str]]) -> None:
@@ -115,16 +115,16 @@ class Labels:
                 self._keys[singular(spelling)] = key
 
     def key(self, label: str) -> str:
-        """Returns the key of a label."""
+        """Returns the key of a label as a detector writes it."""
         plain_key = singular(shortened(label, MAX_LABEL_CHARS))
         return self._keys.get(plain_key, plain_key)
 
     def are_apart(self, one: str, other: str) -> bool:
-        """Whether the owner declared two keys as different things."""
+        """Returns whether the owner declared two keys as different things."""
         return one in self._shown and other in self._shown
 
     def name(self, key: str, counts: Mapping[str, int]) -> str:
-        """Returns the name to show for a key: declared, or the plain label seen most often."""
+        """Returns the name to show for a key: as declared, or the plain label seen most often."""
         declared = self._shown.get(key)
         if declared is not None or not counts:
             return declared or key

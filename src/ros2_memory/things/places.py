@@ -4,11 +4,10 @@ Places are what detections scatter around. They are found heaviest first on a gr
 then belongs to the nearest one, so that two things a metre apart stay two although the noise of
 far detections overlaps.
 
-Where a thing was moved a little (`stays_in`): a sighting is where something was seen in one slice:
-the mean of some looks. It is off by the noise of each look; by that of its *visit*, whose looks
-share their error of localisation; and by the side that it is seen from, since detectors are biased
-along their view. A regression of all visits on the side and on a step says how large the step is,
-and how exactly that is known.
+Where a thing was moved a little (`stays_in`): a sighting is where something was seen in one slice,
+the mean of some looks. It has three errors: the noise of each look; the error of localisation that
+all looks of a *visit* share; and a bias along the view of the detector. A regression of all visits
+on the side of the view and on a step says how large the step is, and how exactly that is known.
 
 Which labels a detector uses for one thing in turn (`with_synonyms`): "mug" and "coffee mug", at one
 place. They end in the same word, lie within the scatter of each other, alternate within a visit,
@@ -24,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict, deque
-from itertools import combinations, pairwise, product, starmap
+from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -36,35 +35,39 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.sights import Floats
     from ros2_memory.columns.sights import JoinedSights
+    from ros2_memory.core.arrays import Columns
     from ros2_memory.storage.base import Mask
 
 _CELL_MM: Final = 100
 _PEAK_MM: Final = 300
 """Spots this near to each other make a peak."""
 _CLAIM_MM: Final = 600
-"""Spots this near to a place are of it before another place is looked for."""
+"""A new place claims the spots this near to it before another place is looked for."""
 GATE_MM: Final = 900
-"""What was seen farther from a place is not of it."""
+"""A spot farther from every place belongs to none."""
 _HALO_SHARE: Final = 0.1
 """A peak within `GATE_MM` of another one, and lighter than this share of it, is its noise."""
 _OWN_SHARE: Final = 0.5
-"""But for one that has this share of its weight while it is seen: a thing that came there."""
+"""A peak that weighs more than this share of the other while it is seen is a thing of its own."""
 MIDDLE: Final = (10, 90)
-"""Between these percentiles of its spots: noise of another one may have been there before."""
+"""A peak is seen between these percentiles of its spots: earlier ones may be another's noise."""
 _SCATTER_MM: Final = 800
 _FEW: Final = 25.0
-"""So few detections, far away, may scatter as widely."""
+"""Fewer detections from far away may scatter over `_SCATTER_MM`."""
 _MAX_PLACES: Final = 512
 _FULL_WEIGHT: Final = 10
 """A spot of more detections weighs no more: all of one slice share its error of localisation."""
 
 
 def places_of(x: Ints, y: Ints, n: Ints, slices: Ints) -> Ints:
-    """Returns the number of the place of each spot (mm), seen in a slice; -1 of none."""
+    """Returns the number of each spot's place, or -1, for spots (mm) of one label.
+
+    `n` has the detections of each spot, `slices` its slice.
+    """
     weight = np.minimum(n, _FULL_WEIGHT).astype(np.float64)
     cells, cell_of = distinct_rows((x // _CELL_MM, y // _CELL_MM))
     mass = np.bincount(cell_of, weight).astype(np.float64)
@@ -87,7 +90,7 @@ class _Spots(NamedTuple):
     slice: Ints
 
     def share(self, cells: Flags, others: Flags) -> float:
-        """Returns the weight of some cells by that of others, while most of it is seen."""
+        """Returns the weight in cells over that in others, while most of the former is seen."""
         is_inside = cells[self.cell]
         first, last = np.percentile(self.slice[is_inside], MIDDLE)
         weight = self.weight * ((self.slice >= first) & (self.slice <= last))
@@ -95,7 +98,7 @@ class _Spots(NamedTuple):
 
 
 def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
-    """Returns where the spots are densest, the densest first, `_CLAIM_MM` or more apart.
+    """Returns the peaks of density, the densest first, at least `_CLAIM_MM` apart.
 
     `centre` and `mass` are of cells, the densest first.
     """
@@ -113,21 +116,15 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
         is_claimed[cell] = True
         weight = float(mass @ is_claimed)
         is_free &= ~is_claimed
-        others = masses[:count]
-        away = _squared(peaks[0, :count] - peak[0], peaks[1, :count] - peak[1])
-        is_near = away <= GATE_MM**2
-        if is_near.any():  # mostly it is not
-            # Peaks that are so heavy that one this light may be their noise.
-            is_halo = is_near & (others > weight / _HALO_SHARE)
-            is_scatter = (away <= _SCATTER_MM**2) & (others + weight < _FEW)
-            heavy = peaks[:, :count].T[is_halo | is_scatter].tolist()
-            if any(
-                weight < _FEW
-                or spots.share(is_claimed, _squared(x - other_x, y - other_y) <= _CLAIM_MM**2)
-                <= _OWN_SHARE
-                for other_x, other_y in heavy
-            ):
-                continue
+        hosts = _heavier_peaks(peak, weight, peaks[:, :count], masses[:count])
+        is_noise = bool(hosts) and weight < _FEW
+        for host_x, host_y in hosts:
+            if is_noise:
+                break
+            is_of_host = _squared(x - host_x, y - host_y) <= _CLAIM_MM**2
+            is_noise = spots.share(is_claimed, is_of_host) <= _OWN_SHARE
+        if is_noise:
+            continue
         peaks[:, count], masses[count] = peak, weight
         count += 1
         if count == _MAX_PLACES:
@@ -135,8 +132,18 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
     return peaks[:, :count].T
 
 
+def _heavier_peaks(
+    peak: Floats, weight: float, peaks: Floats, masses: Floats
+) -> list[tuple[float, float]]:
+    """Returns the peaks near a light one that are so heavy that it may be their noise."""
+    away = _squared(peaks[0] - peak[0], peaks[1] - peak[1])
+    is_halo = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
+    is_scatter = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
+    return [(x, y) for x, y in peaks.T[is_halo | is_scatter].tolist()]
+
+
 def _density(cells: Ints, mass: Floats) -> Floats:
-    """Returns for each cell the mass of the cells around it."""
+    """Returns the mass of the cells around each cell."""
     reach = _PEAK_MM // _CELL_MM
     low = cells.min(axis=0) - reach
     width = int(cells[:, 1].max() - low[1]) + reach + 1
@@ -171,7 +178,7 @@ _FEWEST: Final = 3
 LEAST_MM: Final = 150.0
 """A step that is shorter is none, however sure it is."""
 _SIGMAS: Final = 5.0
-"""So many standard errors are no chance, although a thing may be moved at any of many times."""
+"""A step of more standard errors is no chance, although it may be at any of many times."""
 _BIAS_MM: Final = 40.0
 """Standard deviation of the bias by side: half of the difference between opposite sides."""
 _LOOK_MM: Final = 50.0
@@ -179,20 +186,20 @@ _LOOK_MM: Final = 50.0
 _VISIT_MM: Final = 40.0
 """Usual standard deviation of the error that the looks of a visit share; visits correct it."""
 _LEAST_VISIT_MM: Final = 20.0
-"""That of a thing is taken for no less: a few visits may agree by chance."""
+"""The least that is assumed for a thing: a few visits may agree by chance."""
 _AT_ONCE: Final = 8_192
 """Sightings that are looked at together: more take more memory, and no less time."""
 _USUAL: Final = 8
-"""What is usual weighs as much as so many looks, or differences between visits."""
+"""The usual variance weighs as much as this many looks, or differences between visits."""
 
 
 class Sightings(NamedTuple):
-    """Sightings of things, of each in order of time, at least one.
+    """Sightings of things; each thing has at least one, in order of time.
 
     Attributes:
-        xy: the mean of `n` looks (mm); `dev` is their root mean square distance from it.
-        side: the mean of the unit vectors from the robot to it; 0 where that is not known.
-        first, last: of the looks (ns).
+        xy: the mean place of `n` looks (mm); `dev` is their root mean square distance from it.
+        side: the mean unit vector from the robot to the place; 0 if that is unknown.
+        first, last: log times of the first and the last look (ns).
     """
 
     xy: Floats
@@ -204,7 +211,7 @@ class Sightings(NamedTuple):
 
 
 def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
-    """Returns the number of the visit of each sighting, of things in ascending order."""
+    """Returns the number of each sighting's visit. Things are in ascending order."""
     things = np.broadcast_to(thing, len(last))
     latest = running_end(things, last)
     begins = (first[1:] > latest[:-1] + _PAUSE_NS) | (things[1:] != things[:-1])
@@ -212,9 +219,9 @@ def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
 
 
 def stays_in(sightings: Sightings, thing: Ints) -> list[Ints]:
-    """Returns the number of the stay of each sighting, from 0 for each thing.
+    """Returns the stay of each sighting, numbered from 0 for each thing.
 
-    `thing` has their numbers, from 0 without a gap, in order.
+    `thing` has the number of each sighting's thing, in order, without a gap.
     """
     series = _Series.of(sightings, thing)
     begins = run_starts(series.thing)
@@ -224,9 +231,11 @@ def stays_in(sightings: Sightings, thing: Ints) -> list[Ints]:
 
 
 class _Series(NamedTuple):
-    """Sightings as columns of 1, the side and the place, by the weight of their looks (1/mm²).
+    """The sightings of all things, prepared for the regression.
 
-    Of all things, which are numbered; visits are numbered through all of them.
+    Attributes:
+        columns: 1, the side (x, y) and the place (x, y), times the weight of the looks (1/mm²).
+        visit: the number of each sighting's visit, counted through all things.
     """
 
     columns: Floats
@@ -249,28 +258,30 @@ class _Series(NamedTuple):
 
 
 def _differences(series: _Series) -> list[Floats]:
-    """Returns what visits add to the variance (mm²) of each thing, by each two in a row.
+    """Returns the variances (mm²) that visits add to each thing, from consecutive visits.
 
-    Not by the two that differ most: between these it may have been moved.
+    They ascend. The largest one is left out: the thing may have been moved between those visits.
     """
     starts = run_starts(series.visit)
     sums, thing = np.add.reduceat(series.columns, starts, axis=1), series.thing[starts]
     means = sums / sums[0]
     begins = run_starts(thing)
-    normal = np.add.reduceat(_normal_equations(sums, _VISIT_MM**2), begins, axis=2).transpose(
-        2, 0, 1
-    )
-    fit = np.linalg.solve(normal[:, :, :3] + np.diag(_PRIOR), normal[:, :, 3:])
+    equations = np.add.reduceat(_normal_equations(sums, _VISIT_MM**2), begins, axis=2)
+    equations = equations.transpose(2, 0, 1)
+    fit = np.linalg.solve(equations[:, :, :3] + np.diag(_PRIOR), equations[:, :, 3:])
     off = means[3:] - np.einsum("iv,vij->jv", means[:3], fit[thing])
     by_looks = 1 / sums[0, :-1] + 1 / sums[0, 1:]
+    # The median of a squared distance in the plane is 2 ln 2 times the variance of each axis.
     variance = ((np.diff(off) ** 2).sum(axis=0) / (2 * math.log(2)) - by_looks) / 2
-    # What lies between two things is of neither.
-    of_things = (variance[begin : end - 1] for begin, end in pairwise([*begins, len(thing)]))
-    return [np.sort(of_thing)[:-1] for of_thing in of_things]
+    differences = []
+    for begin, end in pairwise([*begins, len(thing)]):
+        # The last visit's difference is to the next thing.
+        differences.append(np.sort(variance[begin : end - 1])[:-1])
+    return differences
 
 
 def _visit_variances(differences: Sequence[Floats]) -> Floats:
-    """Returns what visits add to the variance (mm²) of each thing."""
+    """Returns the variance (mm²) that visits add to each thing."""
     every = np.sort(np.concatenate(differences))
     usual = _shrunk(len(every), _median(every), _VISIT_MM**2)
     sizes = np.array([*map(len, differences)])
@@ -278,32 +289,35 @@ def _visit_variances(differences: Sequence[Floats]) -> Floats:
 
 
 def _median(ordered: Floats) -> float:
-    """Returns the median of values in order; 0 without any. `numpy.median` takes longer for few."""
+    """Returns the median of values in order; 0 for none. `numpy.median` is slower for few."""
     n = len(ordered)
     return float(ordered[(n - 1) // 2] + ordered[n // 2]) / 2 if n else 0.0
 
 
 def _shrunk(n: Ints | int, median: Floats | float, usual: Floats | float) -> Floats:
-    """Returns the median of `n` variances, drawn to what is usual the more the fewer they are."""
+    """Returns the median of `n` variances, pulled towards the usual one: the more, the fewer."""
     return np.maximum((n * median + _USUAL * usual) / (n + _USUAL), _LEAST_VISIT_MM**2)
 
 
 _PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2])
-"""What is known (1/mm²) before any look of the place, and of the bias by side in x and y.
+"""What is known (1/mm²) of the place, and of the bias by side in x and y, before any look.
 
-Of the place next to nothing, so that the equations have a solution.
+Next to nothing is known of the place: just enough for the equations to have a solution.
 """
 
 
 def _normal_equations(sums: Floats, visit_variance: Floats | float) -> Floats:
-    """Returns what each visit adds to the normal equations of the regression: 3 x 5 x visits."""
+    """Returns each visit's part of the normal equations of the regression: 3 x 5 x visits."""
     weight = np.maximum(sums[0], 1e-30)
     added: Floats = sums[:3, None] * sums * (1 / weight / (1 + visit_variance * weight))
     return added
 
 
 def _are_moved(series: _Series, variance: Floats) -> Flags:
-    """Returns the sightings before which a thing was moved; `variance` of visits is by thing."""
+    """Returns before which sightings a thing was moved. `variance` is each thing's, of visits.
+
+    A step splits its thing in two, and each part is looked at again.
+    """
     moved = np.zeros(len(series.n), np.bool_)
     begins = run_starts(series.thing).tolist()
     waiting = deque(pairwise([*begins, len(moved)]))
@@ -316,7 +330,7 @@ def _are_moved(series: _Series, variance: Floats) -> Flags:
         rows = np.concatenate([np.arange(*span) for span in spans])
         number = np.repeat(np.arange(len(spans)), [stop - start for start, stop in spans])
         batch = _Series(series.columns[:, rows], series.n[rows], series.visit[rows], number)
-        for span, row in _steps(batch, variance[series.thing[rows]]):
+        for span, row in _likeliest_steps(batch, variance[series.thing[rows]]):
             start, stop = spans[span]
             step = int(rows[row])
             moved[step] = True
@@ -324,37 +338,38 @@ def _are_moved(series: _Series, variance: Floats) -> Flags:
     return moved
 
 
-def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
-    """Yields the things with a step, and the first sighting after the likeliest one.
+def _likeliest_steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
+    """Yields each thing with a sure step, and the first sighting after its likeliest one.
 
-    `variance` is that of the visit of each sighting.
+    `variance` is that of each sighting's visit.
     """
     begins = run_starts(series.thing)
     looks = np.cumsum(series.n)
-    of_others, total = (looks - series.n)[begins], np.add.reduceat(series.n, begins)
-    old_looks = looks - of_others[series.thing]
-    new_looks = total[series.thing] - old_looks
-    at = np.flatnonzero((old_looks >= _FEWEST) & (new_looks >= _FEWEST)) + 1
+    looks_of_others = (looks - series.n)[begins]
+    looks_before = looks - looks_of_others[series.thing]
+    looks_after = np.add.reduceat(series.n, begins)[series.thing] - looks_before
+    at = np.flatnonzero((looks_before >= _FEWEST) & (looks_after >= _FEWEST)) + 1
     if not len(at):
         return
     old, new = _before_and_after(series, begins, at, variance)
-    likely = _squared_errors(old, new)
-    # Of each thing the likeliest, of equal ones the first.
-    order = np.lexsort((at, -likely, series.thing[at]))
+    squares = _squared_errors(old, new)
+    # For each thing the likeliest step; of equal ones the first.
+    order = np.lexsort((at, -squares, series.thing[at]))
     things, first = np.unique(series.thing[at[order]], return_index=True)
     best = order[first]
-    is_sure = likely[best] > _SIGMAS**2
+    is_sure = squares[best] > _SIGMAS**2
     yield from zip(things[is_sure].tolist(), at[best[is_sure]].tolist(), strict=True)
 
 
 def _squared_errors(old: Floats, new: Floats) -> Floats:
-    """Returns the square of how many standard errors each step is; 0 of one too short to be any.
+    """Returns the square of each step's length in standard errors; 0 for a step that is too short.
 
-    By the squares before and after it. Unknown are the place, the bias in x and y, and the step.
+    `old` and `new` are the normal equations before and after the step. The unknowns are the place,
+    the bias in x and y, and the step.
     """
     both, of_new = old + new, new[0]
     both[[0, 1, 2], [0, 1, 2]] += _PRIOR[:, None]
-    # The equations, and the right sides in x and y; from the last one the others are eliminated.
+    # Three equations and that of the step, with right sides in x and y: eliminate the first three.
     rows = np.insert(both, 3, of_new[:3], axis=1)
     rows = np.concatenate((rows, of_new[None, [0, 1, 2, 0, 3, 4]]))
     for nth in range(3):
@@ -368,9 +383,9 @@ def _squared_errors(old: Floats, new: Floats) -> Floats:
 def _before_and_after(
     series: _Series, begins: Ints, at: Ints, variance: Floats
 ) -> tuple[Floats, Floats]:
-    """Returns the squares of a thing's visits before and after each step, which may be within one.
+    """Returns the normal equations of a thing's visits before and after each step.
 
-    `begins` has where each thing begins.
+    A step may lie within a visit. `begins` has where each thing begins.
     """
     is_start = np.diff(series.visit, prepend=-1) != 0
     is_start[begins] = True
@@ -395,9 +410,9 @@ _BESIDE_SHARE: Final = 0.02
 _LEAST_SHARE: Final = 0.05
 """A label that is given more rarely is a mistake."""
 _SAME_MM: Final = 100.0
-"""Means of two labels in a visit that are no farther apart are of one place."""
+"""The means of two labels in a visit are at one place if they are this near to each other."""
 _SCATTERS: Final = 2.0
-"""So are those within as many root mean square distances of the looks, if that is more."""
+"""Or if they are within so many root mean square distances of the looks."""
 
 
 def with_synonyms(
@@ -406,16 +421,11 @@ def with_synonyms(
     labels: Labels,
     go_on: Callable[[], None],
 ) -> list[str]:
-    """Returns the keys of the labels of sights, one for all that are names of one thing.
+    """Returns the key of each label of the sights: one key for all names of one thing.
 
     `counts` has how many detections of each spot count.
     """
     keys = [labels.key(label) for label in sights.labels]
-    by_word: dict[str, list[str]] = defaultdict(list)
-    placed = np.unique(sights.spots[counts > 0, Spot.LABEL])
-    for key in sorted({keys[label] for label in placed.tolist()}):
-        if not moves_by_itself(key):
-            by_word[last_word(key)].append(key)
     distinct, key_of_label = numbered(keys)
     number_of = {key: number for number, key in enumerate(distinct)}
 
@@ -428,24 +438,34 @@ def with_synonyms(
         return labels.are_apart(one, other) or _are_beside(sights, labels_of(one), labels_of(other))
 
     groups = {key: frozenset({key}) for key in keys}
-    pairs = (pair for alike in by_word.values() for pair in combinations(alike, 2))
-    for one, other in pairs:
+    placed = np.unique(sights.spots[counts > 0, Spot.LABEL])
+    for one, other in _pairs_of_a_kind({keys[label] for label in placed.tolist()}):
         masks = labels_of(one), labels_of(other)
         if not are_two(one, other) and _alternate(sights, counts, *masks):
             group = groups[one] | groups[other]
             groups |= dict.fromkeys(group, group)
-    # A name that is used for two things does not tell them apart.
-    names = {
-        group: None if any(starmap(are_two, combinations(sorted(group), 2))) else min(group)
-        for group in {*groups.values()}
-    }
-    return [names[groups[key]] or key for key in keys]
+    names: dict[str, str] = {}
+    for group in {*groups.values()}:
+        # A name that is used for two things does not tell them apart.
+        if not any(are_two(one, other) for one, other in combinations(sorted(group), 2)):
+            names |= dict.fromkeys(group, min(group))
+    return [names.get(key, key) for key in keys]
+
+
+def _pairs_of_a_kind(keys: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Yields the pairs of keys that end in the same word, and name no people or pets."""
+    by_word: dict[str, list[str]] = defaultdict(list)
+    for key in sorted(keys):
+        if not moves_by_itself(key):
+            by_word[last_word(key)].append(key)
+    for keys_of_a_kind in by_word.values():
+        yield from combinations(keys_of_a_kind, 2)
 
 
 def _are_beside(sights: JoinedSights, one: Mask, other: Mask) -> bool:
-    """Whether messages have both of two labels at one place, more often than by mistake.
+    """Returns whether messages have two keys at one place, more often than by mistake.
 
-    Each is given as which labels of the sights are names of it.
+    Each mask selects the labels of one key.
     """
     label, beside = sights.spots[:, Spot.LABEL], sights.beside
     spot, label_beside, n = (beside[:, name] for name in Beside)
@@ -455,7 +475,10 @@ def _are_beside(sights: JoinedSights, one: Mask, other: Mask) -> bool:
 
 
 def _alternate(sights: JoinedSights, counts: Ints, one: Mask, other: Mask) -> bool:
-    """Whether two labels take turns at some place, within the scatter of each other."""
+    """Returns whether two keys take turns at some place, within the scatter of each other.
+
+    Each mask selects the labels of one key.
+    """
     spots = sights.spots
     of_both = np.flatnonzero((one | other)[spots[:, Spot.LABEL]] & (counts > 0))
     epoch = sights.epochs[spots[of_both, Spot.SLICE]]
@@ -464,17 +487,19 @@ def _alternate(sights: JoinedSights, counts: Ints, one: Mask, other: Mask) -> bo
         names = (Spot.X, Spot.Y, Spot.SLICE, Spot.LABEL)
         x, y, slices, label = (spots[rows, name] for name in names)
         place = places_of(x, y, counts[rows], slices)
-        for here in (place == nearest for nearest in range(int(place.max(initial=-1)) + 1)):
+        for nth_place in range(int(place.max(initial=-1)) + 1):
+            here = place == nth_place
             is_other = other[label[here]].astype(np.int64)
-            if is_other.any() and not is_other.all():
-                rarer, total = _turns(spots[rows[here]], counts[rows[here]], is_other)
-                if rarer >= max(_FEWEST_TURNS, _LEAST_SHARE * total):
-                    return True
+            if not is_other.any() or is_other.all():
+                continue
+            rarer, total = _turns(spots[rows[here]], counts[rows[here]], is_other)
+            if rarer >= max(_FEWEST_TURNS, _LEAST_SHARE * total):
+                return True
     return False
 
 
 def _turns(spots: Ints, n: Ints, is_other: Ints) -> tuple[int, int]:
-    """Returns how often the rarer of two labels was seen in visits with turns, and both.
+    """Returns how often the rarer of two labels was seen in visits with turns, and both together.
 
     `spots` are at one place in order of time, with `n` detections each; `is_other` is 0 or 1.
     """
@@ -499,9 +524,9 @@ def _turns(spots: Ints, n: Ints, is_other: Ints) -> tuple[int, int]:
 
 
 _POOR_MM: Final = 600
-"""Standard deviation of a point 2 m before the robot."""
+"""Standard deviation of a point `AHEAD_MM` before the robot, above which localisation is poor."""
 _JUMP_MM: Final = 300.0
-"""So far the map moves that point in a jump."""
+"""A jump moves that point by more in the map."""
 _BEFORE_NS: Final = 5 * NS_PER_S
 _NEXT_NS: Final = 4 * NS_PER_S
 _NEVER_NS: Final = 3600 * NS_PER_S
@@ -510,24 +535,8 @@ _KNOWN_NS: Final = 60 * NS_PER_S
 
 
 def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
-    """Returns which spots and which looks are of a slice in which localisation was poor."""
-    fixes = sights.fixes
-    time = fixes[:, Fix.TIME]
-    after = np.diff(time, append=time[-1:] + _NEVER_NS)
-    after[after < 0] = _NEVER_NS  # the next one is of another session
-    turn = np.radians((np.diff(fixes[:, Fix.YAW]) + 1800) % 3600 / 10 - 180)
-    off = np.hypot(np.diff(fixes[:, Fix.X]), np.diff(fixes[:, Fix.Y])) + AHEAD_MM * np.abs(turn)
-    jumped = np.flatnonzero((off > _JUMP_MM) & (after[:-1] <= _NEXT_NS))
-    # What the localiser gave last, at each fix; -1 if that is not known.
-    sigma = fixes[:, Fix.SIGMA]
-    is_new = sigma >= 0
-    is_new[1:] |= after[:-1] > _KNOWN_NS
-    newest = np.maximum.accumulate(np.where(is_new, np.arange(len(sigma)), 0))
-    vague = np.flatnonzero(sigma[newest] > _POOR_MM)
-    starts = np.concatenate((time[jumped] - _BEFORE_NS, time[vague]))
-    stops = np.concatenate((time[jumped + 1], time[vague] + np.minimum(after[vague], _KNOWN_NS)))
-    order = np.argsort(starts, kind="stable")
-    starts, stops = starts[order], np.maximum.accumulate(stops[order])
+    """Returns which spots and which looks are in a slice in which localisation was poor."""
+    starts, stops = _poor_times(sights.fixes)
 
     def are_poor(first: Ints, last: Ints) -> Flags:
         before = np.searchsorted(starts, last, side="right")
@@ -539,3 +548,23 @@ def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
     # Whole slices: else a look from beside would miss what a spot that is left out has seen.
     slices = np.union1d(spots[poor_spots, Spot.SLICE], looks[poor_looks, Look.SLICE])
     return np.isin(spots[:, Spot.SLICE], slices), np.isin(looks[:, Look.SLICE], slices)
+
+
+def _poor_times(fixes: Columns) -> tuple[Ints, Ints]:
+    """Returns when localisation was poor, as starts and stops (ns), both ascending."""
+    time = fixes[:, Fix.TIME]
+    after = np.diff(time, append=time[-1:] + _NEVER_NS)
+    after[after < 0] = _NEVER_NS  # the next one is of another session
+    turn = np.radians((np.diff(fixes[:, Fix.YAW]) + 1800) % 3600 / 10 - 180)
+    off = np.hypot(np.diff(fixes[:, Fix.X]), np.diff(fixes[:, Fix.Y])) + AHEAD_MM * np.abs(turn)
+    jumped = np.flatnonzero((off > _JUMP_MM) & (after[:-1] <= _NEXT_NS))
+    # The last covariance that the localiser gave before each fix, unless it is too old.
+    sigma = fixes[:, Fix.SIGMA]
+    is_new = sigma >= 0
+    is_new[1:] |= after[:-1] > _KNOWN_NS
+    newest = np.maximum.accumulate(np.where(is_new, np.arange(len(sigma)), 0))
+    vague = np.flatnonzero(sigma[newest] > _POOR_MM)
+    starts = np.concatenate((time[jumped] - _BEFORE_NS, time[vague]))
+    stops = np.concatenate((time[jumped + 1], time[vague] + np.minimum(after[vague], _KNOWN_NS)))
+    order = np.argsort(starts, kind="stable")
+    return starts[order], np.maximum.accumulate(stops[order])

@@ -1,8 +1,8 @@
-"""What detectors saw in some rows of one session: placed in the map, as sights.
+"""Places what detectors saw in the rows of one session in the map, as sights.
 
-Which topics are of detectors shows in their messages: at some time they hold detections, or their
-type is named for them. Other messages of such a topic count as looks that saw nothing. So there are
-looks of all topics that may have detections; `detectors` are those that show it in these rows.
+A topic is a detector's if a message of it has a detection, or if the name of its type says so. Its
+other messages are looks that saw nothing. Any topic that may have detections gets looks, since
+another part of the history may show that it is a detector's.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -46,27 +46,46 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.model import BagFile
     from ros2_memory.history.sessions import Session
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
 
 
 LOCALISER: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _NEAR_NS: Final[Ns] = NS_PER_S
-"""Farther from a pose, where the robot was is not known."""
+"""Farther from a pose in time, the robot's place is unknown."""
 _FIX_NS: Final[Ns] = 2 * NS_PER_S
-"""How far apart it is looked where odometry is in the map."""
+"""The time between fixes of odometry in the map."""
 _AHEAD_NS: Final[Ns] = 3 * _FIX_NS
-"""How far beyond the last detection: a jump soon after it shows that localisation was off."""
+"""Fixes go on after the last detection: a jump soon after it shows that localisation was off."""
 _MOST_FIXES: Final = 2_000
 _SAID_NS: Final[Ns] = NS_PER_S // 2
-"""What a localiser says more often than that is not read."""
+"""Of a localiser's messages one in each half of a second is read."""
 _SAME_M: Final = 0.1
-"""What changes less from one look to the next is left out."""
+"""Fixes with smaller changes are left out."""
 _COVARIANCE: Final = 36
+"""Numbers in the covariance of a pose: 6 x 6, of x, y, z and the turns about them."""
+_VARIANCES: Final = (0, 7, 35)
+"""Where the variances of x, y and yaw are among them."""
 
 
 _OF_DETECTORS: Final = re.compile("(detection|recognizedobject)[^/]*$", re.IGNORECASE)
 AROUND_NS: Final[Ns] = 12 * NS_PER_S
 """How far around a stretch poses and transforms are read."""
+
+
+class PlacedSights(NamedTuple):
+    """The sights of a session.
+
+    Attributes:
+        frame_id: of all places and poses: the map, or the frame of the robot's poses if no
+            transforms lead to the map.
+        sights: the sights of each topic; sights without a topic have the fixes.
+        detectors: the topics that surely have a detector.
+    """
+
+    frame_id: str
+    sights: list[Sights]
+    detectors: set[str]
 
 
 class Placer:
@@ -83,44 +102,40 @@ class Placer:
 
     @cached_property
     def body(self) -> Body | None:
-        """The robot's body where transforms place it; None where a topic of poses does."""
+        """The robot's body if transforms place it; None if a topic of poses does."""
         return body_by_transforms(self._view)
 
-    def placed(
+    def place(
         self,
         window: TimeWindow,
         session: Session,
         lender: Session,
         units: Iterable[Rows],
-    ) -> tuple[str, list[Sights], set[str]] | None:
-        """Returns the sights of some rows of a session; None where there are no messages.
-
-        First the frame of all places and poses: the map, or that of the robot's poses where no
-        transforms lead to the map. Then the sights of each topic; those without a topic have the
-        fixes. Last the topics that are surely of detectors.
+    ) -> PlacedSights | None:
+        """Returns the sights in rows of a session; None if there are no messages.
 
         Args:
-            window: the rows are of this time.
-            session: the rows are of it.
-            lender: the one whose transforms hold for it; empty where none do.
-            units: the rows, of some topics; those before the window show what repeats them.
+            window: the time of the sights.
+            session: the session of the rows.
+            lender: the session whose transforms hold for it; empty if none do.
+            units: the rows of the topics. Rows before the window show which messages repeat them.
 
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
-        detected, detectors = self._detected(units, window.start)
-        if not detected:
+        messages_of_topics, detectors = self._new_messages(units, window.start)
+        if not messages_of_topics:
             return None
         poses = self._poses(session, lender, window)
         target, frames = self._frames(lender, window, poses)
         sights = [
             _sights_of(topic, messages, frames, _robot_at(poses, messages, frames))
-            for topic, messages in detected.items()
+            for topic, messages in messages_of_topics.items()
         ]
         if target == self._view.limits.map_frame and len(poses):
-            times = np.concatenate([messages.log_times for messages in detected.values()])
+            times = np.concatenate([messages.log_times for messages in messages_of_topics.values()])
             sights.append(self._fixes(session, poses.frames.words[0], frames, times))
-        return target, sights, detectors
+        return PlacedSights(target, sights, detectors)
 
     def sights_by_bag(
         self,
@@ -129,36 +144,43 @@ class Placer:
         lender: Session,
         units_of_bags: Mapping[BagFile, Sequence[Rows]],
     ) -> Iterator[tuple[BagFile, str, Sights]]:
-        """Yields the sights of each topic in each bag, with the frame that their places are in.
+        """Yields each bag with the frame and the sights of each topic that detected something.
 
-        Takes what `placed` takes. Where the robot was is not in them.
+        See `place` for the arguments. These sights do not have the robot's poses.
         """
         target, frames = self._frames(lender, window, self._poses(session, lender, window))
         for bag, units in units_of_bags.items():
-            for topic, messages in self._detected(units, window.start)[0].items():
+            messages_of_topics, _ = self._new_messages(units, window.start)
+            for topic, messages in messages_of_topics.items():
                 if messages.found.rows.size:
                     nowhere = np.full((len(messages.log_times), 5), math.nan)
                     yield bag, target, _sights_of(topic, messages, frames, nowhere)
 
-    def _detected(self, units: Iterable[Rows], since: Ns) -> tuple[dict[str, Detected], set[str]]:
-        """Returns the messages since a time by topic, and which topics are surely of detectors.
+    def _new_messages(
+        self, units: Iterable[Rows], since: Ns
+    ) -> tuple[dict[str, Detected], set[str]]:
+        """Returns the new messages of each topic since a time, and the topics of sure detectors.
 
-        Those that only repeat the one before are no messages.
+        Messages that only repeat the one before are left out.
         """
-        by_topic: dict[str, list[Rows]] = defaultdict(list)
-        # However they are stored.
+        units_of_topics: dict[str, list[Rows]] = defaultdict(list)
+        # Sorted, so that sights do not depend on how rows are stored.
         for rows in sorted(units, key=lambda rows: (rows.first, rows.last, str(rows.recording))):
-            by_topic[rows.table.channel.topic].append(rows)
-        detected: dict[str, Detected] = {}
+            units_of_topics[rows.table.channel.topic].append(rows)
+        messages_of_topics: dict[str, Detected] = {}
         detectors: set[str] = set()
-        for topic, of_topic in by_topic.items():
-            messages = joined_detected([self.rows.of(rows) for rows in of_topic]).new_since(since)
-            named = [rows for rows in of_topic if _OF_DETECTORS.search(rows.table.channel.type)]
-            is_named = any(map(self.rows.have_labels, named))
-            if messages.log_times.size:
-                detected[topic] = messages
-                detectors |= {topic} if is_named or messages.found.rows.size else set()
-        return detected, detectors
+        for topic, units_of_topic in units_of_topics.items():
+            messages = joined_detected([self.rows.of(rows) for rows in units_of_topic])
+            messages = messages.new_since(since)
+            if not messages.log_times.size:
+                continue
+            messages_of_topics[topic] = messages
+            named = [
+                rows for rows in units_of_topic if _OF_DETECTORS.search(rows.table.channel.type)
+            ]
+            if messages.found.rows.size or any(map(self.rows.have_labels, named)):
+                detectors.add(topic)
+        return messages_of_topics, detectors
 
     def _poses(self, session: Session, lender: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
@@ -169,7 +191,7 @@ class Placer:
             poses = poses_by_session(self._view, around, lender, self.body)
         if not len(poses):
             return poses
-        # Poses of one topic nearly always have one frame: those of others are left out.
+        # Poses of one topic nearly always have one frame: those in other frames are left out.
         frame = int(np.bincount(poses.frames.codes).argmax())
         is_place = (np.abs(poses.positions) < FARTHEST_M).all(axis=1)
         poses = poses.rows(np.flatnonzero((poses.frames.codes == frame) & is_place))
@@ -177,7 +199,7 @@ class Placer:
         return replace(poses, frames=poses.frames._replace(codes=codes, words=words))
 
     def _recorded_poses(self, session: Session, window: TimeWindow) -> Poses:
-        """Returns the poses of the robot's topic that a session has in a window."""
+        """Returns the poses of the robot's topic in a session and a window."""
         failures: list[UndecodableError] = []
         units = pose_rows(
             self._view,
@@ -192,7 +214,7 @@ class Placer:
             return NO_POSES
 
     def _frames(self, lender: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
-        """Returns the frame to place all in (the map if transforms lead there), and the frames."""
+        """Returns the frame for sights (the map if transforms lead there), and the frames in it."""
         pose_frame = poses.frames.words[0] if len(poses) else ""
         target = self._view.limits.map_frame or pose_frame
         if not lender:
@@ -205,16 +227,16 @@ class Placer:
         return pose_frame, frames_over(self._view, lender, window, pose_frame)
 
     def _fixes(self, session: Session, odometry: str, frames: FrameTree, detected: Ints) -> Sights:
-        """Returns where odometry was in the map around detections, where that changes."""
-        first, last = int(detected.min()), int(detected.max()) + _AHEAD_NS
-        step = max(1, (last - first) // (_MOST_FIXES * _FIX_NS)) * _FIX_NS
-        most = MAX_NS // step
-        begin, end = max(first // step - 1, -most), min(last // step + 2, most)
-        times = np.arange(begin, end) * step
-        around = TimeWindow(first, int(detected.max())).widened(AROUND_NS)
-        said_at, said = self._localised(session, around)
-        poses = frames.poses(odometry, times) if odometry != frames.target else None
+        """Returns the poses of odometry in the map around detections, wherever these poses change.
+
+        `detected` has the log times (ns) of the detections.
+        """
+        begin, end = int(detected.min()), int(detected.max())
+        around = TimeWindow(begin, end).widened(AROUND_NS)
+        said_at, said = self._localiser_sigmas(session, around)
+        times, step = _fix_times(begin, end + _AHEAD_NS)
         pose = np.zeros((len(times), 3))
+        poses = frames.poses(odometry, times) if odometry != frames.target else None
         if poses is not None:
             x, y, _ = poses.translation
             pose = np.stack((x, y, _yaw(poses.rotation)), axis=1)[poses.valid]
@@ -224,42 +246,57 @@ class Placer:
         sigma = np.append(said, [math.nan])[np.searchsorted(said_at, times, side="right") - 1]
         is_changed = np.abs(np.diff(pose, axis=0)).max(axis=1, initial=0.0) > _SAME_M
         is_changed |= np.abs(np.diff(np.nan_to_num(sigma, nan=-1.0))) > _SAME_M
-        # One in each slice of the clock besides, however little changes.
-        is_kept = times // SLICE_NS != (times - step) // SLICE_NS
-        is_kept[1:] |= is_changed
-        is_kept[:-1] |= is_changed
-        is_kept &= (times >= first - step) & (times <= last)
-        return fixes_of(times[is_kept], pose[is_kept], sigma[is_kept])
+        # The fixes on both sides of a change, and in any case one in each slice of the clock.
+        is_needed = times // SLICE_NS != (times - step) // SLICE_NS
+        is_needed[1:] |= is_changed
+        is_needed[:-1] |= is_changed
+        is_needed &= (times >= begin - step) & (times <= end + _AHEAD_NS)
+        return fixes_of(times[is_needed], pose[is_needed], sigma[is_needed])
 
-    def _localised(self, session: Session, window: TimeWindow) -> tuple[Ints, Floats]:
-        """Returns what localisers said, once in `_SAID_NS`: when, and the standard deviation (m).
+    def _localiser_sigmas(self, session: Session, window: TimeWindow) -> tuple[Ints, Floats]:
+        """Returns when localisers gave their covariance (ns), and its standard deviation (m).
 
-        From the messages: covariances have no columns.
+        Messages are read, since covariances have no columns. See `_sigma_ahead`.
         """
-        view, said = self._view, []
-        for topic in view.timeline.topics():
-            if LOCALISER not in view.timeline.types_of(topic):
+        said: list[tuple[Ns, float]] = []
+        for message in self._localiser_messages(session, window):
+            decoded = self._view.bags.decode(message)
+            if decoded is None:
                 continue
-            for rows in scan(view, topic, window):
-                if self._sessions.of(rows.recording) != session:
-                    continue
-                slices = rows.times // _SAID_NS
-                firsts = run_starts(slices)
-                for stored in messages_of(view, rows.some(firsts)):
-                    message = view.bags.decode(stored)
-                    if message is None:
-                        continue
-                    frame = view.extractor.frame(message).lstrip("/")
-                    pose = getattr(message, "pose", None)
-                    sigma = _sigma_ahead(getattr(pose, "covariance", None))
-                    if sigma is not None and frame == view.limits.map_frame:
-                        said.append((stored.time, sigma))
+            frame = self._view.extractor.frame(decoded).lstrip("/")
+            pose = getattr(decoded, "pose", None)
+            sigma = _sigma_ahead(getattr(pose, "covariance", None))
+            if sigma is not None and frame == self._view.limits.map_frame:
+                said.append((message.time, sigma))
         said.sort()
         times = np.array([time for time, _ in said], np.int64)
         return times, np.array([sigma for _, sigma in said], np.float64)
 
+    def _localiser_messages(self, session: Session, window: TimeWindow) -> Iterator[StoredMessage]:
+        """Yields a message of each localiser in each `_SAID_NS` of the clock."""
+        timeline = self._view.timeline
+        for topic in timeline.topics():
+            if LOCALISER not in timeline.types_of(topic):
+                continue
+            for rows in scan(self._view, topic, window):
+                if self._sessions.of(rows.recording) == session:
+                    firsts = run_starts(rows.times // _SAID_NS)
+                    yield from messages_of(self._view, rows.some(firsts))
+
+
+def _fix_times(first: Ns, last: Ns) -> tuple[Ints, Ns]:
+    """Returns the times of fixes around two moments (ns), and the step between them.
+
+    They are multiples of the step, so that they do not depend on the moments.
+    """
+    step = max(1, (last - first) // (_MOST_FIXES * _FIX_NS)) * _FIX_NS
+    most = MAX_NS // step
+    begin, end = max(first // step - 1, -most), min(last // step + 2, most)
+    return np.arange(begin, end) * step, step
+
 
 def _sights_of(topic: str, messages: Detected, frames: FrameTree, robot: Floats) -> Sights:
+    """Returns the sights of a topic's messages. `robot` is as in `DetectorMessages`."""
     found = messages.found
     seen = DetectorMessages(
         times=messages.log_times,
@@ -274,7 +311,7 @@ def _sights_of(topic: str, messages: Detected, frames: FrameTree, robot: Floats)
 
 
 def _places_in_target(detected: Detected, frames: FrameTree) -> Floats:
-    """Returns the places (N x 3, m) of detections in the target; NaN where no transform leads."""
+    """Returns the places of detections in the target (N x 3, m); NaN without a transform."""
     detections = detected.found
     places = np.full(detections.places.shape, math.nan)
     has_place = ~np.isnan(detections.places).any(axis=1)
@@ -291,13 +328,13 @@ def _places_in_target(detected: Detected, frames: FrameTree) -> Floats:
 
 
 def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
-    """Returns the robot's pose at each message, and the yaw of its detector relative to it (rad).
+    """Returns the robot's pose at each message, and its detector's yaw, as in `DetectorMessages`.
 
-    As in `DetectorMessages.robot`. Where there is no pose, transforms of the frames that carry the
-    detector are used. A message without a frame is in the frame of most detections.
+    If there is no pose, it follows from the transforms of the frames that carry the detector. A
+    message without a frame is taken to be in the frame of most detections.
     """
     times, pose_frame = detected.times, poses.frames.words[0] if len(poses) else ""
-    robot = np.column_stack((_posed_at(poses, times, frames), np.zeros(len(times))))
+    robot = np.column_stack((_pose_at(poses, times, frames), np.zeros(len(times))))
     of_detections = detected.found.frames
     usual = ""
     if len(of_detections):
@@ -311,9 +348,9 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
         if head is None or body is None:
             continue
         yaw = _yaw(body.rotation)
-        pose = np.stack((*body.translation, yaw, 0 * yaw), axis=1)
-        posed = np.where(body.valid[:, None], pose, math.nan)
-        robot[rows] = np.where(np.isnan(robot[rows]), posed, robot[rows])
+        by_body = np.stack((*body.translation, yaw, 0 * yaw), axis=1)
+        by_body = np.where(body.valid[:, None], by_body, math.nan)
+        robot[rows] = np.where(np.isnan(robot[rows]), by_body, robot[rows])
         head_frame, body_frame = carriers
         if head_frame != body_frame:
             is_known = head.valid & body.valid
@@ -321,10 +358,10 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
     return robot
 
 
-def _posed_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
-    """Returns x, y, z (m) and heading (rad) of the robot at some times; NaN where not known.
+def _pose_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
+    """Returns x, y, z (m) and yaw (rad) of the robot at each time, interpolated between poses.
 
-    That is farther than 1 s from a pose, or where no transform leads from its frame.
+    NaN farther than 1 s from a pose, or if no transform leads from the frame of the poses.
     """
     robot = np.full((len(times), 4), math.nan)
     placed = frames.poses(poses.frames.words[0], times) if len(poses) else None
@@ -357,6 +394,6 @@ def _sigma_ahead(covariance: object) -> float | None:
     """Returns the standard deviation (m) of a point `AHEAD_MM` before a pose; None if unknown."""
     if not isinstance(covariance, Sequence | np.ndarray) or len(covariance) != _COVARIANCE:
         return None
-    x, y, yaw = (float(covariance[index]) for index in (0, 7, 35))
+    x, y, yaw = (float(covariance[index]) for index in _VARIANCES)
     variance = max(x, y) + yaw * (AHEAD_MM / 1000) ** 2
     return math.sqrt(variance) if variance >= 0 and math.isfinite(variance) else None

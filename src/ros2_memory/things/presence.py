@@ -1,12 +1,12 @@
 """When a label was at a place: from what was seen there, and from what was not seen.
 
 What was seen is known by slice (`analysis.sights`): 10 s of the clock.
-A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees around where it often is,
-from which the place was seen at least once. How often a message from a cell has the label, while it
-is there, is its rate. A look from such a cell without a hit is evidence of absence, as strong as
-the rate makes it; a hit is evidence of presence, as strong as false detections are rare. A message
-that has the label somewhere unknown is neither. The likeliest sequence of being there and not being
-there (Viterbi, two states) gives the stays.
+A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees around where it often is.
+The *rate* of a cell is how often its messages have the label while the thing is at the place. A
+look without a hit, from a cell that saw the place before, is evidence of absence: the higher the
+rate, the stronger. A hit is evidence of presence: the rarer false detections, the stronger. A
+message that has the label somewhere unknown is no evidence. The likeliest sequence of presence and
+absence (Viterbi, two states) gives the stays.
 """
 
 from __future__ import annotations
@@ -49,40 +49,46 @@ _FALSE_RATE: Final = 0.01
 _SWITCH: Final = 4.0
 """Natural logarithm of the odds against a change between two slices."""
 _MOST_BY_SLICE: Final = 10.0
-"""What one slice can add to the evidence: its messages share their errors."""
+"""The most evidence in one slice: its messages share their errors."""
 _STANDING: Final = 0.2
 """A robot that stands looks at the same thing behind the same obstacle."""
 _LEAST_BLIND: Final = -2.0
-"""A look with hits, from where the place is hardly seen, says no more against it."""
+"""The most that a look with hits says against a thing, if its cell hardly sees the place."""
 _CLEAR: Final = 1.5
-"""A slice with less is not the first or the last of a stay, unless all have less."""
+"""A slice with less evidence is not the first or last of a stay, unless all slices have less."""
 _FIRM: Final = 5.0
 """A slice with evidence above this has more than one detection, which is hardly ever false."""
 _UNPLACED_HIT: Final = 2.0
-"""What a hit from an unknown pose adds."""
+"""The evidence of a hit from an unknown pose."""
 _PRIOR: Final = 0.5
-"""Hits, and messages without one, that each cell is taken to have had before (Jeffreys' prior)."""
+"""The hits, and the messages without one, that each cell begins with (Jeffreys' prior)."""
 _MISSED_BY_CHANCE: Final = 0.01
 _LEFT_BY_CHANCE: Final = 0.05
 _FEWEST_HITS: Final = 3
 _RARE_OF: Final = 20
-"""A cell sees a place if some hits in a row, or all, are in no more messages than so many each."""
+"""A cell sees a place if one message in twenty has a hit: over all, or over a row of hits."""
 _LEAST_RATE: Final = 0.1
-"""In looks with a hit, a cell that sees a place has one in as many of the messages, at least."""
+"""The least share of messages with a hit, in the looks with hits of a cell that sees a place."""
 _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
-"""A cell with so many looks is blocked if its share of hits is below this part of the others'."""
+"""A cell with many looks is blocked if its share of hits is below a tenth of the others' share."""
 _YAWS: Final = 3600 // CELL_DECIDEG
 _VIEW_SHARE: Final = 0.02
-"""What lies farther out at each side of a field of view is mistaken."""
+"""The share of detections outside of each side of a field of view: they are mistaken."""
 
 
 class Cells:
-    """The looks of all slices by cell: which looks were from where.
+    """The looks of all slices, and the cell that each is from.
+
+    Attributes:
+        slice, topic, x, y, yaw, pan, n, last: columns of the looks, as in `Look`.
+        cell: the number of each look's cell.
+        looks_in: how many looks each cell has; `messages_in` how many messages.
+        messages_before: for each look, how many messages the looks before it have, by cell.
 
     Args:
-        sights: of all slices.
-        poor: which looks are not where they seem to be; those say nothing of others.
+        sights: the sights of all slices.
+        poor: which looks are not where they seem to be: they are in cells of their own.
     """
 
     def __init__(self, sights: JoinedSights, poor: Flags) -> None:
@@ -93,14 +99,14 @@ class Cells:
         self._first, self.last = looks[:, Look.FIRST], looks[:, Look.LAST]
         cells, cell = distinct_rows([*map(narrowed, self._grid(sights, poor))])
         poses = (self.x, self.y, self.yaw / 10.0)
-        self.cell = narrowed(_joined(cells, cell, poses, self.n)[cell])
-        order = np.argsort(self.cell, kind="stable")  # of 16 bits it is much faster
+        self.cell = narrowed(_joined_cells(cells, cell, poses, self.n)[cell])
+        order = np.argsort(self.cell, kind="stable")  # much faster in 16 bits
         self._by_cell = narrowed(order)
         self._slice_starts = begins_of(self.slice, len(sights.epochs))
         self.looks_in = np.bincount(self.cell)
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in
-        # How many messages looks from the same cell before have, and those of other cells.
+
         self.messages_before = np.empty(len(order), np.int64)
         self.messages_before[order] = np.cumsum(self.n[order], dtype=np.int64) - self.n[order]
         after, before = order[1:], order[:-1]
@@ -122,23 +128,23 @@ class Cells:
 
     @property
     def looks(self) -> Looks:
-        """What answers need of the looks."""
+        """The columns of looks that answers need."""
         return Looks(self.slice, self._first, self.last, self.x, self.y, self.yaw, self.cell)
 
     def looks_from(self, cells: Ints) -> Ints:
-        """Returns all looks from some cells of places, by cell."""
+        """Returns all looks from cells, as keys of places."""
         cell = _number(cells)
         looks = self._by_cell[in_ranges(self._starts[cell], self.looks_in[cell])]
         return _keys(np.repeat(_place(cells), self.looks_in[cell]), looks)
 
     def looks_during(self, slices: Ints) -> Ints:
-        """Returns all looks of some slices of places, by slice."""
+        """Returns all looks in slices, as keys of places."""
         start, stop = (self._slice_starts[_number(slices) + nth] for nth in (0, 1))
         looks = in_ranges(start, stop - start)
         return _keys(np.repeat(_place(slices), stop - start), looks)
 
     def totals_in(self, looks: Ints, unplaced: Ints) -> Ints:
-        """Returns how many detections without a place the slice and topic of each look have."""
+        """Returns how many detections without a place are in each look's slice and topic."""
         topics = np.int64(self.topic.max(initial=0)) + 1
         keys, n = _totals(
             unplaced[:, Unplaced.SLICE] * topics + unplaced[:, Unplaced.TOPIC],
@@ -149,18 +155,18 @@ class Cells:
         return np.where(has_total, np.append(n, 0)[rows], 0)
 
     def looked_in(self, number: int) -> Ns | None:
-        """Returns when the first look of a slice ended; None without any."""
+        """Returns when the first look of a slice ended (ns); None if the slice has no look."""
         start, stop = self._slice_starts[number : number + 2].tolist()
         return int(self.last[start:stop].min()) if start < stop else None
 
     def cells_of(self, looks: Ints) -> Ints:
-        """Returns the cells of looks of places."""
+        """Returns the cells of looks, as keys of places."""
         return _keys(_place(looks), self.cell[_number(looks)])
 
     def repeated_misses(self, looks: Ints, hits: Ints) -> Flags:
-        """Returns which looks without a hit repeat the previous one, which had none either.
+        """Returns which looks without a hit follow another one without, from the same cell.
 
-        The one before, from the same cell, is no older than the slice before.
+        The other look must be in the same slice or in the one before.
         """
         previous = self._previous[_number(looks)]
         is_repeated: Flags = (hits == 0) & (previous >= 0)
@@ -171,7 +177,7 @@ class Cells:
         return is_repeated
 
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
-        """Returns how far (mm) and where (degrees from ahead) the place of each look was."""
+        """Returns the distance (mm) and the direction (degrees from ahead) of each look's place."""
         dx, dy = x - self.x[looks], y - self.y[looks]
         bearing = (np.degrees(np.arctan2(dy, dx)) - self.heading(looks) + 180.0) % 360.0 - 180.0
         return np.hypot(dx, dy), bearing
@@ -181,14 +187,14 @@ class Cells:
         return self.yaw[looks] / 10.0 + self.pan[looks] / 10.0
 
 
-def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) -> Ints:
-    """Returns for each cell of a grid the one that it is part of: the heaviest near it, or itself.
+def _joined_cells(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) -> Ints:
+    """Returns for each cell of a grid the cell that it joins: the heaviest near it, or itself.
 
-    A robot that often stands at one pose, and so at the border of several, looks from one cell.
+    A robot that often stands at the border of several cells looks from one cell all the same.
 
     Args:
         cells: yaw, x and y in the grid, and what else tells cells apart.
-        cell: of each look.
+        cell: the cell of each look.
         poses: x, y (mm) and yaw (degrees) of each look.
         n: the messages of each look.
     """
@@ -196,21 +202,21 @@ def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) ->
     x, y, yaw = (np.bincount(cell, n * axis.astype(np.float64)) / weight for axis in poses)
     rank = np.argsort(np.argsort(weight, kind="stable"), kind="stable")
     best = rank.copy()
-    # With room for a step: what is in order, and each step from it, is found quickest.
+    # With room for a step in each column, steps are differences of keys.
     sizes = cells.max(axis=0, initial=0) - cells.min(axis=0, initial=0) + 3
-    keys, weights = _hashed(cells, sizes), _hashed(np.eye(3, cells.shape[1], dtype=np.int64), sizes)
+    keys = _row_keys(cells, sizes)
+    step_keys = _row_keys(np.eye(3, cells.shape[1], dtype=np.int64), sizes)
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    for step in [*product((-1, 0, 1), repeat=3)][14:]:  # the others are from those to these
+    for step in [*product((-1, 0, 1), repeat=3)][14:]:  # each pair of cells once
         turned = (cells[:, 0] + step[0]) % _YAWS - cells[:, 0]
-        wanted = keys + turned * weights[0] + weights[1:] @ step[1:]
-        place, is_there = places_among(wanted, ordered)
+        neighbour = keys + turned * step_keys[0] + step_keys[1:] @ step[1:]
+        place, is_there = places_among(neighbour, ordered)
         one = np.flatnonzero(is_there & (cells[:, 0] >= 0))
         other = order[place[one]]
         turn = np.abs((yaw[other] - yaw[one] + 180.0) % 360.0 - 180.0)
-        near = (turn < CELL_DECIDEG / 10) & (
-            np.hypot(x[other] - x[one], y[other] - y[one]) < CELL_MM
-        )
+        away = np.hypot(x[other] - x[one], y[other] - y[one])
+        near = (turn < CELL_DECIDEG / 10) & (away < CELL_MM)
         one, other = one[near], other[near]
         best[one] = np.maximum(best[one], rank[other])
         best[other] = np.maximum(best[other], rank[one])
@@ -218,8 +224,8 @@ def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) ->
     return np.where(leader[leader] == leader, leader, np.arange(len(cells)))
 
 
-def _hashed(rows: Ints, sizes: Ints) -> Ints:
-    """Returns a number for each row, in their order unless there may be too many of them."""
+def _row_keys(rows: Ints, sizes: Ints) -> Ints:
+    """Returns a number for each row, in the order of rows unless the numbers overflow."""
     numbers = np.zeros(len(rows), np.int64)
     for column, size in zip(rows.T, sizes, strict=True):
         numbers = numbers * size + column
@@ -227,9 +233,10 @@ def _hashed(rows: Ints, sizes: Ints) -> Ints:
 
 
 def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topics: int) -> Floats:
-    """Returns how far (mm), and from and to which directions (degrees), detectors see.
+    """Returns how far (mm), and from and to which directions (degrees), each detector sees.
 
-    That is for each of so many topics where nearly all its detections lie: `n` at each.
+    Nearly all detections of its topic lie there. `topics` is the number of topics; `n` has the
+    detections at each distance and bearing. The field of a topic without detections is -1.
     """
     fields = np.full((topics, 3), -1.0)
     for number in np.flatnonzero(np.bincount(topic)).tolist():
@@ -248,22 +255,22 @@ def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
 
 
 class Evidence(NamedTuple):
-    """The evidence for the places of a label: the looks at each, and those that saw it there.
+    """The looks at the places of a label, and how many of their messages have it there.
 
-    Looks are from cells that saw it at least once. Of a cell that does not see it, but for a false
-    detection once in a while, only those are here that are in a slice in which it was seen.
+    A look is from a cell with at least one hit. Some cells do not see the place, and have a false
+    detection once in a while: of these only the looks in slices with a hit are here.
 
     Attributes:
-        looks: their places and numbers, as keys in order.
-        cell: of each look; cells are numbered for each place.
-        n: how many messages of each of these looks say whether it was there: those that have the
-            label without a place do not.
-        hits: how many messages of each of these looks have the label there.
-        blind: the places and slices, as keys in order, of hits by messages without a known pose.
-        times: how many hits each of these has.
-        sees: whether each of the looks is from a cell that sees the place.
-        fair: whether a look that has no hit could have: from a cell that sees the place, and with
-            the place well inside the field of view.
+        looks: the place and the number of each look, as keys in order.
+        cell: each look's cell, numbered for each place.
+        n: how many messages of each look say whether the label was there. A message that has the
+            label without a place does not.
+        hits: how many messages of each look have the label there.
+        blind: the places and slices, as keys in order, with hits from an unknown pose.
+        times: how many such hits each of them has.
+        sees: whether each look is from a cell that sees the place.
+        fair: whether each look could have had a hit: its cell sees the place, and the place is well
+            inside the field of view.
     """
 
     looks: Ints
@@ -275,18 +282,26 @@ class Evidence(NamedTuple):
     sees: Flags
     fair: Flags
 
-    def at(self, place: int) -> Evidence:
-        """Returns that of the looks at one place alone, in few bytes, with their numbers."""
+    def at_place(self, place: int) -> Evidence:
+        """Returns the evidence of the looks at one place, without its number in their keys."""
         ends = np.array([place, place + 1]) << _BITS
         looks = slice(*np.searchsorted(self.looks, ends).tolist())
-        of_looks = (_number(self.looks[looks]), self.cell[looks], self.n[looks], self.hits[looks])
-        number, cell, n, hits = map(narrowed, of_looks)
-        sees, fair, none = self.sees[looks].copy(), self.fair[looks].copy(), self.blind[:0]
-        return Evidence(number, cell, n, hits, none, none, sees, fair)
+        none = self.blind[:0]
+        return Evidence(
+            looks=narrowed(_number(self.looks[looks])),
+            cell=narrowed(self.cell[looks]),
+            n=narrowed(self.n[looks]),
+            hits=narrowed(self.hits[looks]),
+            blind=none,
+            times=none,
+            # Copied, so that the evidence of all other places is freed.
+            sees=self.sees[looks].copy(),
+            fair=self.fair[looks].copy(),
+        )
 
 
 class Looks(NamedTuple):
-    """When and from where detectors looked: columns as in `Look`; `cell` is as in `Cells`."""
+    """When and from where detectors looked: columns as in `Look`, and `cell` as in `Cells`."""
 
     slice: Ints
     first: Ints
@@ -298,12 +313,14 @@ class Looks(NamedTuple):
 
 
 class Stay(NamedTuple):
-    """A time at a place: the slices of the first and the last sighting, and what came after.
+    """A time at a place.
 
-    `messages` are those of the looks that saw it, `clear_hits` the hits from cells that see it.
-    Between the slices `firm_first` and `firm_last` single detections, which may be false, are not
-    needed to see it there.
-    `left` is the slice by which it was seen to be gone (chance of missing it below 5 %), or None.
+    Attributes:
+        first_slice, last_slice: the slices of the first and the last sighting.
+        firm_first, firm_last: the slices of the first and the last sighting beyond doubt.
+        hits: the detections; `clear_hits` are those from cells that see the place.
+        messages: the messages of the looks with hits.
+        left: the slice by which it was seen to be gone (chance of missing it below 5 %), or None.
     """
 
     first_slice: int
@@ -326,26 +343,31 @@ def evidence_at(
     unplaced: Sequence[Ints],
     label: Ints,
 ) -> Evidence:
-    """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the slice.
+    """Returns the evidence for places.
 
-    `fields` are as of `fields_of_view`, `place` has the number of the place of each row, `label`
-    that of the label of each place, and `unplaced` the rows of each label.
+    Args:
+        cells: the looks.
+        fields: the field of view of each topic; see `fields_of_view`.
+        places: x and y (mm) of each place.
+        rows: the hits as rows of `Hit`, with the slice in place of `SPOT`.
+        place: the number of each hit's place.
+        unplaced: for each label its rows of `Unplaced`.
+        label: the number of each place's label.
     """
     has_look, n = rows[:, Hit.LOOK] >= 0, rows[:, Hit.N]
     blind, times = _totals(_keys(place, rows[:, Hit.SPOT])[~has_look], n[~has_look])
     hit_looks, hits_of = _totals(_keys(place, rows[:, Hit.LOOK])[has_look], n[has_look])
-    messages = cells.n[_number(hit_looks)]
-    np.minimum(hits_of, messages, out=hits_of)
+    np.minimum(hits_of, cells.n[_number(hit_looks)], out=hits_of)
     hit_cells, cell_of = np.unique(cells.cells_of(hit_looks), return_inverse=True)
-    sees = _sees(cells, hit_cells, cell_of, _number(hit_looks), hits_of)
-    # From a dock, ten thousands of looks are at each place of which it once had a false detection.
+    sees = _seeing_cells(cells, hit_cells, cell_of, _number(hit_looks), hits_of)
+    # All looks from cells that see the place; from others those in slices with hits. From a dock,
+    # ten thousands of looks are at each place of which it once had a false detection.
     hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
     beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
-    keys = cells.cells_of(beside)
-    cell, is_of_one = places_among(keys, hit_cells)
+    cell, has_hits = places_among(cells.cells_of(beside), hit_cells)
     looks_in = cells.looks_in[_number(hit_cells[sees])]
-    cell = np.concatenate((cell[is_of_one], np.repeat(np.flatnonzero(sees), looks_in)))
-    looks = np.concatenate((beside[is_of_one], cells.looks_from(hit_cells[sees])))
+    cell = np.concatenate((cell[has_hits], np.repeat(np.flatnonzero(sees), looks_in)))
+    looks = np.concatenate((beside[has_hits], cells.looks_from(hit_cells[sees])))
     order = np.argsort(looks, kind="stable")
     order = order[np.diff(looks[order], prepend=-1) > 0]
     looks, cell = looks[order], cell[order]
@@ -356,15 +378,24 @@ def evidence_at(
     fair[fair] = _are_in_view(cells, fields, places, looks[fair])
     numbers = _number(looks)
     n = cells.n[numbers].astype(np.int64)
-    for nth in [nth for nth, rows_of_label in enumerate(unplaced) if len(rows_of_label)]:
-        of_label = np.flatnonzero(label[_place(looks)] == nth)
-        n[of_label] -= cells.totals_in(numbers[of_label], unplaced[nth])
-    cell, n, hits = map(narrowed, (cell, np.maximum(n, hits), hits))
-    return Evidence(looks, cell, n, hits, blind, times, look_sees, fair)
+    for nth_label, rows_of_label in enumerate(unplaced):
+        if len(rows_of_label):
+            of_label = np.flatnonzero(label[_place(looks)] == nth_label)
+            n[of_label] -= cells.totals_in(numbers[of_label], rows_of_label)
+    return Evidence(
+        looks,
+        narrowed(cell),
+        narrowed(np.maximum(n, hits)),
+        narrowed(hits),
+        blind,
+        times,
+        look_sees,
+        fair,
+    )
 
 
 def _are_in_view(cells: Cells, fields: Floats, places: Floats, looks: Ints) -> Flags:
-    """Returns which looks have their place (mm) in the field of view of their topic."""
+    """Returns which looks have their place in the field of view of their topic."""
     numbers = _number(looks)
     distance, bearing = cells.seen_at(numbers, *places[_place(looks)].T)
     far, left, right = fields[cells.topic[numbers]].T
@@ -376,7 +407,7 @@ _BITS: Final = 32
 
 
 def _keys(place: Ints, number: Ints) -> Ints:
-    """Returns pairs of a place and the number of a look, a cell or a slice as one number each."""
+    """Returns a place and the number of a look, a cell or a slice as one key each."""
     return (place << _BITS) | number
 
 
@@ -389,30 +420,36 @@ def _number(keys: Ints) -> Ints:
 
 
 def _distinct(keys: Ints) -> Ints:
-    """Returns the distinct ones of keys that are mostly in order: `numpy.unique` takes longer."""
+    """Returns the distinct keys in order. `numpy.unique` is slower if most are in order."""
     ordered = np.sort(keys, kind="stable")
     return ordered[np.diff(ordered, prepend=-1) > 0]
 
 
 def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
-    """Returns the distinct keys in order, and the sum of each."""
+    """Returns the distinct keys in order, and the sum of `n` for each."""
     distinct, row_of = np.unique(keys, return_inverse=True)
     return distinct, np.bincount(row_of, n, len(distinct)).astype(np.int64)
 
 
-def _sees(cells: Cells, hit_cells: Ints, cell: Ints, hit_looks: Ints, hits: Ints) -> Flags:
-    """Returns which cells see a place, not only report it falsely once in a while.
+def _seeing_cells(cells: Cells, hit_cells: Ints, cell: Ints, hit_looks: Ints, hits: Ints) -> Flags:
+    """Returns which cells with hits see their place, and do not only report it falsely at times.
 
-    `cell` has the number among these of each look that saw it, in order of time. From a dock that
-    faces a wall, ten thousands of messages have some false detections behind it.
+    From a dock that faces a wall, ten thousands of messages have some false detections behind it.
+
+    Args:
+        cells: the looks.
+        hit_cells: the cells, as keys of places.
+        cell: for each look with hits, which of these cells it is from, in order of time.
+        hit_looks: the numbers of these looks.
+        hits: how many hits each of these looks has.
     """
     place, number = _place(hit_cells), _number(hit_cells)
     hits_in, messages = np.bincount(cell, hits, len(hit_cells)), cells.messages_in[number]
     looks, own_looks = cells.looks_in[number], np.bincount(cell, minlength=len(hit_cells))
     is_frequent = messages <= _RARE_OF * hits_in
-    is_frequent[_in_a_row(cell, hits, cells.messages_before[hit_looks])] = True
+    is_frequent[_cells_with_rows_of_hits(cell, hits, cells.messages_before[hit_looks])] = True
     is_dense = hits_in >= _LEAST_RATE * np.bincount(cell, cells.n[hit_looks], len(hit_cells))
-    # What other cells see most of the time, a cell that sees it does not miss nearly always.
+    # If other cells see the place most of the time, a cell that misses it nearly always is blocked.
     share, weight = own_looks / looks, np.minimum(looks, _MANY_LOOKS)
     others = np.bincount(place, weight)[place] - weight
     pooled = np.bincount(place, share * weight)[place] - share * weight
@@ -421,10 +458,10 @@ def _sees(cells: Cells, hit_cells: Ints, cell: Ints, hit_looks: Ints, hits: Ints
     return is_frequent & is_dense & ~is_blocked
 
 
-def _in_a_row(cell: Ints, hits: Ints, messages_before: Ints) -> Ints:
-    """Returns the cells of which `_FEWEST_HITS` in a row are in few messages.
+def _cells_with_rows_of_hits(cell: Ints, hits: Ints, messages_before: Ints) -> Ints:
+    """Returns the cells with `_FEWEST_HITS` hits within few messages.
 
-    `hits` are those of each look of a cell, in order of time.
+    `cell` and `hits` are of looks, in order of time for each cell.
     """
     order = np.argsort(cell, kind="stable")
     cell, before = cell[order], messages_before[order]
@@ -439,68 +476,99 @@ def _in_a_row(cell: Ints, hits: Ints, messages_before: Ints) -> Ints:
 
 def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     """Yields the stays at places, each with the number of its place, in order of time."""
-    slices, odds, *counts = _by_slice(cells, evidence)
-    hits = counts[0]
-    start, stop = _present(odds, _place(slices))
+    by_slice = _slice_evidence(cells, evidence)
+    slices, odds = by_slice.slices, by_slice.odds
+    start, stop = _runs_of_presence(odds, _place(slices))
     run, rows = np.repeat(np.arange(len(start)), stop - start), in_ranges(start, stop - start)
-    run, rows = run[hits[rows] > 0], rows[hits[rows] > 0]
+    has_hits = by_slice.hits[rows] > 0
+    run, rows = run[has_hits], rows[has_hits]
     if not len(rows):
         return
-    # A false detection or two beside a stay are no part of it.
-    clearness = 1 + np.sum([odds[rows] >= least for least in (_CLEAR, _FIRM)], axis=0)
-    most = Groups.of(distinct_rows([run])[1])
-    clearest = np.repeat(most.ends(clearness)[1], most.sizes)
-    first, last = _ends(run, rows, clearness >= np.minimum(clearest, 2))
-    firm_first, firm_last = _ends(run, rows, clearness >= clearest)
-    place, left = _place(slices[first]), []
-    until = np.searchsorted(slices, (place + 1) << _BITS)
-    for begin, end in zip((firm_last + 1).tolist(), until.tolist(), strict=True):
-        gone = np.cumsum(odds[begin:end]) < math.log(_LEFT_BY_CHANCE)
-        left.append(int(_number(slices[begin + gone.argmax()])) if gone.any() else None)
-    sums = [np.append(0, np.cumsum(count)).astype(np.int64) for count in counts]
-    totals = (count[last + 1] - count[first] for count in sums)
-    ends = (_number(slices[row]) for row in (first, last, firm_first, firm_last))
-    columns = (column.tolist() for column in (*ends, *totals))
-    yield from zip(place.tolist(), map(Stay._make, zip(*columns, left, strict=True)), strict=True)
+    # 1, 2 or 3: a false detection or two beside a stay do not belong to it.
+    clearness = 1 + (odds[rows] >= _CLEAR).astype(np.int64) + (odds[rows] >= _FIRM)
+    by_run = Groups.of(distinct_rows([run])[1])
+    clearest = np.repeat(by_run.ends(clearness)[1], by_run.sizes)
+    first, last = _run_ends(run, rows, clearness >= np.minimum(clearest, 2))
+    firm_first, firm_last = _run_ends(run, rows, clearness >= clearest)
+    first_slice, last_slice, firm_from, firm_to = (
+        _number(slices[ends]).tolist() for ends in (first, last, firm_first, firm_last)
+    )
+    sums = [np.append(0, np.cumsum(count)).astype(np.int64) for count in by_slice.counts]
+    hits, clear_hits, messages = ((count[last + 1] - count[first]).tolist() for count in sums)
+    place = _place(slices[first])
+    next_place = np.searchsorted(slices, (place + 1) << _BITS)
+    for nth, number in enumerate(place.tolist()):
+        end = int(firm_last[nth]) + 1
+        is_gone = np.cumsum(odds[end : next_place[nth]]) < math.log(_LEFT_BY_CHANCE)
+        stay = Stay(
+            first_slice=first_slice[nth],
+            last_slice=last_slice[nth],
+            firm_first=firm_from[nth],
+            firm_last=firm_to[nth],
+            hits=hits[nth],
+            clear_hits=clear_hits[nth],
+            messages=messages[nth],
+            left=int(_number(slices[end + is_gone.argmax()])) if is_gone.any() else None,
+        )
+        yield number, stay
 
 
-def _ends(run: Ints, rows: Ints, which: Flags) -> tuple[Ints, Ints]:
-    """Returns the first and the last of those of some rows that are of each run."""
+def _run_ends(run: Ints, rows: Ints, which: Flags) -> tuple[Ints, Ints]:
+    """Returns the first and the last selected row of each run."""
     run, rows = run[which], rows[which]
     return rows[np.diff(run, prepend=-1) != 0], rows[np.diff(run, append=-1) != 0]
 
 
-def _by_slice(cells: Cells, evidence: Evidence) -> tuple[Ints, Floats, Ints, Ints, Ints]:
-    """Returns the slices of places, as keys in order, with the evidence of each alone.
+class _SliceEvidence(NamedTuple):
+    """The evidence in each slice of a place alone.
 
-    That is the natural logarithm of the odds that it was there, how often it was seen, how often
-    from cells that see the place, and the messages of the looks that saw it.
+    Attributes:
+        slices: the places and slices, as keys in order.
+        odds: the natural logarithm of the odds that the label was there.
+        hits: the detections; `clear_hits` are those from cells that see the place.
+        messages: the messages of the looks with hits.
     """
+
+    slices: Ints
+    odds: Floats
+    hits: Ints
+    clear_hits: Ints
+    messages: Ints
+
+    @property
+    def counts(self) -> tuple[Ints, Ints, Ints]:
+        """The columns that add up over slices."""
+        return self.hits, self.clear_hits, self.messages
+
+
+def _slice_evidence(cells: Cells, evidence: Evidence) -> _SliceEvidence:
     looks = _keys(_place(evidence.looks), cells.slice[_number(evidence.looks)])
     slices = _distinct(np.concatenate((looks, evidence.blind)))
     slice_of, blind = np.searchsorted(slices, looks), np.searchsorted(slices, evidence.blind)
-    hit = np.flatnonzero(evidence.hits)  # few of them all
+    hit = np.flatnonzero(evidence.hits)  # a few of all looks
     weights = evidence.hits[hit], evidence.hits[hit] * evidence.sees[hit], evidence.n[hit]
     counts = [np.bincount(slice_of[hit], weight, len(slices)) for weight in weights]
     for count in counts:
         count[blind] += evidence.times
     hits, clear_hits, messages = counts
-    by_look = _odds(cells, evidence, hit, np.flatnonzero((hits > 0)[slice_of]))
-    odds = np.bincount(slice_of, by_look, len(slices)).astype(np.float64)
+    look_odds = _look_odds(cells, evidence, hit, np.flatnonzero((hits > 0)[slice_of]))
+    odds = np.bincount(slice_of, look_odds, len(slices)).astype(np.float64)
     odds[blind] += _UNPLACED_HIT * evidence.times
-    return slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, clear_hits, messages
+    return _SliceEvidence(
+        slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, clear_hits, messages
+    )
 
 
-def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
-    """Returns the natural logarithm of the odds for a thing by each look.
+def _look_odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
+    """Returns the natural logarithm of the odds for presence by each look.
 
-    `hit` are the looks that saw it, `there` those of slices in which it was seen: these tell how
-    often each cell sees it while it is there.
+    `hit` are the looks with hits. `there` are all looks in slices with hits: they tell how often
+    each cell sees the label while it is there.
     """
     cell, n, hits = evidence.cell, evidence.n, evidence.hits[hit]
     messages = np.bincount(cell[there], n[there], int(cell.max(initial=0)) + 1)
     rate = (np.bincount(cell[hit], hits, len(messages)) + _PRIOR) / (messages + 2 * _PRIOR)
-    rate = rate.clip(2 * _FALSE_RATE, 0.98)
+    rate = rate.clip(2 * _FALSE_RATE, 1 - 2 * _FALSE_RATE)
     for_hit, for_miss = np.log(rate / _FALSE_RATE), np.log((1 - rate) / (1 - _FALSE_RATE))
     odds: Floats = np.where(evidence.fair, n * for_miss[cell], 0.0)
     of_hits = hits * for_hit[cell[hit]] + (n[hit] - hits) * for_miss[cell[hit]]
@@ -510,19 +578,19 @@ def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
     return odds
 
 
-def looks_without(
-    every: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: Span
+def count_misses(
+    looks: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: Span
 ) -> tuple[int, Ns | None]:
     """Returns how many messages of a window [start, stop) could have had a thing, and have not.
 
-    And when the chance that all of them missed it fell below 1 %; None where it did not.
-    `evidence` is that for this place alone.
+    And when (ns) the chance that all of them missed it fell below 1 %; None if it never did.
 
-    By the looks then from cells that saw it during the stay, up to `seen_to` or with a hit; each
-    cell's own rate is known as well as its messages make it (a uniform prior).
+    Only looks from cells that saw the thing during its stay count. Those are the looks up to
+    `seen_to`, and later ones with a hit. A cell's rate is known as well as its messages tell (a
+    uniform prior). `evidence` is that of one place; see `Evidence.at_place`.
     """
-    looks, is_hit = evidence.looks, evidence.hits > 0
-    slices, first, last = every.slice[looks], every.first[looks], every.last[looks]
+    numbers, is_hit = evidence.looks, evidence.hits > 0
+    slices, first, last = looks.slice[numbers], looks.first[numbers], looks.last[numbers]
     during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
     during &= (last <= seen_to) | is_hit
     start, stop = window
@@ -554,26 +622,26 @@ def looks_without(
     return messages, crossed
 
 
-def _present(by_slice: Floats, place: Ints) -> tuple[Ints, Ints]:
-    """Returns where the likeliest runs of slices in which a thing was there begin and end."""
-    # Slices of one sign have one state: fewer steps than slices.
-    is_positive = by_slice >= 0
+def _runs_of_presence(odds: Floats, place: Ints) -> tuple[Ints, Ints]:
+    """Returns where the likeliest runs of slices with the thing present begin and end."""
+    # Consecutive slices of one sign have one state: that leaves fewer steps.
+    is_positive = odds >= 0
     is_first = np.diff(place, prepend=-1) != 0
     starts = np.flatnonzero(is_first | np.diff(is_positive, prepend=is_positive[:1]))
     if not len(starts):
         return starts, starts
-    sums = np.add.reduceat(by_slice, starts).tolist()
+    sums = np.add.reduceat(odds, starts).tolist()
     spans = pairwise([*np.flatnonzero(is_first[starts]).tolist(), len(starts)])
-    states = chain.from_iterable(_states(sums[begin:end]) for begin, end in spans)
+    states = chain.from_iterable(_likeliest_states(sums[begin:end]) for begin, end in spans)
     is_there = np.fromiter(states, np.bool_, len(starts))
     begins = is_there & (is_first[starts] | ~np.append(False, is_there[:-1]))
     ends = is_there & np.append(is_first[starts[1:]] | ~is_there[1:], True)
     return starts[begins], np.append(starts, len(place))[1:][ends]
 
 
-def _states(sums: Sequence[float]) -> Sequence[bool]:
-    """Returns in which runs of slices a thing was there, by the evidence of each."""
-    absent, present = 0.0, -_SWITCH / 4
+def _likeliest_states(sums: Sequence[float]) -> Sequence[bool]:
+    """Returns whether the thing was present in each run of slices (Viterbi), by their evidence."""
+    absent, present = 0.0, -_SWITCH / 4  # it may well be there when the place is first seen
     came_from: list[tuple[bool, bool]] = []
     for value in sums:
         to_absent, to_present = present - _SWITCH, absent - _SWITCH

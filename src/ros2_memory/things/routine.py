@@ -1,10 +1,12 @@
 """Where a thing that moves usually is: at which hours of the day, and how likely now.
 
-What is known is where it was last seen in each hour of each day. A place is the likelier, the more
-often the thing was there around the same hour of the day; the place where it was last seen counts
-by how often the thing was still there after as long a time. Usual places are returned only where,
-before each known hour, they would have predicted the thing's place better than its last place did,
-and better than without hours. The measure is Brier's score: the squared error of the probabilities.
+The last sighting in each hour of each day is known. A place is the likelier, the more often the
+thing was there around the same hour of the day. How likely its last place is follows from how often
+the thing was still there after as long a time.
+
+Usual places are returned only if they would have predicted the place in each known hour, from all
+hours before, better than the last place alone does, and better than without the hour of the day.
+The measure is Brier's score: the squared error of the probabilities.
 """
 
 from __future__ import annotations
@@ -33,11 +35,11 @@ _FEWEST_HOURS: Final = 24
 """Fewer known hours make no routine."""
 _FEWEST_DAYS: Final = 4
 _LEARNED_DAYS: Final = 2
-"""The first days are learned from only."""
+"""The first days are only learned from, and not predicted."""
 _AROUND_H: Final = 1.0
 """Standard deviation of the hour at which somebody does the same on another day."""
 _AGES_H: Final = (1.5, 3.0, 6.0, 12.0, 24.0)
-"""How long ago it was seen last, in classes: between them differs how often it is still there."""
+"""The bounds of classes of times since the last sighting: each has its own chance of staying."""
 _SIGMAS: Final = 2.0
 _LEAST_SHARE: Final = 0.05
 _MOST_PLACES: Final = 4
@@ -49,49 +51,58 @@ class _HourlyPlaces(NamedTuple):
     """The last sighting in each hour.
 
     Attributes:
-        hours: of local time since the epoch, ascending.
-        places: the number of the place of each, of `size`.
+        hours: hours of local time since the epoch, ascending.
+        places: the number of each hour's place, below `size`.
     """
 
     hours: Floats
     places: Ints
     size: int
 
-    def shares(self, rows: Ints) -> Floats:
-        """Returns how often it was at each place before each of some rows; none is impossible."""
-        return _normalised(self._before(rows) @ self.are_at() + 1.0 / self.size)
+    def place_shares(self, rows: Ints) -> Floats:
+        """Returns the share of each place in the hours before each row; no share is 0."""
+        return _normalised(self._are_before(rows) @ self.are_at() + 1.0 / self.size)
 
-    def around(self, rows: Ints, hours: Floats) -> Floats:
-        """Returns how likely each place is at hours of the day, by what lies before some rows."""
+    def likely_by_hour(self, rows: Ints, hours: Floats) -> Floats:
+        """Returns how likely each place is at an hour of the day, by the hours before each row."""
         apart = np.abs((self.hours - hours[:, None] + _DAY_H / 2) % _DAY_H - _DAY_H / 2)
-        weights = np.exp(-((apart / _AROUND_H) ** 2) / 2) * self._before(rows)
-        return _normalised(weights @ self.are_at() + self.shares(rows))
+        weights = np.exp(-((apart / _AROUND_H) ** 2) / 2) * self._are_before(rows)
+        return _normalised(weights @ self.are_at() + self.place_shares(rows))
 
-    def still_there(self, rows: Ints, ages_h: Floats) -> Floats:
-        """Returns how likely it is where it was seen so long before each of some rows."""
-        ages = np.digitize(np.diff(self.hours), _AGES_H)
-        is_as_old = (ages == np.digitize(ages_h, _AGES_H)[:, None]) & self._before(rows)[:, 1:]
-        stayed = is_as_old & (np.diff(self.places) == 0)
-        likely: Floats = (stayed.sum(axis=1) + 1.0) / (is_as_old.sum(axis=1) + 2.0)
-        return likely
+    def chances_to_stay(self, rows: Ints, ages_h: Floats) -> Floats:
+        """Returns how likely a thing is still where it was, by the hours before each row.
 
-    def likely(self, rows: Ints, hours: Floats) -> tuple[Floats, Floats]:
-        """Returns how likely each place is at later hours, by what lies before each of some rows.
-
-        And how likely without what is known of hours.
+        It was there `ages_h` hours ago. Each class of ages begins with one time that it stayed, and
+        one that it did not.
         """
-        shares, nth, last = self.shares(rows), np.arange(len(rows)), self.places[rows - 1]
-        stays, others = self.still_there(rows, hours - self.hours[rows - 1]), 1 - shares[nth, last]
+        ages = np.digitize(np.diff(self.hours), _AGES_H)
+        is_alike = ages == np.digitize(ages_h, _AGES_H)[:, None]
+        is_alike &= self._are_before(rows)[:, 1:]
+        stayed = is_alike & (np.diff(self.places) == 0)
+        chances: Floats = (stayed.sum(axis=1) + 1.0) / (is_alike.sum(axis=1) + 2.0)
+        return chances
+
+    def predict(self, rows: Ints, hours: Floats) -> tuple[Floats, Floats]:
+        """Returns how likely each place is at later hours, by the hours before each row.
+
+        First with the hour of the day, then without.
+        """
+        shares, nth, last = self.place_shares(rows), np.arange(len(rows)), self.places[rows - 1]
+        stays = self.chances_to_stay(rows, hours - self.hours[rows - 1])
+        # If it left, it is at the other places by their shares.
+        others = 1 - shares[nth, last]
         moves = np.divide(1 - stays, others, out=np.zeros(len(rows)), where=others > 0)
         prior = shares * moves[:, None]
         prior[nth, last] = stays
-        return _normalised(prior * (self.around(rows, hours) / shares)), _normalised(prior)
+        by_hour = self.likely_by_hour(rows, hours)
+        return _normalised(prior * (by_hour / shares)), _normalised(prior)
 
-    def _before(self, rows: Ints) -> Flags:
+    def _are_before(self, rows: Ints) -> Flags:
+        """Returns which hours (columns) are before each row."""
         return np.arange(len(self.hours)) < rows[:, None]
 
     def are_at(self) -> Floats:
-        """Returns whether it was at each place (column), by hour: 0 or 1."""
+        """Returns 1 for each hour (row) and the place (column) where the thing was then, else 0."""
         are_at: Floats = (self.places[:, None] == np.arange(self.size)).astype(np.float64)
         return are_at
 
@@ -104,19 +115,19 @@ def _normalised(weights: Floats) -> Floats:
 def usual_places(
     times: Ints, xy_mm: Ints, now: Ns, offset: Offset = local_offset
 ) -> tuple[UsualPlace, ...] | None:
-    """Returns where a thing usually is, the likeliest place now first; none without a routine.
+    """Returns where a thing usually is, the likeliest place now first; empty without a routine.
 
-    None where it was seen at one place alone, or too rarely to say.
+    None if it was seen at one place only, or too rarely to say.
 
     Args:
         times: when it was seen (N, ns), ascending.
-        xy_mm: where (N x 2).
-        now: the time that is asked about.
+        xy_mm: where it was seen (N x 2, mm).
+        now: the time that is asked about (ns).
         offset: of local time.
     """
-    last = np.flatnonzero(np.diff(times // _HOUR_NS, append=-1) != 0)
-    hours = np.array([_local_hour(at, offset) for at in times[last].tolist()])
-    places, centres = _places(xy_mm[last])
+    last_in_hour = np.flatnonzero(np.diff(times // _HOUR_NS, append=-1) != 0)
+    hours = np.array([_local_hour(at, offset) for at in times[last_in_hour].tolist()])
+    places, centres = _cluster_places(xy_mm[last_in_hour])
     hourly = _HourlyPlaces(hours, places, len(centres))
     days = hours // _DAY_H
     learned = int(np.searchsorted(days, days[0] + _LEARNED_DAYS))
@@ -125,26 +136,23 @@ def usual_places(
     if not _has_routine(hourly, learned):
         return ()
     every = np.array([len(hours)])
-    [likely], _ = hourly.likely(every, np.array([max(_local_hour(now, offset), hours[-1])]))
+    [likely_now], _ = hourly.predict(every, np.array([max(_local_hour(now, offset), hours[-1])]))
     shares = np.bincount(places, minlength=hourly.size) / len(places)
-    by_hour = hourly.around(np.repeat(every, _DAY_H), np.arange(0.5, _DAY_H))
+    by_hour = hourly.likely_by_hour(np.repeat(every, _DAY_H), np.arange(0.5, _DAY_H))
     is_known = np.isin(np.arange(_DAY_H), hours % _DAY_H // 1)
-    best = np.where(is_known, by_hour.argmax(axis=1), -1)
-    order = [place for place in np.argsort(-likely).tolist() if shares[place] >= _LEAST_SHARE]
-    return tuple(
-        UsualPlace(
-            (*(centres[place] / _MM).tolist(), 0.0),
-            (),
-            float(shares[place]),
-            _hours_text(np.flatnonzero(best == place).tolist()),
-            float(likely[place]),
-        )
-        for place in order[:_MOST_PLACES]
-    )
+    best_of_hour = np.where(is_known, by_hour.argmax(axis=1), -1)
+    order = [place for place in np.argsort(-likely_now).tolist() if shares[place] >= _LEAST_SHARE]
+    usual = []
+    for place in order[:_MOST_PLACES]:
+        x, y = (centres[place] / _MM).tolist()
+        best_hours = np.flatnonzero(best_of_hour == place).tolist()
+        share, chance = float(shares[place]), float(likely_now[place])
+        usual.append(UsualPlace((x, y, 0.0), (), share, _hours_text(best_hours), chance))
+    return tuple(usual)
 
 
 def _hours_text(hours: Sequence[int]) -> str:
-    """Returns hours of the day as stretches: "07-09" is until 09:00."""
+    """Returns hours of the day as spans: "07-09" ends at 09:00."""
     begins = [hour for hour in hours if hour - 1 not in hours]
     ends = [hour + 1 for hour in hours if hour + 1 not in hours]
     return ", ".join(f"{begin:02}-{end:02}" for begin, end in zip(begins, ends, strict=True))
@@ -155,10 +163,13 @@ def _local_hour(at: Ns, offset: Offset) -> float:
     return (at + offset(at // NS_PER_S) * NS_PER_S) / _HOUR_NS
 
 
-def _places(xy_mm: Ints) -> tuple[Ints, Floats]:
-    """Returns the number of the place of each position, and the mean of each place."""
+def _cluster_places(xy_mm: Ints) -> tuple[Ints, Floats]:
+    """Returns the number of each position's place, and the mean of each place (mm).
+
+    A position joins the nearest place within a metre, else it begins a new one.
+    """
     numbers = np.zeros(len(xy_mm), np.int64)
-    sums: list[Floats] = []
+    sums: list[Floats] = []  # x, y and the number of positions of each place
     for row, position in enumerate(xy_mm):
         apart = [math.dist(xyn[:2] / xyn[2], position) for xyn in sums]
         place = int(np.argmin(apart)) if apart and min(apart) <= _ONE_PLACE_MM else len(sums)
@@ -171,20 +182,20 @@ def _places(xy_mm: Ints) -> tuple[Ints, Floats]:
 
 
 def _has_routine(hourly: _HourlyPlaces, learned: int) -> bool:
-    """Returns whether the hours say more of where it was than the last place, and than shares.
+    """Returns whether predictions with hours beat the last place, and those without hours.
 
-    Of the first sightings, so many are `learned` from only.
+    The first `learned` hours are not predicted. Both gains must be beyond chance.
     """
-    count, parts = len(hourly.hours), []
+    count, gains = len(hourly.hours), []
     for begin in range(learned, count, _AT_ONCE):
         rows = np.arange(begin, min(begin + _AT_ONCE, count))
-        stayed = 2.0 * (np.diff(hourly.places)[rows - 1] != 0)
-        score, without_hours = (
+        # A wrong place is off by 1, and so is the right one, which got nothing.
+        error_of_last_place = 2.0 * (np.diff(hourly.places)[rows - 1] != 0)
+        error, error_without_hours = (
             ((likely - hourly.are_at()[rows]) ** 2).sum(axis=1)
-            for likely in hourly.likely(rows, hourly.hours[rows])
+            for likely in hourly.predict(rows, hourly.hours[rows])
         )
-        parts.append(np.stack((stayed - score, without_hours - score), axis=1))
-    gains = np.concatenate(parts)
-    mean = np.mean(gains, axis=0)
-    error = np.std(gains, axis=0) / math.sqrt(len(gains))
-    return bool((mean > _SIGMAS * error).all())
+        gains.append(np.stack((error_of_last_place - error, error_without_hours - error), axis=1))
+    every = np.concatenate(gains)
+    standard_error = np.std(every, axis=0) / math.sqrt(len(every))
+    return bool((np.mean(every, axis=0) > _SIGMAS * standard_error).all())

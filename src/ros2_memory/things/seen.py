@@ -1,8 +1,8 @@
-"""What detectors saw in a history: the sights of one stretch of the clock after the other.
+"""Reads what detectors saw in a history, stretch by stretch of the clock.
 
-A stretch is ten minutes, of one session: what is seen in it is placed by the transforms and poses
-of that session then. So sights are the same however a history is cut into bags. They are made once,
-where all that they follow from is in parts of the store: then they are stored beside these.
+A stretch is ten minutes of one session. Its sights are placed by the transforms and poses of that
+session then, so that they do not depend on how the history is cut into bags. Sights that follow
+from parts of the store alone are stored beside these parts, and made only once.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 
 VERSION: Final = 8
-"""Of what sights follow from. Raise it with every change of what is seen in the same messages."""
+"""The version of stored sights. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS
-"""Sights of so long are taken from the store at once: the older ones are asked for next."""
+"""Sights of this time are taken from the store at once: the older ones are asked for next."""
 _MANY: Final = 64
 """A bag that spans more stretches may have odd times."""
 _NO_DETECTIONS: Final = frozenset(
@@ -69,21 +69,22 @@ _NO_DETECTIONS: Final = frozenset(
         "vision_msgs/msg/LabelInfo",
     }
 )
-"""Packages and types whose messages hold no detections, so that nothing is looked for in them."""
+"""Packages and types whose messages hold no detections: they are not read."""
 _TEXT: Final = "std_msgs/msg/String"
 
 
 class SeenStretch(NamedTuple, Generic[S]):
-    """The sights of a session in ten minutes of the clock, or those of several in `STRETCH_NS`.
+    """The sights of a session in ten minutes of the clock, or of several sessions in `STRETCH_NS`.
+
+    A section of the sights has one session and ten minutes.
 
     Attributes:
-        sessions: that of each section of the sights: its recordings; in the store their numbers,
-            see `Seen.of`.
-        starts: log time (ns) of the ten minutes of each section, in order.
-        frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
-            lead to the map.
+        sessions: the session of each section; in the store its number, see `Seen.with_sessions`.
+        starts: where the ten minutes of each section begin (log time, ns), in order.
+        frame_id: of all places and poses: the map, or the frame of the robot's poses if no
+            transforms lead to the map.
         spots: how many spots there are.
-        sights: of each topic.
+        sights: the sights of each topic.
     """
 
     sessions: tuple[S, ...]
@@ -94,10 +95,12 @@ class SeenStretch(NamedTuple, Generic[S]):
 
 
 class TopicSights(NamedTuple):
-    """The sights of a topic in a stretch, packed as `joined` takes them.
+    """The sights of a topic in a stretch.
 
-    Of `topics` there is one, or none of those that have the fixes. Where it `detects` nothing it
-    may still be of a detector, which shows in other stretches.
+    Attributes:
+        topics: the topic; none for the sights with the fixes.
+        detects: whether this stretch shows that the topic is a detector's. Others may show it.
+        packed: the sights as `columns.sights.joined` takes them.
     """
 
     topics: tuple[str, ...]
@@ -106,21 +109,21 @@ class TopicSights(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What was seen in a stretch, by the numbers of the sessions."""
+    """What was seen in a stretch, with numbers for sessions."""
 
     stretches: tuple[SeenStretch[int], ...]
 
     @property
     def memory_bytes(self) -> int:
-        """About how much memory it takes."""
+        """About how much memory the sights take."""
         topics = [topic for stretch in self.stretches for topic in stretch.sights]
         return 200 + sum(200 + len(topic.packed) for topic in topics)
 
-    def of(self, sessions: Sequence[Session]) -> list[SeenStretch[Session]]:
-        """Returns the stretches with these sessions in place of their numbers."""
+    def with_sessions(self, sessions: Sequence[Session]) -> list[SeenStretch[Session]]:
+        """Returns the stretches with sessions in place of their numbers."""
         return [
-            SeenStretch(tuple(sessions[number] for number in stretch[0]), *stretch[1:])
-            for stretch in self.stretches
+            SeenStretch(tuple(sessions[number] for number in numbers), starts, frame, spots, sights)
+            for numbers, starts, frame, spots, sights in self.stretches
         ]
 
 
@@ -129,10 +132,11 @@ SIGHTS: Final[FragmentKind[Seen]] = FragmentKind("sights", (Seen, SeenStretch, T
 
 
 class _Lending(NamedTuple):
-    """A session, and the one whose transforms hold for it: empty where none do.
+    """A session, and the session whose transforms hold for it.
 
     Attributes:
-        slices: in which slices of the clock they hold; None: in all.
+        lender: empty if no transforms hold.
+        slices: the slices of the clock in which they hold; None for all.
     """
 
     session: Session
@@ -145,8 +149,8 @@ class _Surroundings(NamedTuple):
 
     Attributes:
         window: the stretch.
-        folders: of the recordings that reach into it, or nearly so.
-        sessions: those that the recordings are of, in the order of their names.
+        folders: the folders of the recordings in the stretch, or just beside it.
+        sessions: the sessions of these recordings, in the order of their names.
     """
 
     window: TimeWindow
@@ -155,7 +159,7 @@ class _Surroundings(NamedTuple):
 
 
 def may_have_detections(type_name: str) -> bool:
-    """Returns whether messages of a type may hold detections, as far as its name tells."""
+    """Returns whether messages of a type may hold detections, as far as the type's name tells."""
     names = {type_name, type_name.partition("/")[0]}
     return type_name == _TEXT or _NO_DETECTIONS.isdisjoint(names)
 
@@ -169,7 +173,7 @@ def topics_with_detections(timeline: Timeline) -> list[str]:
     ]
 
 
-class Watching:
+class SightReader:
     """Reads what detectors saw in the bags of a view.
 
     Args:
@@ -202,46 +206,46 @@ class Watching:
     def newest_first(
         self, until: Ns = MAX_NS, most: float = math.inf
     ) -> Iterator[list[SeenStretch[Session]]]:
-        """Yields the sights of all sessions in each stretch with some that begins before a time.
+        """Yields the sights of all sessions stretch by stretch, of those that begin before a time.
 
-        In that of `STRETCH_NS` at once, if it is not the newest, and there are fewer than `most`
-        spots up to its start.
+        Stretches without sights are left out. Those of one `STRETCH_NS` come at once, except in the
+        newest, and except where that would lead to `most` spots or more.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         spots = 0
-        for nth, together in enumerate(self._stretches_in(TimeWindow(MIN_NS, until))):
-            whole = self._joined(together) if nth else None
-            is_whole = whole is not None and spots + spots_in(whole) < most
-            for part in [whole] if is_whole else map(self._seen_in, together):
+        for nth, stretches in enumerate(self._stretches_in(TimeWindow(MIN_NS, until))):
+            joined = self._joined_sights(stretches) if nth else None
+            if joined is not None and spots + spots_in(joined) < most:
+                parts: Iterable[list[SeenStretch[Session]]] = [joined]
+            else:
+                parts = map(self._seen_in, stretches)
+            for part in parts:
                 if part:
                     spots += spots_in(part)
                     yield part
 
-    def made(self, window: TimeWindow, *, is_joined: bool = False) -> Iterator[Ns]:
-        """Makes the sights that follow from the parts of a window; those of others are left out.
+    def make_sights(self, window: TimeWindow, *, is_joined: bool = False) -> Iterator[Ns]:
+        """Makes and stores the sights of a window that follow from parts of the store alone.
 
-        If `is_joined`, those of each `STRETCH_NS` at once. Yields the log time (ns) of each, the
-        newest first.
+        With `is_joined` it makes the sights of whole `STRETCH_NS`, from those of their stretches.
+        Yields where each stretch begins (log time, ns), the newest first.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        for together in self._stretches_in(window.widened(SIGHTS_NS)):
-            start = together[0].start // STRETCH_NS * STRETCH_NS
+        for stretches in self._stretches_in(window.widened(SIGHTS_NS)):
+            start = stretches[0].start // STRETCH_NS * STRETCH_NS
             if is_joined and window.covers(start, start + STRETCH_NS - 1):
-                self._joined(together)
-            for stretch in together:
+                self._joined_sights(stretches)
+            for stretch in stretches:
                 if not is_joined and self._parts_around(stretch) is not None:
                     self._seen_in(stretch)
                 yield stretch.start
 
     def _stretches_in(self, window: TimeWindow) -> Iterator[list[TimeWindow]]:
-        """Yields the stretches of a window in which there may be messages, the newest first.
-
-        Those of each `STRETCH_NS` together.
-        """
+        """Yields the stretches of each `STRETCH_NS` that may have messages, the newest first."""
         if not self._topics:
             return
         if self._view.memory.scanner.store is not None:
@@ -250,24 +254,24 @@ class Watching:
                 open_scan(self._view, topic, reach, copies=topic not in self._topics)
                 for topic in self._needed
             ]
-        is_asked = (self._firsts < window.stop) & (self._lasts >= window.start)
-        spans = self._firsts[is_asked], self._lasts[is_asked]
-        stretches = map(_window, reversed(self._numbers_of(*spans)))
-        asked = (stretch for stretch in stretches if not stretch.intersect(window).empty)
-        for _, together in groupby(asked, lambda stretch: stretch.start // STRETCH_NS):
-            yield [*together]
+        is_inside = (self._firsts < window.stop) & (self._lasts >= window.start)
+        numbers = self._numbers_of(self._firsts[is_inside], self._lasts[is_inside])
+        stretches = map(_stretch_window, reversed(numbers))
+        inside = (stretch for stretch in stretches if not stretch.intersect(window).empty)
+        for _, neighbours in groupby(inside, lambda stretch: stretch.start // STRETCH_NS):
+            yield [*neighbours]
 
     def _numbers_of(self, starts: IntArray, ends: IntArray) -> list[int]:
         """Returns the numbers of the stretches in which bags may have messages.
 
-        Of each bag the log times of its first and last message are given.
+        `starts` and `ends` are the log times (ns) of the bags' first and last messages.
         """
         first, last = starts // SIGHTS_NS, ends // SIGHTS_NS
         sizes = last - first + 1
         is_odd = sizes > _MANY
         numbers = [in_ranges(first[~is_odd], sizes[~is_odd])]
         for start, end in zip(starts[is_odd].tolist(), ends[is_odd].tolist(), strict=True):
-            # Its times are odd: centuries may lie between two messages.
+            # Centuries may lie between two messages of such a bag: look which stretches have any.
             window = TimeWindow(start, end).widened(1)
             for topic in self._topics:
                 numbers += [rows.times // SIGHTS_NS for rows in scan(self._view, topic, window)]
@@ -275,9 +279,9 @@ class Watching:
         return distinct
 
     def _parts_around(self, window: TimeWindow) -> tuple[int, ...] | None:
-        """Returns the parts that what is seen in a window follows from; None where not they alone.
+        """Returns the parts of all topics that the sights of a window follow from.
 
-        Those of all topics that places and looks need.
+        None if they follow from more than whole parts of the store.
         """
         if not self._scans:
             return None
@@ -289,29 +293,27 @@ class Watching:
             numbers.update(parts)
         return tuple(sorted(numbers))
 
-    def by_bag(self, bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, str, Sights]]:
-        """Yields the sights of the messages of each of some bags that count, in each stretch.
+    def sights_by_bag(self, bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, str, Sights]]:
+        """Yields each bag with its sights in each stretch, and the frame of their places.
 
-        With the frame of their places, which the robot's poses decide; these are not in the sights.
-
-        Raises:
-            QueryTimeoutError: while it is iterated, when the deadline has passed.
+        Only messages that count are seen. The sights do not have the robot's poses.
         """
         files = {bag.file for bag in bags}
         spans = np.array([(bag.start, bag.end) for bag in bags], np.int64).reshape(-1, 2).T
         for number in self._numbers_of(*spans):
-            window = _window(number)
-            by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
+            window = _stretch_window(number)
+            units_by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
             for rows in self._rows(window):
                 for bag, positions in rows.bag_rows(files):
                     session = self._sessions.of(bag.recording)
-                    lender = self._transforms_of(session, bag, window)
-                    of_bags = by_lender.setdefault((session, lender), {})
-                    of_bags.setdefault(bag, []).append(rows.some(positions))
-            for (session, lender), of_bags in by_lender.items():
-                yield from self._placer.sights_by_bag(window, session, lender, of_bags)
+                    lender = self._lender_to(session, bag, window)
+                    units_of_bags = units_by_lender.setdefault((session, lender), {})
+                    units_of_bags.setdefault(bag, []).append(rows.some(positions))
+            for (session, lender), units_of_bags in units_by_lender.items():
+                yield from self._placer.sights_by_bag(window, session, lender, units_of_bags)
 
-    def _around(self, window: TimeWindow) -> _Surroundings:
+    def _surroundings(self, window: TimeWindow) -> _Surroundings:
+        """Returns the recordings and sessions in a stretch, and which session lends transforms."""
         self._view.bags.check_deadline()
         near = window.widened(AROUND_NS)
         begin, end = self._latest.searchsorted(near.start), self._firsts.searchsorted(near.stop)
@@ -336,9 +338,12 @@ class Watching:
     def _lendings(
         self, session: Session, bag: BagFile, window: TimeWindow, *, is_alone: bool
     ) -> Iterator[_Lending]:
-        """Yields whose transforms hold for a session, of which a bag is; it may be alone there."""
+        """Yields which sessions lend transforms to one. `bag` is a bag of it.
+
+        `is_alone`: no other session is in the window.
+        """
         if is_alone or self._sessions.has_all_kinds(session):
-            yield _Lending(session, self._transforms_of(session, bag, window))
+            yield _Lending(session, self._lender_to(session, bag, window))
             return
         slices: dict[Session, list[int]] = defaultdict(list)
         for number in range(window.start // SLICE_NS, (window.stop - 1) // SLICE_NS + 1):
@@ -347,142 +352,139 @@ class Watching:
         for lender, numbers in slices.items():
             yield _Lending(session, lender, tuple(numbers))
 
-    def _transforms_of(self, session: Session, bag: BagFile, window: TimeWindow) -> Session:
-        """Returns the session whose transforms hold for a bag's; empty where none has any."""
+    def _lender_to(self, session: Session, bag: BagFile, window: TimeWindow) -> Session:
+        """Returns the session whose transforms hold for a bag's session; empty if none has any."""
         if self._sessions.has_all_kinds(session):
             return session
         return self._sessions.lending_to(bag.recording, max(bag.start, window.start))
 
-    def _joined(self, together: Sequence[TimeWindow]) -> list[SeenStretch[Session]] | None:
-        """Returns what was seen in the stretches of a `STRETCH_NS`, as that of one; see `Seen`.
+    def _joined_sights(self, stretches: Sequence[TimeWindow]) -> list[SeenStretch[Session]] | None:
+        """Returns the sights in all stretches of a `STRETCH_NS` as those of one stretch.
 
-        None where it is not over, or does not follow from parts alone.
+        None if that time is not over, or if the sights follow from more than whole parts.
         """
-        start = together[-1].start // STRETCH_NS * STRETCH_NS
+        start = stretches[-1].start // STRETCH_NS * STRETCH_NS
         whole = TimeWindow(start, start + STRETCH_NS)
         parts = self._parts_around(whole) if whole.stop <= self._newest else None
         if parts is None:
             return None
-        around = self._around(whole)
-        surroundings = [around]
-        if not all(self._sessions.has_all_kinds(session) for session, *_ in around.sessions):
+        surroundings = [self._surroundings(whole)]
+        lendings = surroundings[0].sessions
+        if not all(self._sessions.has_all_kinds(lending.session) for lending in lendings):
             # Who lends to whom differs from one stretch to the next.
-            surroundings = [*map(self._around, together)]
-        of_all = chain.from_iterable(around.sessions for around in surroundings)
-        sessions = sorted(dict.fromkeys(session for session, *_ in of_all), key=min)
+            surroundings = [*map(self._surroundings, stretches)]
+            lendings = [*chain.from_iterable(around.sessions for around in surroundings)]
+        sessions = sorted(dict.fromkeys(lending.session for lending in lendings), key=min)
         numbers = {session: number for number, session in enumerate(sessions)}
-        follows_from = [
-            (around.window.start, self._digest(around), [numbers[s] for s, *_ in around.sessions])
-            for around in surroundings
-        ]
-        digest = _hashed(follows_from)
+        follows_from = []
+        for around in surroundings:
+            numbers_around = [numbers[lending.session] for lending in around.sessions]
+            follows_from.append((around.window.start, self._digest(around), numbers_around))
+        key = FragmentKey(start, _hashed(follows_from), parts)
+        [seen] = remembered(
+            self._view, joining(SIGHTS), key, lambda: self._join_sights(stretches, numbers)
+        ).fragments
+        return seen.with_sessions(sessions)
 
-        def make() -> Joined[Seen]:
-            # Which topics are of detectors shows in all of a history, so these stay apart.
-            def kind(stretch: SeenStretch[Session]) -> tuple[str, list[tuple[str, ...]]]:
-                return stretch.frame_id, [of_topic.topics for of_topic in stretch.sights]
+    def _join_sights(
+        self, stretches: Sequence[TimeWindow], numbers: Mapping[Session, int]
+    ) -> Joined[Seen]:
+        """Joins the sights of stretches that have the same frame and topics.
 
-            seen = [part for stretch in reversed(together) for part in self._seen_in(stretch)]
-            by_kind = groupby(sorted(seen, key=kind), kind)
-            return Joined([Seen(tuple(_as_one([*alike], numbers) for _, alike in by_kind))])
-
-        key = FragmentKey(start, digest, parts)
-        [seen] = remembered(self._view, joining(SIGHTS), key, make).fragments
-        return seen.of(sessions)
+        Topics stay apart, since only all of a history shows which of them are detectors'.
+        """
+        alike: dict[tuple[str, tuple[tuple[str, ...], ...]], list[SeenStretch[Session]]] = {}
+        for stretch in reversed(stretches):
+            for part in self._seen_in(stretch):
+                kind = part.frame_id, tuple(of_topic.topics for of_topic in part.sights)
+                alike.setdefault(kind, []).append(part)
+        return Joined([Seen(tuple(_united(alike[kind], numbers) for kind in sorted(alike)))])
 
     def _seen_in(self, stretch: TimeWindow) -> list[SeenStretch[Session]]:
-        """Returns what each session saw in a stretch; from the cache where it is there."""
-        around = self._around(stretch)
-        return self._seen(around).of([lending.session for lending in around.sessions])
+        """Returns what each session saw in a stretch."""
+        around = self._surroundings(stretch)
+        return self._seen(around).with_sessions([lending.session for lending in around.sessions])
 
     def _seen(self, around: _Surroundings) -> Seen:
-        scanner = self._view.memory.scanner
+        """Returns what was seen in a stretch: from the store or the cache, if it can be there."""
         bags = self._view.timeline.overlapping(around.window.widened(AROUND_NS))
         if any(bag.state is BagState.ACTIVE for bag in bags):
             return self._read(around)
-        digest = self._digest(around)
+        start, digest = around.window.start, self._digest(around)
         parts = self._parts_around(around.window)
         if parts is not None:
-            part_key = FragmentKey(around.window.start, digest, parts)
             return remembered(
                 self._view,
                 SIGHTS,
-                part_key,
+                FragmentKey(start, digest, parts),
                 lambda: self._read(around),
                 also_before=_TOGETHER_NS,
             )
         if self._may_be_repeated:
             return self._read(around)
         # Parts, as these, are of certain recordings.
-        key = (around.window.start, digest, tuple(bag.identity for bag in bags))
-        cached = scanner.caches.sights.get(key)
+        key = (start, digest, tuple(bag.identity for bag in bags))
+        cache = self._view.memory.scanner.caches.sights
+        cached = cache.get(key)
         if cached is not None:
             return cast("Seen", cached)
-        before = self._view.notes.added
+        notes_before = self._view.notes.added
         seen = self._read(around)
-        if self._view.notes.added == before:
-            size = seen.memory_bytes + 100 * len(bags)
-            scanner.caches.sights.put(key, seen, size)
+        if self._view.notes.added == notes_before:
+            cache.put(key, seen, seen.memory_bytes + 100 * len(bags))
         return seen
 
     def _digest(self, around: _Surroundings) -> str:
-        """Returns what tells apart the sights of other settings, static transforms or sessions."""
+        """Returns a hash of the settings, static transforms and sessions behind the sights."""
         window = around.window
-        transforms = [
-            [
-                (
-                    *(static.parent, static.child, static.transform),
-                    static.log_time if window.contains(static.log_time) else 0,
-                )
-                for static in static_in(self._view.sessions.static(lender), window)
-            ]
-            for _, lender, _ in around.sessions
-            if lender
-        ]
-        begin = window.start // SLICE_NS
-        sessions = [
-            (
-                [(folder in session, folder in lender) for folder in around.folders],
-                [number - begin for number in slices or ()],
+        transforms = []
+        for lending in around.sessions:
+            if not lending.lender:
+                continue
+            in_window = static_in(self._view.sessions.static(lending.lender), window)
+            transforms.append(
+                [
+                    (
+                        *(static.parent, static.child, static.transform),
+                        static.log_time if window.contains(static.log_time) else 0,
+                    )
+                    for static in in_window
+                ]
             )
-            for session, lender, slices in around.sessions
-        ]
+        first_slice = window.start // SLICE_NS
+        sessions = []
+        for session, lender, slices in around.sessions:
+            members = [(folder in session, folder in lender) for folder in around.folders]
+            sessions.append((members, [number - first_slice for number in slices or ()]))
         limits, body = self._view.limits, self._placer.body
         placed_by = body or self._view.pose_topic
         settings = (limits.map_frame, placed_by, limits.tf_topics, limits.tf_clock)
         return _hashed((VERSION, settings, transforms, sessions))
 
     def _read(self, around: _Surroundings) -> Seen:
-        """Returns what was seen, by the messages."""
-        by_session: dict[Session, list[Rows]] = defaultdict(list)
+        """Returns what was seen in a stretch by its messages."""
+        units_by_session: dict[Session, list[Rows]] = defaultdict(list)
         start = around.window.start
         for rows in self._rows(TimeWindow(max(start - AROUND_NS, MIN_NS), around.window.stop)):
-            by_session[self._sessions.of(rows.recording)].append(rows)
+            units_by_session[self._sessions.of(rows.recording)].append(rows)
         stretches: list[SeenStretch[int]] = []
         for number, (session, lender, slices) in enumerate(around.sessions):
-            units = by_session[session]
+            units = units_by_session[session]
             if slices is not None:
-                units = [
-                    rows.some(
-                        np.flatnonzero(
-                            np.isin(rows.times // SLICE_NS, slices) | (rows.times < start)
-                        )
-                    )
-                    for rows in units
-                ]
-            seen = self._placer.placed(around.window, session, lender, units)
-            if seen is not None:
-                frame_id, sights_of_topics, detectors = seen
-                spots = sum(len(sights.spots) for sights in sights_of_topics)
-                topics = tuple(
-                    TopicSights(
-                        sights.topics,
-                        not detectors.isdisjoint(sights.topics),
-                        packed(sights),
-                    )
-                    for sights in sights_of_topics
+                units = [_rows_in_slices(rows, slices, start) for rows in units]
+            placed = self._placer.place(around.window, session, lender, units)
+            if placed is None:
+                continue
+            spots = sum(len(sights.spots) for sights in placed.sights)
+            topics = tuple(
+                TopicSights(
+                    sights.topics,
+                    not placed.detectors.isdisjoint(sights.topics),
+                    packed(sights),
                 )
-                stretches.append(SeenStretch((number,), (start,), frame_id, spots, topics))
+                for sights in placed.sights
+            )
+            stretches.append(SeenStretch((number,), (start,), placed.frame_id, spots, topics))
         return Seen(tuple(stretches))
 
     def _rows(self, window: TimeWindow) -> Iterator[Rows]:
@@ -492,10 +494,16 @@ class Watching:
             yield from filter(self._placer.rows.may_have_any, scanned)
 
 
-def _as_one(
+def _rows_in_slices(rows: Rows, slices: Sequence[int], start: Ns) -> Rows:
+    """Returns the rows in slices of the clock, and all rows before a time (ns)."""
+    is_inside = np.isin(rows.times // SLICE_NS, slices) | (rows.times < start)
+    return rows.some(np.flatnonzero(is_inside))
+
+
+def _united(
     stretches: Sequence[SeenStretch[Session]], numbers: Mapping[Session, int]
 ) -> SeenStretch[int]:
-    """Returns stretches of the same topics and frame as one; sessions have numbers."""
+    """Returns stretches with the same topics and frame as one, with numbers for sessions."""
     topics = tuple(
         TopicSights(
             of_topic[0].topics,
@@ -510,7 +518,7 @@ def _as_one(
 
 
 def spots_in(stretches: Iterable[SeenStretch[S]]) -> int:
-    """Returns how many spots there are in some stretches."""
+    """Returns how many spots there are in stretches."""
     return sum(stretch.spots for stretch in stretches)
 
 
@@ -518,7 +526,7 @@ def _hashed(value: object) -> str:
     return blake2b(repr(value).encode(), digest_size=12).hexdigest()
 
 
-def _window(number: int) -> TimeWindow:
-    """Returns when a stretch is."""
+def _stretch_window(number: int) -> TimeWindow:
+    """Returns the ten minutes of the stretch with a number."""
     begin = number * SIGHTS_NS
     return TimeWindow(max(begin, MIN_NS), min(begin + SIGHTS_NS, MAX_NS))

@@ -1,6 +1,6 @@
 """What a list of things leaves out, in sentences: silent detectors, and detections without a thing.
 
-Those are too few, score too low, or could not be placed.
+A detection is without a thing if there are too few, if its score is too low, or without a place.
 """
 
 from __future__ import annotations
@@ -63,64 +63,66 @@ _UNDECODED: Final = Reason(
 )
 
 
-class Asked(NamedTuple):
-    """A question about things.
+class ThingsQuestion(NamedTuple):
+    """A question about things, and what it found.
 
     Attributes:
-        labels: those that were asked for, by key; all where there are none.
-        found: the keys of things that were found; `vague` the labels of those that were seen last
-            while localisation was poor.
-        inside: says how things were asked for.
-        min_score: names the limit of scores, and where it is from.
-        undecoded: topics with messages that cannot be decoded, as of `note_undecoded`.
+        labels: the labels by key; empty for all things.
+        found: the keys of the things that were found.
+        vague: the labels of found things that were last seen while localisation was poor.
+        bounds: how a sentence names the window and the region.
+        min_score: how a sentence names the least score, and the setting it is from.
+        undecoded: topics with messages that cannot be decoded; see `note_undecoded`.
     """
 
     labels: Mapping[str, str]
     found: Collection[str]
     vague: Collection[str]
     window: TimeWindow
-    inside: str
+    bounds: str
     min_score: str
     undecoded: Collection[str]
 
 
-class _Detected(NamedTuple):
-    """How often a label was detected: as counts, with too low scores, and without a place.
+class _LabelDetections(NamedTuple):
+    """How often a label was detected in a window.
 
-    `first` and `last` are of those without a place, `placed` is when it was last seen at one;
-    `together` how many were seen at once.
+    Attributes:
+        counted: detections that count.
+        low: detections with too low a score.
+        unplaced: detections without a place.
+        first_unplaced, last_unplaced: their first and last log time (ns).
+        last_placed: the last log time (ns) of a detection with a place.
+        at_once: how many were seen at once.
     """
 
     name: str
     counted: int
     low: int
     unplaced: int
-    first: Ns
-    last: Ns
-    placed: Ns
-    together: int
-
-    @property
-    def total(self) -> int:
-        """How often it was detected in all."""
-        return self.counted + self.low + self.unplaced
+    first_unplaced: Ns
+    last_unplaced: Ns
+    last_placed: Ns
+    at_once: int
 
 
 def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
-    """Notes topics that may have detections, and of which messages in a window cannot be decoded.
+    """Notes the topics whose messages may be detections and cannot be decoded, and returns them.
 
-    Returns these topics. Of each topic the first and the newest message are tried: where only some
-    between them are broken, there is no note.
+    The first and the newest message of each topic in the window are tried. Broken messages between
+    them are not noticed.
     """
     failures: list[UndecodableError] = []
     for topic in topics_with_detections(view.timeline):
         with suppress(NotInLakeError):
             newest = view.stream.newest(topic, window)
-            first = None if newest is None else view.stream.first([topic], window)
+            if newest is None:
+                continue
+            first = view.stream.first([topic], window)
             for stored in filter(None, (newest, first)):
                 at = TimeWindow(stored.time, stored.time + 1)
                 rows_then = [*scan(view, topic, at, copies=True)]
-                # What was decoded need not be compiled again.
+                # Decoding compiles the type, which takes long: columns show what was decoded.
                 if not rows_then or any("" in rows.table.left_out for rows in rows_then):
                     view.bags.decode(stored, failures)
     reasons = {failure.topic: failure.reason for failure in failures}
@@ -130,7 +132,7 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
 
 
 def describe_hung(view: View, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence for each detector that hangs at the end of a window."""
+    """Yields a sentence for each detector that repeats one message at the end of a window."""
     for topic in topics_with_detections(view.timeline):
         with suppress(NotInLakeError):
             since = hung_since(view, topic, window)
@@ -150,9 +152,9 @@ def notes_on_never(
     *,
     is_bounded: bool = False,
 ) -> tuple[str, ...]:
-    """Returns the notes on what a search that found nothing in a window may have been meant for.
+    """Returns the notes on a search that found nothing in a window: what may have been meant.
 
-    `is_bounded`: whether matches of some times in the window did not count.
+    `is_bounded`: the search did not count the matches at some times of the window.
     """
     meant = () if is_bounded else _found_in_singular(view, topic, condition, window)
     topics = matching_topics(view, topic)
@@ -169,16 +171,17 @@ def notes_on_never(
 def _found_in_singular(
     view: View, topic: str, condition: Condition, window: TimeWindow
 ) -> tuple[str, ...]:
-    """Returns the note on a text that no message has, but its singular without an article.
+    """Returns the note on a text that was not found, if its singular without an article was.
 
-    A search takes a text as it stands, and `find_things` a label in either form.
+    A search takes a text as it stands, while `find_things` takes a label in either form.
     """
     test = condition.test
     if not isinstance(test, Contains | Equals) or test.folded is None:
         return ()
-    bare = _ARTICLE.sub("", plain(test.folded))
+    text = plain(test.folded)
+    bare = _ARTICLE.sub("", text)
     for word in dict.fromkeys((bare, singular(bare))):
-        if word == plain(test.folded):
+        if word == text:
             continue
         other = replace(test, needle=word) if isinstance(test, Contains) else Equals(word)
         with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
@@ -190,52 +193,63 @@ def _found_in_singular(
     return ()
 
 
-def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
-    """Yields what the things that were found do not say."""
-    if not asked.found:
-        yield from _silences(view, known, asked)
+def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterator[str]:
+    """Yields what the things that a question found do not say."""
+    if not question.found:
+        yield from _silence_notes(view, known, question)
     if len(known.frames) > 2:  # the first is the map's
         yield (
             "without a map, each run of odometry has its own coordinates: a thing may be listed "
             "once for each run"
         )
-    if not known.estimate.topics and known.since is None and not asked.undecoded:
+    if not known.estimate.topics and known.since is None and not question.undecoded:
         yield (
             "no things are known: no message has a detection, which is an object with one of the "
             f"fields {', '.join(LABELS)}, as in vision_msgs/msg/Detection3DArray; find_matches "
             "searches text"
         )
-    yield from vague_notes(known, (asked.window,), asked.labels, asked.vague)
-    if not asked.labels:
-        yield from unplaced_notes(known, (asked.window,))
-        others = sorted(known.estimate.names.keys() - asked.found)
-        detected = [*_detected(known, others, asked.window)]
-        low = [label for label in detected if label.low and not label.counted]
-        if low:
-            named = [f"{label.name} ({counted(label.low, 'time')})" for label in low]
-            yield repeating(
-                f"detected only below {asked.min_score}: {listed(named, at_most=_MOST_NAMED)}",
-                [label.name for label in detected],
-            )
-    for key, label in asked.labels.items():
-        about = f"{abbreviate(label)}: " if len(asked.labels) > 1 else ""
-        for note in _of_label(known, key, asked):
+    yield from vague_notes(known, (question.window,), question.labels, question.vague)
+    if not question.labels:
+        yield from unplaced_notes(known, (question.window,))
+        yield from _low_score_notes(known, question)
+    for key, label in question.labels.items():
+        about = f"{abbreviate(label)}: " if len(question.labels) > 1 else ""
+        for note in _label_notes(known, key, question):
             yield still_quoted(about + note, note)
+
+
+def _low_score_notes(known: KnownThings, question: ThingsQuestion) -> Iterator[str]:
+    """Yields which labels were only detected with too low a score, of all that were not found."""
+    others = sorted(known.estimate.names.keys() - question.found)
+    detections = [*_detections_of(known, others, question.window)]
+    named = [
+        f"{label.name} ({counted(label.low, 'time')})"
+        for label in detections
+        if label.low and not label.counted
+    ]
+    if named:
+        yield repeating(
+            f"detected only below {question.min_score}: {listed(named, at_most=_MOST_NAMED)}",
+            [label.name for label in detections],
+        )
 
 
 def vague_notes(
     known: KnownThings,
     windows: Collection[TimeWindow],
     keys: Collection[str] = (),
-    also: Collection[str] = (),
+    vague: Collection[str] = (),
 ) -> Iterator[str]:
-    """Yields which labels were detected last while localisation was poor, of some keys or all."""
+    """Yields which labels were last detected while localisation was poor.
+
+    They are `vague`, and those that this is found of in a window: of some keys, or of all.
+    """
     estimate, spots = known.estimate, known.estimate.spots
-    labels = {*also}
+    labels = {*vague}
     for window in windows if estimate.poor.any() else ():
         during = estimate.seen_in(np.arange(len(spots)), window)
-        found, number = np.unique(spots[during, Spot.LABEL], return_inverse=True)
-        for label, rows in zip(found.tolist(), rows_by(number, len(found)), strict=True):
+        codes, number = np.unique(spots[during, Spot.LABEL], return_inverse=True)
+        for label, rows in zip(codes.tolist(), rows_by(number, len(codes)), strict=True):
             key = known.labels.key(estimate.labels[label])
             if (not keys or key in keys) and estimate.is_vague(during[rows]):
                 labels.add(estimate.names[key])
@@ -250,18 +264,18 @@ def vague_notes(
 def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Iterator[str]:
     """Yields which labels were detected without a place since they were last seen at one.
 
-    And those of which there were too many at once to tell them apart.
+    And which labels had too many detections at once to tell all of them apart.
     """
-    yield from _labels_left_out(known)
+    yield from _too_many_labels_note(known)
     for window in windows:
-        labels = [*_detected(known, sorted(known.estimate.names), window)]
+        labels = [*_detections_of(known, sorted(known.estimate.names), window)]
         unplaced = [
             f"{label.name} ({counted(label.unplaced, 'time')}, "
-            f"from {unix_text(label.first)} to {unix_text(label.last)})"
+            f"from {unix_text(label.first_unplaced)} to {unix_text(label.last_unplaced)})"
             for label in labels
-            if label.last > label.placed + SLICE_NS
+            if label.last_unplaced > label.last_placed + SLICE_NS
         ]
-        crowded = [label.name for label in labels if label.together > MAX_SPOTS]
+        crowded = [label.name for label in labels if label.at_once > MAX_SPOTS]
         if crowded:
             yield repeating(
                 f"of more than {MAX_SPOTS} at once, the others are left out: "
@@ -275,12 +289,12 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
             )
 
 
-def _labels_left_out(known: KnownThings) -> list[str]:
-    """Returns a note where some slice has more labels than are looked at; none where none has."""
+def _too_many_labels_note(known: KnownThings) -> list[str]:
+    """Returns the note on labels that are left out, if a topic has too many in some slice."""
     estimate = known.estimate
     if len(estimate.labels) <= MAX_LABELS:
         return []
-    # A slice, a topic and a label are the first columns of both.
+    # The first columns of both tables are slice, topic and label.
     tables = (estimate.spots, estimate.unplaced)
     columns = [np.concatenate([table[:, name] for table in tables]) for name in range(3)]
     labels, _ = distinct_rows(columns)
@@ -290,10 +304,10 @@ def _labels_left_out(known: KnownThings) -> list[str]:
     return [f"of more than {MAX_LABELS} labels in 10 s, the others are left out"]
 
 
-def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
-    """Yields why no thing may be known of a window: its detectors published nothing in it."""
-    window, looks = asked.window, known.estimate.looks
-    topics = [topic for topic in known.estimate.topics if topic not in asked.undecoded]
+def _silence_notes(view: View, known: KnownThings, question: ThingsQuestion) -> Iterator[str]:
+    """Yields that detectors published nothing in a window: no thing may be known for that."""
+    window, looks = question.window, known.estimate.looks
+    topics = [topic for topic in known.estimate.topics if topic not in question.undecoded]
     # Each new message of a detector is a look.
     is_empty = not ((looks.first < window.stop) & (looks.last >= window.start)).any()
     if topics and is_empty and known.reaches_back(window):
@@ -304,71 +318,77 @@ def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     yield from describe_silences(view, known.estimate.topics, window)
 
 
-def _during(window: TimeWindow, table: Ints | Columns, first: int, last: int) -> Ints:
-    """Returns the rows of a table that reach into a window, by their `first` and `last` column."""
+def _rows_during(window: TimeWindow, table: Columns, first: int, last: int) -> Ints:
+    """Returns the rows of a table that reach into a window, by the numbers of two columns."""
     return np.flatnonzero((table[:, first] < window.stop) & (table[:, last] >= window.start))
 
 
-def _detected(known: KnownThings, keys: Iterable[str], window: TimeWindow) -> Iterator[_Detected]:
-    """Yields how often each of some labels was detected in a window."""
-    estimate, unplaced = known.estimate, known.estimate.unplaced
-    during = _during(window, estimate.spots, Spot.FIRST, Spot.LAST)
-    all_lost = unplaced[_during(window, unplaced, Unplaced.FIRST, Unplaced.LAST)]
+def _detections_of(
+    known: KnownThings, keys: Iterable[str], window: TimeWindow
+) -> Iterator[_LabelDetections]:
+    """Yields how often each label was detected in a window, by the labels' keys."""
+    estimate, every = known.estimate, known.estimate.unplaced
+    during = _rows_during(window, estimate.spots, Spot.FIRST, Spot.LAST)
+    unplaced = every[_rows_during(window, every, Unplaced.FIRST, Unplaced.LAST)]
     names, key_of_label = numbered(map(known.labels.key, estimate.labels))
     number_of = {key: number for number, key in enumerate(names)}
     rows_of = rows_by(key_of_label[estimate.spots[during, Spot.LABEL]], len(names))
-    lost_of = rows_by(key_of_label[all_lost[:, Unplaced.LABEL]], len(names))
+    unplaced_rows_of = rows_by(key_of_label[unplaced[:, Unplaced.LABEL]], len(names))
     for key in keys:
         number = number_of[key]
-        rows, lost = during[rows_of[number]], all_lost[lost_of[number]]
+        rows, lost = during[rows_of[number]], unplaced[unplaced_rows_of[number]]
         spots, count = estimate.spots[rows], int(estimate.counts[rows].sum())
-        yield _Detected(
+        yield _LabelDetections(
             name=estimate.names[key],
             counted=count,
             low=int(spots[:, Spot.N].sum()) - count,
             unplaced=int(lost[:, Unplaced.N].sum()),
-            first=int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
-            last=int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
-            placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
-            together=int(spots[:, Spot.TOGETHER].max(initial=0)),
+            first_unplaced=int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
+            last_unplaced=int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
+            last_placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
+            at_once=int(spots[:, Spot.TOGETHER].max(initial=0)),
         )
 
 
-def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
+def _label_notes(known: KnownThings, key: str, question: ThingsQuestion) -> Iterator[str]:
     """Yields notes on a label that was asked for."""
     if key not in known.estimate.names:
-        yield from _labels_left_out(known) or _never_reported(known, key, asked.labels[key])
+        yield from _too_many_labels_note(known) or _similar_labels(known, key, question.labels[key])
         return
-    [detected] = _detected(known, [key], asked.window)
-    if unplaced := detected.unplaced:
+    [in_window] = _detections_of(known, [key], question.window)
+    unplaced = in_window.unplaced
+    if unplaced:
         lost = counted(unplaced, "detection")
         yield f"{lost} of it could not be placed, and {'is' if unplaced == 1 else 'are'} left out"
-    if key in asked.found:
+    if key in question.found:
         return
-    if detected.low:
-        times = counted(detected.low, "time")
-        yield f"it was detected {times} below {asked.min_score}, which does not count"
-    if detected.counted:
+    if in_window.low:
+        times = counted(in_window.low, "time")
+        yield f"it was detected {times} below {question.min_score}, which does not count"
+    if in_window.counted:
+        times = counted(in_window.counted, "time")
         yield (
-            f"it was detected {counted(detected.counted, 'time')} in this time, but does not count "
-            f"as a thing{asked.inside}: find_matches lists single detections"
+            f"it was detected {times} in this time, but does not count "
+            f"as a thing{question.bounds}: find_matches lists single detections"
         )
-    if not detected.total and known.reaches_back(asked.window):
-        [in_all] = _detected(known, [key], TimeWindow.everything())
+    is_in_window = in_window.counted or in_window.low or unplaced
+    if not is_in_window and known.reaches_back(question.window):
+        [in_all] = _detections_of(known, [key], TimeWindow.everything())
+        times = counted(in_all.counted + in_all.low + in_all.unplaced, "time")
         when = known.reach or " in all"
-        yield f"it was detected {counted(in_all.total, 'time')}{when}, and not once in this window"
+        yield f"it was detected {times}{when}, and not once in this window"
 
 
-def _never_reported(known: KnownThings, key: str, label: str) -> Iterator[str]:
-    """Yields which labels there are, those like it first, where there are any."""
+def _similar_labels(known: KnownThings, key: str, label: str) -> Iterator[str]:
+    """Yields that no detector reported a label, and the labels that are like it, or all labels."""
     names = sorted({*known.estimate.names.values()})
-    close = [name for name in names if key in name or name in key]
-    close += difflib.get_close_matches(key, names, 3)
-    shown = [*dict.fromkeys(close)] or names
-    meant = f"; did you mean {close[0]}?" if close else ""
-    if names:
-        yield repeating(
-            f"no detector reported {abbreviate(label)}{known.reach}; "
-            f"there are: {listed(shown)}{meant}",
-            shown,
-        )
+    if not names:
+        return
+    similar = [name for name in names if key in name or name in key]
+    similar += difflib.get_close_matches(key, names, 3)
+    shown = [*dict.fromkeys(similar)] or names
+    meant = f"; did you mean {similar[0]}?" if similar else ""
+    yield repeating(
+        f"no detector reported {abbreviate(label)}{known.reach}; there are: {listed(shown)}{meant}",
+        shown,
+    )

@@ -13,7 +13,7 @@ from ros2_memory.analysis.sights import DetectorMessages, Sights, fixes_of, sigh
 from ros2_memory.columns.sights import JoinedSights, joined, packed
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.model import Vector3
-from ros2_memory.things.instances import estimate
+from ros2_memory.things.estimation import estimate
 from ros2_memory.things.labels import Labels, moves_by_itself
 
 LABELS = Labels({"mug": ["coffee mug"]})
@@ -128,7 +128,7 @@ def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place(
     bag = bag_of(*gone, *seen, *nothing, *elsewhere, *nothing, *seen)
     [mug] = estimate(whole([bag]), LABELS).instances
     assert len(mug.stays) == 4
-    assert sum((stay.also for stay in mug.stays), Counter()) == {"bowl": 27}
+    assert sum((stay.misread_as for stay in mug.stays), Counter()) == {"bowl": 27}
 
 
 @pytest.mark.parametrize("name", ["{} box", "box{}"])

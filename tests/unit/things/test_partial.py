@@ -19,7 +19,7 @@ from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
 from ros2_memory.things.find import find_things
-from ros2_memory.things.seen import Watching
+from ros2_memory.things.seen import SightReader
 from tests.support.bags import write_splits
 from tests.support.column_worlds import World
 from tests.support.memories import memory_of, with_store
@@ -146,7 +146,7 @@ def test_a_bag_of_odd_times_has_the_sights_of_its_messages_alone(
     write_splits(tmp_path, odd, split_s=10.0**10)
     stretches = [
         one
-        for some in Watching(View(World.of(tmp_path).memory, Call())).newest_first()
+        for some in SightReader(View(World.of(tmp_path).memory, Call())).newest_first()
         for one in some
     ]
     parts = [part.packed for stretch in stretches for part in stretch.sights]

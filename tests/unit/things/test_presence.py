@@ -15,8 +15,8 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
+    count_misses,
     evidence_at,
-    looks_without,
     stays_at,
 )
 from tests.unit.things.test_instances import whole
@@ -52,8 +52,8 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     for _, stay in stays_at(cells, found):
         for after in (0, int(cells.last[len(cells.last) // 2])):
             by = stay, after, (after + 1, MAX_NS)
-            assert looks_without(cells.looks, found.at(0), *by) == looks_without(
-                cells.looks, whole.at(0), *by
+            assert count_misses(cells.looks, found.at_place(0), *by) == count_misses(
+                cells.looks, whole.at_place(0), *by
             )
 
 

@@ -1,0 +1,406 @@
+"""Estimates things from sights: stays at places, linked into things with a history.
+
+A label that is a small share of another's detections at a place, and is never in one message with
+it there, is that other thing under a wrong name. The stays that are left are linked into as few
+things as explain them: a stay that was seen to have ended may go on elsewhere. A label of people or
+pets, or one whose stays are many and short, moves by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.sights import STOREY_MM, Score, Spot
+from ros2_memory.core.arrays import (
+    Flags,
+    Ints,
+    distinct_rows,
+    in_ranges,
+    rows_by,
+)
+from ros2_memory.things.false_stays import remove_false_stays
+from ros2_memory.things.instances import (
+    Estimate,
+    Instance,
+    Mover,
+    PlacedStay,
+    Tally,
+    count_labels,
+    count_names,
+)
+from ros2_memory.things.labels import Labels, moves_by_itself
+from ros2_memory.things.observations import (
+    FEWEST,
+    LabelGroup,
+    Observations,
+    groups_in,
+    lowest_bin,
+    placed_stays,
+)
+from ros2_memory.things.places import (
+    GATE_MM,
+    MIDDLE,
+    places_of,
+    stays_in,
+    with_synonyms,
+)
+from ros2_memory.things.presence import (
+    Evidence,
+    evidence_at,
+    stays_at,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from ros2_memory.columns.sights import JoinedSights
+
+
+_FEWEST_OF_MOVERS: Final = 10
+_SEVERAL_SHARE: Final = 0.1
+"""Where more of the slices have several of a label at one place, several things stand there."""
+_FEWEST_IN_PART: Final = 10
+_SEVERAL_IN_PART: Final = 0.5
+"""So do they where more have several in the time between the outer percentiles of such slices."""
+_SPOTS_AT_ONCE: Final = 16_384
+"""About how many spots of labels are looked at together."""
+_RESTLESS_MOVES: Final = 6
+_RESTLESS_SHARE: Final = 0.2
+
+
+def estimate(
+    sights: JoinedSights,
+    labels: Labels,
+    min_score: float = 0.0,
+    go_on: Callable[[], None] = lambda: None,
+) -> Estimate:
+    """Returns the things in sights.
+
+    Detections with a score below `min_score`, to 0.05, do not count. `go_on` is called again and
+    again; its errors end the estimate.
+    """
+    observed = Observations(sights, min_score, go_on)
+    names = _names_to_show(sights, labels)
+    keys = with_synonyms(sights, observed.counts, labels, go_on)
+    groups = groups_in(observed, keys)
+    _add_places(groups, observed)
+    for batch in _batches(groups):
+        _add_stays(batch, observed)
+    remove_false_stays(groups, observed, keys)
+    instances, movers = _linked_things(groups, observed)
+    for instance in instances:
+        rows = np.concatenate([stay.spots for stay in instance.stays])
+        label_counts = count_labels(sights, observed.counts, rows)
+        instance.labels = count_names(label_counts, labels, names)
+    instances.sort(key=lambda thing: (thing.label, thing.stays[0].first, thing.stays[0].x))
+    counting = np.flatnonzero(sights.scores[:, Score.BIN] >= lowest_bin(min_score))
+    scores = (sights.scores[counting, name] for name in Score)
+    result = Estimate(
+        topics=sights.topics,
+        labels=sights.labels,
+        spots=sights.spots,
+        unplaced=sights.unplaced,
+        scores=Tally.of(len(sights.spots), *scores),
+        hits=observed.hits,
+        looks=observed.cells.looks,
+        instances=instances,
+        movers=movers,
+        counts=observed.counts,
+        poor=observed.poor,
+        names=names,
+        evidence=_evidence_of(instances, groups),
+        unplaced_of={group.key: group.unplaced for group in groups},
+    )
+    for instance in instances:
+        instance.looks, instance.missed_by = result.missing(instance, instance.stays[-1])
+    return result
+
+
+def _batches(groups: Sequence[LabelGroup]) -> Iterator[list[LabelGroup]]:
+    """Yields the groups in batches of about `_SPOTS_AT_ONCE` spots."""
+    spots_before = np.cumsum([0, *(len(group.rows) for group in groups)])
+    numbers = (spots_before // _SPOTS_AT_ONCE).tolist()
+    for _, numbered_groups in groupby(zip(numbers, groups, strict=False), itemgetter(0)):
+        yield [group for _, group in numbered_groups]
+
+
+def _linked_things(
+    groups: Sequence[LabelGroup], observed: Observations
+) -> tuple[list[Instance], list[Mover]]:
+    """Returns the instances that explain the stays of each group, and the labels that move."""
+    instances: list[Instance] = []
+    movers: list[Mover] = []
+    for group in groups:
+        linked = _link(group, observed)
+        _add_poorly_localised(linked, group, observed)
+        moves = len(group.stays) - len(linked)
+        is_restless = moves >= _RESTLESS_MOVES and moves > _RESTLESS_SHARE * len(group.rows)
+        if not is_restless and not moves_by_itself(group.key):
+            instances += linked
+            continue
+        counts = observed.counts[group.rows]
+        if counts[counts >= FEWEST].sum() >= _FEWEST_OF_MOVERS:
+            movers.append(Mover(group.key, group.epoch, group.rows))
+    return instances, movers
+
+
+def _evidence_of(
+    instances: Sequence[Instance], groups: Sequence[LabelGroup]
+) -> dict[tuple[str, int, int], Evidence]:
+    """Returns the evidence for the places of things: at most other places, detections are false."""
+    group_of = {(group.key, group.epoch): group for group in groups}
+    evidence: dict[tuple[str, int, int], Evidence] = {}
+    for instance in instances:
+        group = group_of[instance.key, instance.epoch]
+        for place in {stay.place for stay in instance.stays}:
+            if (group.key, group.epoch, place) not in evidence:
+                evidence[group.key, group.epoch, place] = group.evidence.at_place(place)
+    return evidence
+
+
+def _add_places(groups: Sequence[LabelGroup], observed: Observations) -> None:
+    """Adds to each group its places, with a new one each time that a thing was moved a little."""
+    single: list[tuple[LabelGroup, Ints]] = []
+    for group in groups:
+        if moves_by_itself(group.key):
+            continue
+        observed.go_on()
+        for rows, is_shared in _places_of_group(group, observed):
+            if is_shared:
+                group.places.append(rows)
+            elif observed.counts[rows].sum() >= FEWEST:
+                single.append((group, rows))
+    if not single:
+        return
+    thing = np.repeat(np.arange(len(single)), [len(rows) for _, rows in single])
+    steps = stays_in(observed.sightings(np.concatenate([rows for _, rows in single])), thing)
+    for (group, rows), step in zip(single, steps, strict=True):
+        group.places += [rows[step == number] for number in range(int(step.max()) + 1)]
+
+
+def _places_of_group(group: LabelGroup, observed: Observations) -> Iterator[tuple[Ints, bool]]:
+    """Yields the spots at each place, and whether several things of the label stand there."""
+    rows = observed.firm(group.rows)
+    names = (Spot.X, Spot.Y, Spot.Z, Spot.SLICE)
+    x, y, z, slices = (observed.sights.spots[rows, name] for name in names)
+    place = np.full(len(rows), -1, np.int64)
+    # A floor ends where heights leave a gap.
+    by_height = np.argsort(z, kind="stable")
+    floors = np.split(by_height, np.flatnonzero(np.diff(z[by_height]) > STOREY_MM) + 1)
+    for floor in floors:
+        on_floor = places_of(x[floor], y[floor], observed.counts[rows[floor]], slices[floor])
+        place[floor] = np.where(on_floor < 0, -1, on_floor + place.max(initial=-1) + 1)
+    rows, place = rows[place >= 0], place[place >= 0]
+    pairs, pair_of = distinct_rows((place, observed.groups[rows]))
+    are_shared = _are_shared(pairs[:, 0], np.bincount(pair_of))
+    for number, positions in enumerate(rows_by(place, len(are_shared))):
+        yield rows[positions], bool(are_shared[number])
+
+
+def _are_shared(place: Ints, spots: Ints) -> Flags:
+    """Returns at which places several things of a label stand together: slices have several spots.
+
+    That holds in all of time, or in one part of it. `spots` has the number of spots in each slice
+    of a place, in order of time; places are in order.
+    """
+    sizes = np.bincount(place)
+    are_shared: Flags = np.bincount(place, spots - 1) > _SEVERAL_SHARE * sizes
+    begins = np.cumsum(sizes) - sizes
+    often = np.bincount(place, spots > 1) >= _FEWEST_IN_PART
+    for number in np.flatnonzero(often & ~are_shared).tolist():
+        spots_there = spots[begins[number] : begins[number] + sizes[number]]
+        several = np.flatnonzero(spots_there > 1)
+        begin, end = np.percentile(several, MIDDLE)
+        inside = np.count_nonzero((several >= begin) & (several <= end))
+        are_shared[number] = inside > _SEVERAL_IN_PART * (end - begin)
+    return are_shared
+
+
+def _add_stays(groups: Sequence[LabelGroup], observed: Observations) -> None:
+    """Adds to each group the stays at its places, and the evidence for them.
+
+    Places are numbered in the order of the groups.
+    """
+    spots_of_places = [rows for group in groups for rows in group.places]
+    if not spots_of_places:
+        return
+    spots, rows = observed.sights.spots, np.concatenate(spots_of_places)
+    place = np.repeat(np.arange(len(spots_of_places)), [len(there) for there in spots_of_places])
+    group_of = np.repeat(np.arange(len(groups)), [len(group.places) for group in groups])
+    n = observed.counts[rows]
+    sums = [np.bincount(place, n * spots[rows, column]) for column in (Spot.X, Spot.Y)]
+    centres = np.stack(sums, axis=1) / np.bincount(place, n)[:, None]
+    sizes, look, n_of_look = observed.hits.rows_of(rows)
+    hits = np.stack((np.repeat(spots[rows, Spot.SLICE], sizes), look, n_of_look), axis=1)
+    evidence = evidence_at(
+        observed.cells,
+        observed.fields,
+        centres,
+        hits,
+        np.repeat(place, sizes),
+        unplaced=[group.unplaced for group in groups],
+        label=group_of,
+    )
+    observed.go_on()
+    stays = [*stays_at(observed.cells, evidence)]
+    # The spots of a place are in the order of their slices: those of a stay are a range.
+    width = len(observed.sights.epochs)
+    keys = place * width + spots[rows, Spot.SLICE]
+    bounds = [
+        (number * width + stay.first_slice, number * width + stay.last_slice + 1)
+        for number, stay in stays
+    ]
+    begin, end = np.searchsorted(keys, np.array(bounds, np.int64).reshape(-1, 2)).T
+    for group in groups:
+        group.evidence = evidence
+    for stay in placed_stays(observed, stays, rows[in_ranges(begin, end - begin)], end - begin):
+        groups[group_of[stay.place]].stays.append(stay)
+
+
+def _link(group: LabelGroup, observed: Observations) -> list[Instance]:
+    """Links the stays of a label into as few things as explain them.
+
+    A thing goes on to its next stay after one that was seen to end, without the thing at its place.
+    Once a label is known to be moved, a thing may also have left a place that nobody looked at.
+    """
+    instances = _chain_stays(group, group.stays, proven=True)
+    if any(_is_far(thing.stays[0], stay) for thing in instances for stay in thing.stays):
+        unproven = _chain_stays(group, group.stays, proven=False)
+        parts = _split_around_others(group.stays, observed)
+        split = _chain_stays(group, parts, proven=False)
+        instances = min(instances, unproven, split, key=len)
+    for instance in instances:
+        instance.stays = _without_overlap(instance.stays, observed)
+    return instances
+
+
+def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool) -> list[Instance]:
+    """Returns things whose stays follow one another, at the same place if they can.
+
+    With `proven` a thing goes on only from a stay that is known to have ended.
+    """
+    instances: list[Instance] = []
+    for stay in sorted(stays, key=lambda stay: stay.firm_first):
+        ended = [
+            instance
+            for instance in instances
+            if instance.stays[-1].firm_last <= stay.firm_first
+            and (not proven or _has_ended(instance.stays[-1], stay))
+        ]
+        if not ended:
+            instances.append(Instance(group.key, group.epoch, [stay]))
+            continue
+        lasts = [instance.stays[-1] for instance in ended]
+        preferred = [(last.place == stay.place, last.last) for last in lasts]
+        ended[preferred.index(max(preferred))].stays.append(stay)
+    return instances
+
+
+def _has_ended(last: PlacedStay, stay: PlacedStay) -> bool:
+    """Whether a stay was seen to end, or is so near the next that both would be seen together."""
+    return last.left is not None or (last.last <= stay.first and not _is_far(last, stay))
+
+
+def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
+    is_above = abs(one.z - other.z) > STOREY_MM
+    return is_above or math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
+
+
+def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) -> list[PlacedStay]:
+    """Splits each stay in which another stay of the label lies between two sightings."""
+    parts: list[PlacedStay] = []
+    for stay in stays:
+        observed.go_on()
+        firsts = observed.sights.spots[stay.spots, Spot.FIRST]
+        rows = stay.spots[np.argsort(firsts, kind="stable")]
+        cuts = _cuts_around_others(stay, rows, stays, observed)
+        if not cuts:
+            parts.append(stay)
+            continue
+        whole = stay.stay._replace(firm_first=-1, firm_last=-1)
+        sizes = np.diff([0, *sorted(cuts), len(rows)])
+        split = placed_stays(observed, [(stay.place, whole)] * len(sizes), rows, sizes)
+        split[0].misread_as = stay.misread_as
+        parts += split
+    return parts
+
+
+def _cuts_around_others(
+    stay: PlacedStay, rows: Ints, stays: Sequence[PlacedStay], observed: Observations
+) -> set[int]:
+    """Returns before which of a stay's spots another stay at another place lies.
+
+    `rows` are the spots in order of time. None of them may be seen during the other stay.
+    """
+    first, last = (observed.sights.spots[rows, name] for name in (Spot.FIRST, Spot.LAST))
+    cuts = set()
+    for other in stays:
+        is_inside = stay.firm_first < other.firm_first and other.firm_last < stay.firm_last
+        if other.place == stay.place or not is_inside:
+            continue
+        before, after = last < other.firm_first, first > other.firm_last
+        if (before | after).all() and before.any() and after.any():
+            cuts.add(int(after.argmax()))
+    return cuts
+
+
+def _without_overlap(stays: Sequence[PlacedStay], observed: Observations) -> list[PlacedStay]:
+    """Returns stays without single sightings at places that the thing had left: they are false."""
+    spots = observed.sights.spots
+    trimmed: list[PlacedStay] = []
+    for number, stay in enumerate(stays):
+        rows = stay.spots
+        if number + 1 < len(stays):
+            end = max(stays[number + 1].firm_first, stay.firm_last)
+            rows = rows[spots[rows, Spot.LAST] <= end]
+        if number:
+            begin = min(stays[number - 1].firm_last, stay.firm_first)
+            rows = rows[spots[rows, Spot.FIRST] >= begin]
+        if len(rows) < len(stay.spots):
+            [placed] = placed_stays(
+                observed, [(stay.place, stay.stay)], rows, np.array([len(rows)])
+            )
+            trimmed.append(replace(placed, misread_as=stay.misread_as, left=stay.left))
+        else:
+            trimmed.append(stay)
+    return trimmed
+
+
+def _add_poorly_localised(
+    instances: Sequence[Instance], group: LabelGroup, observed: Observations
+) -> None:
+    """Adds to things the spots that were seen near them while localisation was poor."""
+    is_left_out = observed.poor[group.rows] & (len(observed.firm(group.rows)) < len(group.rows))
+    for row in group.rows[is_left_out].tolist():
+        [spot] = observed.sights.spots[np.array([row])]
+        newest: list[PlacedStay] = []
+        for instance in instances:
+            begun = [stay for stay in instance.stays if stay.first <= spot[Spot.LAST]]
+            if begun and abs(begun[-1].z - spot[Spot.Z]) <= STOREY_MM:
+                newest.append(begun[-1])
+        away_mm = [math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]) for stay in newest]
+        if away_mm and min(away_mm) <= GATE_MM:
+            stay = newest[away_mm.index(min(away_mm))]
+            stay.spots = np.sort(np.append(stay.spots, row))
+            stay.last = max(stay.last, int(spot[Spot.LAST]))
+            stay.count += int(observed.counts[row])
+
+
+def _names_to_show(sights: JoinedSights, labels: Labels) -> dict[str, str]:
+    """Returns the name to show of each key, by how often each of its labels was detected."""
+    detections = np.zeros(len(sights.labels), np.int64)
+    for table in (sights.spots, sights.unplaced):
+        # Both tables have the label and the number in the same columns.
+        often = np.bincount(table[:, Spot.LABEL], table[:, Spot.N], len(detections))
+        detections += often.astype(np.int64)
+    counts: dict[str, dict[str, int]] = {}
+    for label, n in zip(sights.labels, detections.tolist(), strict=True):
+        if n:
+            counts.setdefault(labels.key(label), {})[label] = n
+    return {key: labels.name(key, by_label) for key, by_label in counts.items()}
