@@ -1,8 +1,8 @@
-"""What changed in the seconds before a moment: before it, never because of what.
+"""What changed in the seconds before a moment: what came before it, not what caused it.
 
-Log entries of WARN and above, levels of diagnostics, goals of actions, booleans, a battery that
-fell below a fraction, and a commanded velocity that became zero while a goal was active. That
-nothing changed is an answer where such topics are recorded.
+Changes are log entries of WARN and above, levels of diagnostics, goals of actions, booleans, a
+battery that fell below a fraction, and a commanded velocity that became zero while a goal was
+active. Where such topics are recorded, it is an answer that nothing changed.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from ros2_memory.insights.topic_events import (
     events_in,
     events_of_messages,
     flag_name,
-    last_listed,
+    last_listings,
     note_left_out,
-    toggled,
+    toggle_sentence,
 )
 from ros2_memory.places.pose_frames import newest_pose, placed, with_place
 from ros2_memory.results import Before, PastChange
@@ -59,9 +59,9 @@ LENGTH_NS: Final = 10 * NS_PER_S
 _LEAD_NS: Final = 30 * NS_PER_S
 """How long before a window messages are read: a change shows by the message before it."""
 _OLDEST_STATE_NS: Final = 3600 * NS_PER_S
-"""How old a state may be that no later message repeats, as of a goal; what is latched holds on."""
+"""How old a state may be that no later message repeats. The state of a latched topic never ages."""
 _AROUND_NS: Final = 600 * NS_PER_S
-"""A topic with a bag so near is recorded, though it may have nothing to report."""
+"""A topic with messages so near is recorded, even if it has nothing to report."""
 _POSE_NS: Final = 2 * NS_PER_S
 """The robot may have moved since an older pose."""
 SLACK_NS: Final = NS_PER_S // 2
@@ -79,7 +79,7 @@ _ROUTINE: Final = ("goal accepted", "goal succeeded")
 
 
 class _DatedChange(NamedTuple):
-    """Something that changed on a topic; a log entry that is repeated goes on until `last`."""
+    """A change on a topic. `last` is after `first` for a log entry that is repeated."""
 
     first: Ns
     last: Ns
@@ -92,7 +92,7 @@ class ChangesBefore:
     Attributes:
         looked_at: the topics on which a change would show.
         state: booleans, statuses that are not ok, and the goal of each action, at the end.
-        events: by topic, what its messages report in the window and before it.
+        events: what the messages of each topic report in the window and before it.
     """
 
     def __init__(
@@ -109,9 +109,9 @@ class ChangesBefore:
         self.events = events
 
     def after(self, at: Ns, length: Ns, *, slack: Ns = 0) -> tuple[PastChange, ...]:
-        """Returns what changed in the time after a moment, nearest first: `before` is negative.
+        """Returns the changes in the time (ns) after a moment, nearest first, with negative `before`.
 
-        What changed up to `slack` after it is left out: it counts as before.
+        A change up to `slack` after the moment is left out: it counts as before.
         """
         begin = bisect_left(self._changes, (at + slack + 1,))
         end = bisect_left(self._changes, (at + length + 1,))
@@ -120,10 +120,10 @@ class ChangesBefore:
     def before(
         self, at: Ns, length: Ns = LENGTH_NS, *, without: str = "", slack: Ns = 0
     ) -> tuple[PastChange, ...]:
-        """Returns what changed in the time before a moment, nearest first.
+        """Returns the changes in the time (ns) before a moment, nearest first.
 
-        What changed up to `slack` after it counts as at the moment. `without` is how sentences
-        begin that are left out: those of the boolean that toggled.
+        A change up to `slack` after the moment counts as at the moment. Sentences that begin with
+        `without` are left out: those of the boolean that toggle_sentence then.
         """
         changes = {}
         begin = bisect_left(self._changes, (at - length - self._longest,))
@@ -137,12 +137,12 @@ class ChangesBefore:
 
 
 def is_routine(change: PastChange) -> bool:
-    """Returns whether a change is the begin of a goal, or its end as it was meant."""
+    """Returns whether a change is the begin of a goal, or its success."""
     return change.text.endswith(_ROUTINE)
 
 
 def topics_with_changes(view: View) -> list[str]:
-    """Returns the topics whose events show changes: those with events, and the commands."""
+    """Returns the topics on which changes may show: topics with events, and the topic of commands."""
     timeline, command = view.timeline, _command_topic(view)
     return [
         topic
@@ -159,7 +159,7 @@ def changes_in(
     Args:
         view: of the call.
         window: of the changes.
-        earlier: the events in the window of topics that were asked before.
+        earlier: the events in the window, of the topics for which they are known already.
     """
     timeline = view.timeline
     events_of_topics: dict[str, TopicEvents] = {}
@@ -168,7 +168,7 @@ def changes_in(
     for topic in topics_with_changes(view):
         types = timeline.types_of(topic)
         inside = earlier[topic] if topic in earlier else events_in(view, topic, window)
-        events = _with_lead(view, topic, window, inside, types)
+        events = _with_state_before(view, topic, window, inside, types)
         if events is not None:
             events_of_topics[topic] = events
         can_show_changes = any(map(has_changes, types)) or (events is not None and events.known)
@@ -194,19 +194,22 @@ def _commanded_stops(
     """Yields when the commanded velocity became zero while a goal was active."""
     if command not in events_of_topics:
         return
-    actions = {topic: [*_goal_activity(events)] for topic, events in events_of_topics.items()}
+    activities = {topic: [*_goal_activity(events)] for topic, events in events_of_topics.items()}
     _, commands = events_of_topics[command].of_kind(COMMAND)
     for change in commands:
-        if not change.value and any(
-            _is_active(action, change.time) and _is_said_since_break(view, topic, change.time)
-            for topic, action in actions.items()
-        ):
+        if change.value:
+            continue
+        is_active = any(
+            _is_active(activity, change.time) and _has_message_of_run(view, topic, change.time)
+            for topic, activity in activities.items()
+        )
+        if is_active:
             text = f"{command} went to zero while a goal was active"
             yield _DatedChange(change.time, change.time, text)
 
 
-def _is_said_since_break(view: View, topic: str, at: Ns) -> bool:
-    """Returns whether a topic had a message since the run of the recorder at a moment began."""
+def _has_message_of_run(view: View, topic: str, at: Ns) -> bool:
+    """Returns whether a topic has a message of the recorder's run at a moment, up to then."""
     breaks = view.snapshot.breaks
     nth = bisect_right(breaks, at, key=itemgetter(1)) - 1
     begun = breaks[nth][1] if nth >= 0 else MIN_NS
@@ -221,7 +224,8 @@ def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
 def _command_topic(view: View) -> str:
     """Returns the topic of velocities that command the robot's base; empty if there is none.
 
-    Of `/cmd_vel_nav`, `/cmd_vel_smoothed` and `/cmd_vel`, which follow each other, the last.
+    Navigation chains such topics, from `/cmd_vel_nav` over `/cmd_vel_smoothed` to `/cmd_vel`: the
+    shortest name is the last one.
     """
     timeline = view.timeline
     topics = [
@@ -233,7 +237,7 @@ def _command_topic(view: View) -> str:
     return min(topics, key=lambda topic: (len(topic), topic), default="")
 
 
-def _with_lead(
+def _with_state_before(
     view: View,
     topic: str,
     window: TimeWindow,
@@ -242,7 +246,7 @@ def _with_lead(
 ) -> TopicEvents | None:
     """Returns the events in a window, joined with the state before it.
 
-    None where neither can have a change: a detector's topic is not read for it.
+    None if the topic cannot have changes, as a detector's: then nothing before is read.
     """
     if not (LOG in types or events is None or events.known):
         return None
@@ -257,30 +261,35 @@ def _with_lead(
 
 
 def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]:
+    """Yields the reports of a topic, the changes of its states, and states that are new."""
     for report in events.reports:
         span_s, often = unix_from_ns(report.last - report.first), report.reports
         again = f" ({often} times in {span_s:.0f} s)" if often > 1 else ""
         yield _DatedChange(report.first, report.last, Quoted(report.text + again))
     level = next((state.first for state in events.known if state.kind == CHARGE), 0)
     for change in events.changes:
-        text = toggled(topic, change) if change.kind == FLAG else ""
-        if change.kind != GOAL or change.value in GOAL_WORDS:
-            text = text or _change_sentence(topic, change, level)
+        if change.kind == FLAG:
+            text = toggle_sentence(topic, change)
+        elif change.kind == GOAL and change.value not in GOAL_WORDS:
+            text = ""  # it was accepted before
+        else:
+            text = _change_sentence(topic, change, level)
         if change.kind == CHARGE:
             level = change.value
         if text:
             yield _DatedChange(change.time, change.time, text)
     for state in events.known:
-        # Where earlier messages are without it, a goal is new, and a status that is not ok; and a
-        # charge had been just above a limit.
-        if state.at != events.first and (state.kind == GOAL or state.first):
+        # Earlier messages did not have this goal, this status that is not ok, or this low charge.
+        is_new = state.at != events.first
+        if is_new and (state.kind == GOAL or state.first):
             change = Change(state.kind, state.name, state.at, state.first, state.text)
-            if text := _change_sentence(topic, change, 0):
+            text = _change_sentence(topic, change, 0)
+            if text:
                 yield _DatedChange(state.at, state.at, text)
 
 
 def _change_sentence(topic: str, change: Change, level_before: int) -> str:
-    """Returns a sentence for a status, a goal or a charge; empty for what is not reported."""
+    """Returns a sentence on a status, a goal or a lower charge; empty for any other change."""
     if change.kind == STATUS:
         more = f": {change.text}" if change.text else ""
         sentence = f"status of {change.name} became {_level(change.value)}{more}"
@@ -293,14 +302,14 @@ def _change_sentence(topic: str, change: Change, level_before: int) -> str:
 
 
 def _level(number: int) -> str:
-    """Returns the level of a diagnostic status in words."""
+    """Returns a level of diagnostics in words."""
     return _LEVELS[number] if 0 <= number < len(_LEVELS) else f"level {number}"
 
 
 def _goal_activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
-    """Yields, whenever the status of a goal changes, whether the newest one is active from then on.
+    """Yields whether an action's newest goal is active, from each change of a goal's status on.
 
-    An older goal does not count: that it ended may not be recorded.
+    Older goals do not count: their ends may not be recorded.
     """
     goals, changes = events.of_kind(GOAL)
     begun = {goal.name: goal.at for goal in goals}
@@ -319,7 +328,7 @@ def _goal_activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
 
 
 def _is_active(activity: Sequence[tuple[Ns, bool]], time: Ns) -> bool:
-    """Returns whether the newest goal of an action was active at a time; see `_goal_activity`."""
+    """Returns whether an action's newest goal was active at a time; see `_goal_activity`."""
     nth = bisect_right(activity, (time, True)) - 1
     return nth >= 0 and activity[nth][1]
 
@@ -329,33 +338,36 @@ def _state_at_end(
 ) -> Iterator[tuple[str, bool | str]]:
     """Yields booleans, statuses that are not ok, and the newest goal of each action, at the end.
 
-    Of another run of the recorder only what a latched topic said: no goal goes on.
+    From before the recorder's current run only the values of latched topics hold, and no goals.
     """
     for topic, events in events_of_topics.items():
-        goes_on = is_latched(view, topic) and GOALS not in view.timeline.types_of(topic)
-        if not goes_on and not _is_said_since_break(view, topic, window.stop - 1):
+        holds = is_latched(view, topic) and GOALS not in view.timeline.types_of(topic)
+        if not holds and not _has_message_of_run(view, topic, window.stop - 1):
             continue
         is_battery = any(state.kind == CHARGE for state in events.known)
-        for flag in () if is_battery else events.of_kind(FLAG)[0]:
+        flags, _ = events.of_kind(FLAG)
+        for flag in () if is_battery else flags:
             yield flag_name(topic, flag), bool(flag.last)
         goals, _ = events.of_kind(GOAL)
         if goals:
             newest = max(goals, key=lambda state: state.at)
             word = GOAL_WORDS.get(newest.last, "active")
-            if newest.last in _ACTIVE_GOAL and last_listed(view, topic, window, {newest.name}):
+            is_active = newest.last in _ACTIVE_GOAL
+            if is_active and last_listings(view, topic, window, {newest.name}):
                 word = "listed no more"  # its server has restarted
             yield f"{action_of(topic)} goal", word
-        for status in events.of_kind(STATUS)[0]:
+        statuses, _ = events.of_kind(STATUS)
+        for status in statuses:
             if status.last:
                 yield Quoted(f"status of {status.name}"), _level(status.last)
 
 
-def before(
+def recap_before(
     memory: Memory, call: Call, at_s: float, length_s: float, frame_id: str | None = None
 ) -> Before:
     """Returns what changed in the seconds before a moment, and the state of the robot then.
 
-    And the first changes after it: a robot may report what was the cause only seconds later.
+    And the first changes after it: a robot may report a cause only seconds later.
 
     Raises:
         InvalidArgumentsError: the moment is not finite, or no transform leads to `frame_id`.
@@ -395,18 +407,18 @@ def before(
 
 
 def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float | None]:
-    """Returns the robot's newest pose, in the map where that is known, and its speed.
+    """Returns the robot's newest pose, in the map if transforms lead there, and its speed (m/s).
 
     Raises:
-        InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
+        InvalidArgumentsError: no transform leads to `frame_id`.
     """
-    window = TimeWindow.before(at, _POSE_NS)
     try:
-        message, pose = newest_pose(view, resolve_path_topic(view), window) or (None, None)
+        newest = newest_pose(view, resolve_path_topic(view), TimeWindow.before(at, _POSE_NS))
     except (InvalidArgumentsError, NoDataError):
         return None, None
-    if message is None:
+    if newest is None:
         return None, None
+    message, pose = newest
     twist = view.extractor.twist(view.bags.decode(message), message.type)
     speed_mps = None if twist is None else math.hypot(*twist.linear)
     if pose is None:
@@ -417,7 +429,7 @@ def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | No
 
 
 def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
-    """Yields how full each battery was at a time."""
+    """Yields how full each battery was at a moment, by its topic."""
     timeline = view.timeline
     for topic in timeline.topics():
         if BATTERY not in timeline.types_of(topic):

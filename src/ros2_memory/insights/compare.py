@@ -1,12 +1,13 @@
 """What differs between two windows: things, way, standstills, time in places, errors, silences.
 
-A thing that was seen in both is compared by where it was seen last in each. One that was seen in
-the later alone *appeared* only where its place was looked at in the earlier one, from where it is
-seen, so often that missing it by chance is below 1 %. One that was seen in the earlier alone is
-reported as not seen where expected by the same rule, and else as not looked at. One of each kind,
-with one label, in odometry that began again between them may be one thing: it was seen in both, and
-its places cannot be compared. What moves by itself has no place: it is compared by whether it was
-seen, how many at once, and where last.
+A thing that was seen in both windows is compared by where it was seen last in each. A thing that
+was seen in the later window only *appeared* if its place was looked at in the earlier one, so often
+that missing it by chance is below 1 %. A thing that was seen in the earlier window only is not seen
+where expected by the same rule. Otherwise a thing of one window is not looked at in the other.
+
+Where odometry began again between the windows, a thing of the earlier and a thing of the later with
+one label may be one thing: their places cannot be compared. People and pets have no place: they are
+compared by whether they were seen, how many at once, and where last.
 
 Two numbers differ where they are apart by more than a tenth of the larger, and by more than what
 noise and the rounding of what is stored may make of equal ones (`_LEAST`).
@@ -18,7 +19,7 @@ import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import has_errors
 from ros2_memory.analysis.sights import Spot
@@ -78,8 +79,9 @@ _LEAST_APART_M: Final = 0.5
 _LEAST_MINUTES: Final = 0.2
 _LEAST_SILENT_S: Final = 10.0
 _LEAST_COUNT: Final = 0.5
+_LEAST_RECORDED_S: Final = 10.0
 _SAME_MOVER_M: Final = 1.0
-"""What moves by itself, and was last seen so near to where it was before, is where it was."""
+"""People and pets that were last seen so near to where they were before are where they were."""
 
 
 def compare(
@@ -94,7 +96,7 @@ def compare(
 ) -> Comparison:
     """Returns what differs in a window (Unix seconds, inclusive) from another one.
 
-    `where` takes the things that are in a region in either window, and the time, the standstills
+    `where` selects the things that are in a region in either window, and the time, the standstills
     and the points of the way in that region.
 
     Raises:
@@ -108,39 +110,34 @@ def compare(
         other = TimeWindow.from_unix(with_start_s, with_end_s)
     except InvalidArgumentsError as error:
         raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
-    reach = min(max(asked.stop, other.stop), memory.clock.now())
-    view = open_view(memory, call, reach)
-    # What is not listed there is not known, rather than 0.
-    unlisted: list[float | None] = [0.0, 0.0]
-    for nth, window in enumerate((asked, other)):
-        if gap_around(view, window) is not None:
-            note_unrecorded(view, window)
-            unlisted[nth] = None
+    view = open_view(memory, call, min(max(asked.stop, other.stop), memory.clock.now()))
+    unlisted = [_unlisted_number(view, window) for window in (asked, other)]
     windows = call.asked = clamped(view, asked), clamped(view, other)
     frame, things = _compare_things(view, windows, region)
     drives = [drive_in(view, window) for window in windows]
-    elapsed = [drive.elapsed for drive in drives]
-    way = [_path_numbers(view, *of_one) for of_one in zip(drives, windows, strict=True)]
+    way = [
+        _path_numbers(view, drive, window) for drive, window in zip(drives, windows, strict=True)
+    ]
     placement = known_placement(view)
-    minutes = _minutes_in_places(view, placement, windows, region, elapsed)
-    way_frame, stood, farthest = _path_differences(view, placement, drives, windows, region)
+    minutes = _minutes_in_places(view, placement, windows, region, drives)
+    paths = _compare_paths(view, placement, drives, windows, region)
     errors = [_error_counts(view, window) for window in windows]
     silences = [_silent_seconds(view, window) for window in windows]
     note_unread(view, windows[0], of="from start to end: ", gaps=False)
     note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
-    recorded = [_recorded_seconds(view, *of_one) for of_one in zip(windows, elapsed, strict=True)]
-    if differ(recorded[0], recorded[1], 10.0):
+    lengths, recorded = [], []
+    for window, drive in zip(windows, drives, strict=True):
+        lengths.append(unix_from_ns(drive.elapsed.between(*window.asked())))
+        recorded.append(_recorded_seconds(view, window, drive.elapsed))
+    if differ(recorded[0], recorded[1], _LEAST_RECORDED_S):
         view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
     view.notes.retract_outside(*windows)
     if region is not None:
         view.notes.add("way, errors and silent_s are not only of that place")
-    lengths = [
-        passed.between(*window.asked()) for window, passed in zip(windows, elapsed, strict=True)
-    ]
     return Comparison(
         oldest=min(window.start for window in windows),
         newest=max(window.stop for window in windows),
-        lengths=Pair(*map(unix_from_ns, lengths)),
+        lengths=Pair(*lengths),
         recorded=Pair(*recorded),
         frame_id=frame,
         things=things,
@@ -148,11 +145,22 @@ def compare(
         places=_differing(*minutes, least=_LEAST_MINUTES),
         errors=_differing(*errors, least=_LEAST_COUNT, unlisted=unlisted),
         silences=_differing(*silences, least=_LEAST_SILENT_S, unlisted=unlisted),
-        way_frame_id=way_frame,
-        stood=stood,
-        farthest=farthest,
+        way_frame_id=paths.frame_id,
+        stood=paths.stood,
+        farthest=paths.farthest,
         notes=view.notes.sentences(),
     )
+
+
+def _unlisted_number(view: View, window: TimeWindow) -> float | None:
+    """Returns the number of errors that a window does not list: 0, or None if nothing is recorded.
+
+    A note says so then.
+    """
+    if gap_around(view, window) is None:
+        return 0.0
+    note_unrecorded(view, window)
+    return None
 
 
 def _compare_things(
@@ -160,18 +168,17 @@ def _compare_things(
 ) -> tuple[str, ComparedThings]:
     """Returns the frame of things, and what became of them from the earlier window to the later."""
     limits = view.limits
-    both = TimeWindow(
-        min(window.start for window in windows), max(window.stop for window in windows)
-    )
     for window in windows:
         note_undecoded(view, window)
         view.notes.add(*describe_hung(view, window))
+    both = TimeWindow(
+        min(window.start for window in windows), max(window.stop for window in windows)
+    )
     things = known_things(view, limits.min_score, both)
     note_other_frames(view, things, where)
+    epochs = [instance.epoch for instance in things.estimate.instances]
+    frame = things.frames[epochs[0] if epochs else 0]
     first, second = sorted(windows, key=lambda window: (window.start, window.stop))
-    frame = next(
-        (things.frames[instance.epoch] for instance in things.estimate.instances), things.frames[0]
-    )
     if any(gap_around(view, window) is not None for window in windows):
         view.notes.add("things are not compared: there is nothing to compare them with")
         return frame, ComparedThings()
@@ -183,42 +190,45 @@ def _compare_things(
             f"things are not compared after {unix_text(second.asked()[1])}, where one of the two "
             "times ends within the other"
         )
-    runs = {instance.epoch for instance in things.estimate.instances}
-    if (
-        len(runs) > 1
-        and not things.has_map
-        and not is_one_run(view, resolve_path_topic(view), windows)
-    ):
+    has_runs = len({*epochs}) > 1 and not things.has_map
+    if has_runs and not is_one_run(view, resolve_path_topic(view), windows):
         view.notes.add(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
     view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, (first, second)))
     places = places_asked(limits, where, things.frames)
-    return frame, _ThingsBetween(things, first, second, where, places).compared()
+    return frame, _ThingsBetween(things, first, second, where, places).compare()
 
 
 class _StayInWindow(NamedTuple):
-    """A thing's last stay in a window, and that part of the stay; how many there were at once."""
+    """A thing's last stay in a window.
+
+    Attributes:
+        part: the part of the stay in the window.
+        at_once: how many of the label were there at once.
+    """
 
     stay: PlacedStay
     part: ThingStay
     at_once: int
 
     def is_elsewhere(self, other: _StayInWindow) -> bool:
-        """Whether a thing was moved between this and another: to and fro is no move."""
+        """Returns whether a thing was moved between two stays: to and fro is no move."""
         away_m = math.dist(self.part.place[:2], other.part.place[:2])
         return self.stay.place != other.stay.place and away_m >= LEAST_MM / 1000
 
 
 @dataclass(frozen=True, slots=True)
 class _ThingsBetween:
-    """Compares the things of two windows. Slices (10 s) count whole, a shared one in the later.
+    """Compares the things of two windows.
+
+    Slices (10 s) count as a whole. A slice of both windows counts in the later one.
 
     Attributes:
         earlier, later: the windows.
-        where: what was there in either window counts; None for all.
-        places: the named ones.
+        where: the region in which a thing must be in either window; None for anywhere.
+        places: the named places.
     """
 
     known: KnownThings
@@ -227,35 +237,42 @@ class _ThingsBetween:
     where: Where | None
     places: Sequence[Place]
 
-    def compared(self) -> ComparedThings:
-        """Returns what differs, each list with those seen last first."""
-        kinds: dict[str, list[tuple[Instance, ComparedThing]]] = defaultdict(list)
+    def compare(self) -> ComparedThings:
+        """Returns what differs, each list with the things seen last first."""
+        lists: dict[str, list[ComparedThing]] = defaultdict(list)
+        not_looked_at: list[tuple[Instance, ComparedThing]] = []
+        same = 0
         for instance in self.known.estimate.instances:
-            before = self._stay_in(instance, self.earlier, self.later.start)
-            after = self._stay_in(instance, self.later)
-            shared = self._stay_in(instance, self.earlier)
-            if before is None and after and shared and shared.is_elsewhere(after):
-                before = shared  # in slices of both windows, but elsewhere
-            frame = self.known.frames[instance.epoch]
-            if any(
-                self.where is None or self.where.contains(frame, *stay.part.place[:2])
-                for stay in (before, after)
-                if stay is not None
-            ):
-                kind, thing = self._difference(instance, before, after)
-                kinds[kind].append((instance, thing))
-        same = len(kinds.pop("same", ()))
-        alone, both = _paired(kinds.pop("not_looked_at", ()))
-        lists = {kind: [thing for _, thing in things] for kind, things in kinds.items()}
-        lists |= {"not_looked_at": alone, "not_comparable": both}
+            before = self._last_stay(instance, self.earlier, self.later.start)
+            after = self._last_stay(instance, self.later)
+            if before is None and after is not None:
+                shared = self._last_stay(instance, self.earlier)
+                if shared is not None and shared.is_elsewhere(after):
+                    before = shared  # in slices of both windows, but elsewhere
+            if not self._is_inside(instance, before) and not self._is_inside(instance, after):
+                continue
+            kind, thing = self._difference(instance, before, after)
+            if kind == "same":
+                same += 1
+            elif kind == "not_looked_at":
+                not_looked_at.append((instance, thing))
+            else:
+                lists[kind].append(thing)
+        lists["not_looked_at"], lists["not_comparable"] = _pair_across_runs(not_looked_at)
         ordered = {kind: tuple(sorted(things, key=_newest_first)) for kind, things in lists.items()}
         movers = tuple(sorted(self._movers(), key=_newest_first))
         return ComparedThings(**ordered, same=same, movers=movers)
 
+    def _is_inside(self, instance: Instance, stay: _StayInWindow | None) -> bool:
+        """Returns whether a thing has a stay in the region."""
+        if stay is None or self.where is None:
+            return stay is not None
+        return self.where.contains(self.known.frames[instance.epoch], *stay.part.place[:2])
+
     def _difference(
         self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None
     ) -> tuple[str, ComparedThing]:
-        """Returns what became of a thing: kind and description."""
+        """Returns which list of `ComparedThings` a thing is in, or "same", and the thing."""
         thing = ComparedThing(
             label=instance.label,
             before=None if before is None else before.part,
@@ -264,19 +281,19 @@ class _ThingsBetween:
         estimate = self.known.estimate
         if before is None and after is not None:
             window = self.earlier.start, min(self.earlier.stop, self.later.start)
-            _, crossed = estimate.missing(instance, after.stay, window)
-            return "not_looked_at" if crossed is None else "appeared", thing
+            _, missed = estimate.missing(instance, after.stay, window)
+            return "not_looked_at" if missed is None else "appeared", thing
         if before is not None and after is None:
-            # At its place of the earlier window, before the later one.
+            # Its last stay at the same place before the later window.
             *_, last_there = (
                 stay
                 for stay in instance.stays
                 if stay.place == before.stay.place and stay.first < self.later.start
             )
-            looks, crossed = estimate.missing(instance, last_there)
-            if crossed is None or crossed >= self.later.stop:
+            looks, missed = estimate.missing(instance, last_there)
+            if missed is None or missed >= self.later.stop:
                 return "not_looked_at", thing
-            return "not_seen_where_expected", replace(thing, missed=crossed, looks=looks)
+            return "not_seen_where_expected", replace(thing, missed=missed, looks=looks)
         if before is None or after is None or before.is_elsewhere(after):
             return "moved", thing
         if before.at_once == after.at_once:
@@ -284,41 +301,44 @@ class _ThingsBetween:
         was, now = (replace(stay.part, at_once=stay.at_once) for stay in (before, after))
         return "more_or_fewer", replace(thing, before=was, after=now)
 
-    def _stay_in(
+    def _last_stay(
         self, instance: Instance, window: TimeWindow, before: Ns = MAX_NS
     ) -> _StayInWindow | None:
+        """Returns a thing's last stay in a window, of slices that end before a time."""
         estimate, frame = self.known.estimate, self.known.frames[instance.epoch]
         for stay in reversed(instance.stays):
             rows = estimate.seen_in(stay.spots, window, before)
             if len(rows):
                 place = estimate.place_of(stay, rows)
-                part = self.known.stay(rows, place, frame, self.places)
+                part = self.known.describe_stay(rows, place, frame, self.places)
                 return _StayInWindow(stay, part, estimate.side_by_side(rows))
         return None
 
     def _movers(self) -> Iterator[ComparedMover]:
-        """Yields what moves by itself and was not seen alike in both windows."""
-        by_label: dict[str, tuple[list[MoverSeen], list[MoverSeen]]] = {}
+        """Yields the people, pets and other movers that differ between the windows."""
+        alone: dict[str, tuple[list[MoverSeen], list[MoverSeen]]] = {}
         for mover in self.known.estimate.movers:
             label = self.known.estimate.names[mover.key]
-            before = self._mover_in(mover, self.earlier, self.later.start)
-            after = self._mover_in(mover, self.later)
-            if before and after:
+            before = self._last_seen(mover, self.earlier, self.later.start)
+            after = self._last_seen(mover, self.later)
+            befores, afters = alone.setdefault(label, ([], []))
+            if before is not None and after is not None:
                 away_m = math.dist(before.place[:2], after.place[:2])
                 if before.at_once != after.at_once or away_m > _SAME_MOVER_M:
                     yield ComparedMover(label, before, after)
-                continue
-            befores, afters = by_label.setdefault(label, ([], []))
-            befores += filter(None, [before])
-            afters += filter(None, [after])
-        for label, (befores, afters) in by_label.items():
-            # In each run of odometry it is another mover: one of each window is one row.
-            for before, after in zip_longest(befores, afters):
-                yield ComparedMover(label, before, after)
+            elif before is not None:
+                befores.append(before)
+            elif after is not None:
+                afters.append(after)
+        for label, (befores, afters) in alone.items():
+            # Each run of odometry has its own mover: one of each window make a row.
+            for earlier, later in zip_longest(befores, afters):
+                yield ComparedMover(label, earlier, later)
 
-    def _mover_in(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
+    def _last_seen(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
+        """Returns where a mover was last seen in a window, in slices that end before a time."""
         estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
-        rows = self.known.seen_there(mover, window, self.where, before)
+        rows = self.known.seen_inside(mover, window, self.where, before)
         if not len(rows):
             return None
         spots = estimate.spots[rows]
@@ -334,32 +354,33 @@ class _ThingsBetween:
         )
 
 
-def _paired(
+def _pair_across_runs(
     things: Sequence[tuple[Instance, ComparedThing]],
 ) -> tuple[list[ComparedThing], list[ComparedThing]]:
-    """Returns the things that were seen in one window alone, and those that were seen in both.
+    """Returns the things of one window alone, and pairs that may be one thing in two runs.
 
-    A thing of the earlier window and one of the later with its label, in another odometry, are
-    taken as one.
+    A pair has one label, a thing of the earlier window, and one of the later in other odometry.
     """
-    later: dict[str, list[tuple[int, ComparedThing]]] = {}
+    later: dict[str, list[tuple[int, ComparedThing]]] = defaultdict(list)
     for instance, thing in things:
         if thing.before is None:
-            later.setdefault(instance.key, []).append((instance.epoch, thing))
+            later[instance.key].append((instance.epoch, thing))
     alone: list[ComparedThing] = []
-    both: list[ComparedThing] = []
+    pairs: list[ComparedThing] = []
     for instance, thing in things:
         if thing.before is None:
             continue
-        candidates = later.get(instance.key, [])
-        for position, (epoch, candidate) in enumerate(candidates):
-            if epoch != instance.epoch:
-                del candidates[position]
-                both.append(replace(thing, after=candidate.after))
-                break
-        else:
+        candidates = later[instance.key]
+        others = [candidate for candidate in candidates if candidate[0] != instance.epoch]
+        if not others:
             alone.append(thing)
-    return alone + [thing for rest in later.values() for _, thing in rest], both
+            continue
+        candidates.remove(others[0])
+        _, partner = others[0]
+        pairs.append(replace(thing, after=partner.after))
+    for candidates in later.values():
+        alone += [thing for _, thing in candidates]
+    return alone, pairs
 
 
 def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:
@@ -370,7 +391,7 @@ def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:
 
 
 def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
-    """Returns the numbers of the path; None for unknown ones."""
+    """Returns the numbers of a path by the names in `_LEAST`; None for an unknown number."""
     trajectory = drive.valid_trajectory
     if trajectory is None:
         return dict.fromkeys(_LEAST)
@@ -385,61 +406,61 @@ def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, flo
     }
 
 
-_Farthest: TypeAlias = tuple[FarFromOther | None, FarFromOther | None]
-_PathDifferences: TypeAlias = tuple[str, tuple[StandstillPlace, ...], _Farthest]
+class _PathDifferences(NamedTuple):
+    """Where the robot stood or drove in one window and not in the other.
+
+    Attributes:
+        frame_id: the frame of the places; empty if paths cannot be compared.
+        stood: where it stood longer in one window, the largest difference first.
+        farthest: for each window the point that is farthest from the other window's path.
+    """
+
+    frame_id: str = ""
+    stood: tuple[StandstillPlace, ...] = ()
+    farthest: tuple[FarFromOther | None, FarFromOther | None] = None, None
 
 
-def _path_differences(
+def _compare_paths(
     view: View,
     placement: MapPlacement | None,
     drives: Sequence[Drive],
     windows: tuple[TimeWindow, TimeWindow],
     where: Where | None,
 ) -> _PathDifferences:
-    """Returns where the robot stood, and where it drove, in one window and not in the other.
-
-    First the frame of these places.
-    """
-    unknown: _PathDifferences = "", (), (None, None)
+    """Returns where the robot stood, and where it drove, in one window and not in the other."""
     if placement is None or any(drive.path is None for drive in drives):
-        return unknown
+        return _PathDifferences()
     frame = placement.frame_id
     if where is not None and where.frame_id not in {None, frame}:
-        return unknown
+        return _PathDifferences()
     if not placement.is_map and not is_one_run(view, resolve_path_topic(view), windows):
         view.notes.add(
             f"standstills and paths are not compared: {changing_origin(frame)}, and no transforms "
             "lead to a map"
         )
-        return unknown
+        return _PathDifferences()
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
     tracks = [known_track(view, frame, window).track for window in windows]
-    stands = [
-        [
-            *placed_standstills(
-                track,
-                ((standstill.start, standstill.end) for standstill, _ in drive.standstills),
-                region,
-            )
-        ]
-        for track, drive in zip(tracks, drives, strict=True)
-    ]
-    stood: list[tuple[float, StandstillPlace]] = []
+    stands = []
+    for track, drive in zip(tracks, drives, strict=True):
+        spans = ((stop.standstill.start, stop.standstill.end) for stop in drive.standstills)
+        stands.append([*placed_standstills(track, spans, region)])
+    differences: list[tuple[float, StandstillPlace]] = []
     for at in stood_at(*stands):
         this_s, other_s = (seconds or 0.0 for seconds in at.seconds)
         if differ(this_s, other_s, _LEAST["stood_s"]):
             named = at._replace(inside=places_at(places, frame, *at.place))
-            stood.append((abs(this_s - other_s), named))
-    stood.sort(key=lambda row: -row[0])
-    points = farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region)
-    this, other = (
-        None
-        if point is None or point.away_m < _LEAST_APART_M
-        else point._replace(inside=places_at(places, frame, *point.place))
-        for point in points
-    )
-    return frame, tuple(at for _, at in stood), (this, other)
+            differences.append((abs(this_s - other_s), named))
+    differences.sort(key=lambda difference: -difference[0])
+    farthest: list[FarFromOther | None] = []
+    for point in farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region):
+        if point is None or point.away_m < _LEAST_APART_M:
+            farthest.append(None)
+        else:
+            farthest.append(point._replace(inside=places_at(places, frame, *point.place)))
+    this, other = farthest
+    return _PathDifferences(frame, tuple(at for _, at in differences), (this, other))
 
 
 def _minutes_in_places(
@@ -447,20 +468,22 @@ def _minutes_in_places(
     placement: MapPlacement | None,
     windows: tuple[TimeWindow, TimeWindow],
     where: Where | None,
-    elapsed: Sequence[Elapsed],
+    drives: Sequence[Drive],
 ) -> list[dict[str, float | None]]:
-    """Returns the minutes in each named place, or in a region, of each window.
+    """Returns for each window the minutes in each named place, or in a region.
 
-    None where it is not known at any time of a window where the robot was.
+    A number is None if it is unknown at all times of the window where the robot was. Places where
+    the robot was in neither window are left out.
     """
     places = view.limits.places
     if placement is None or (where is None and not places):
         return [{}, {}]
     minutes_of_windows: list[dict[str, float | None]] = []
-    for window, passed in zip(windows, elapsed, strict=True):
+    visited = set[str]()
+    for window, drive in zip(windows, drives, strict=True):
         if where is None:
             tracks = places_in(view, places, placement, window)
-            asked = [(place.name, place.region, joined) for place, joined in tracks]
+            asked = [(place.name, place.region, track) for place, track in tracks]
         else:
             frame = placement.frame_id
             asked = [
@@ -468,20 +491,21 @@ def _minutes_in_places(
                 for place in where.each
             ]
         minutes: dict[str, float | None] = {}
-        for name, region, joined in asked:
-            lasted = passed.among(stay[:2] for stay in joined.inside(region, window))
-            minutes[name] = unix_from_ns(lasted) / 60 if joined.reaches(window) else None
+        for name, region, track in asked:
+            stays = ((stay.start, stay.stop) for stay in track.inside(region, window))
+            lasted = drive.elapsed.among(stays)
+            minutes[name] = unix_from_ns(lasted) / 60 if track.reaches(window) else None
+            if minutes[name]:
+                visited.add(name)
         minutes_of_windows.append(minutes)
-    # Where it was in neither window, as far as is known, nothing differs.
-    been = {name for minutes in minutes_of_windows for name, lasted in minutes.items() if lasted}
     return [
-        {name: lasted for name, lasted in minutes.items() if name in been}
+        {name: lasted for name, lasted in minutes.items() if name in visited}
         for minutes in minutes_of_windows
     ]
 
 
 def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:
-    """Returns how often each error was reported."""
+    """Returns how often each error was reported, by its text."""
     counts: dict[str, float] = defaultdict(float)
     for events in found_events(view, window, has_errors).values():
         for error in () if events is None else events.errors:
@@ -490,7 +514,7 @@ def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:
 
 
 def _silent_seconds(view: View, window: TimeWindow) -> Mapping[str, float]:
-    """Returns for how many seconds each topic was silent while the robot was on."""
+    """Returns how many seconds each topic was silent while the robot was on."""
     seconds: dict[str, float] = defaultdict(float)
     for silence in silences_in(view, window):
         seconds[silence.topic] += unix_from_ns(silence.length)
@@ -498,7 +522,7 @@ def _silent_seconds(view: View, window: TimeWindow) -> Mapping[str, float]:
 
 
 def _recorded_seconds(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
-    """Returns how many seconds of a window were recorded, but for pauses of less than a split."""
+    """Returns how many seconds of a window were recorded. Pauses shorter than a split count."""
     start, end = window.asked()
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     if earliest is None or latest is None:
@@ -516,24 +540,25 @@ def _differing(
     least: Mapping[str, float] | float,
     unlisted: Sequence[float | None] = (0.0, 0.0),
 ) -> tuple[tuple[str, Pair], ...]:
-    """Returns the numbers that differ, those that differ most first.
+    """Returns the numbers that differ, the largest difference first, by name.
 
-    A name that one side lacks is `unlisted` there; a number that is not known on one side is
-    listed.
+    A name that a side lacks has the number in `unlisted` there. A number that is unknown on one
+    side only differs.
     """
-    differing: list[tuple[float, str, Pair]] = []
+    pairs: dict[str, Pair] = {}
+    differences: dict[str, float] = {}
     for name in dict.fromkeys([*this, *other]):
         one, two = this.get(name, unlisted[0]), other.get(name, unlisted[1])
-        floor = least if isinstance(least, float) else least[name]
+        pairs[name] = Pair(one, two)
         if one is None or two is None:
             if one is not two:
-                differing.append((0.0, name, Pair(one, two)))
-        elif differ(one, two, floor):
-            differing.append((abs(one - two), name, Pair(one, two)))
-    differing.sort(key=lambda row: (-row[0], row[1]))
-    return tuple((name, pair) for _, name, pair in differing)
+                differences[name] = 0.0
+        elif differ(one, two, least if isinstance(least, float) else least[name]):
+            differences[name] = abs(one - two)
+    ordered = sorted(differences, key=lambda name: (-differences[name], name))
+    return tuple((name, pairs[name]) for name in ordered)
 
 
 def differ(one: float, two: float, least: float) -> bool:
-    """Whether two numbers differ by more than noise: by a tenth of the larger, and by `least`."""
+    """Returns whether two numbers differ by more than a tenth of the larger, and than `least`."""
     return abs(one - two) > max(least, _SHARE * max(abs(one), abs(two)))

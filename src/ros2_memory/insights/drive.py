@@ -56,20 +56,20 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
-"""A standstill that begins so soon after a loss of speed is what that led to."""
+"""A standstill that begins so soon after a loss of speed is the end of braking."""
 _MOST_MISSING: Final = 0.1
-"""Where poses are missing for more of the time, how long the robot stood is not known."""
+"""If poses are missing for more of the recorded time, how long the robot stood is unknown."""
 
 
 class Stop(NamedTuple):
-    """A standstill, as far as it is in a window, and whether it goes on after that."""
+    """The part of a standstill in a window, and whether it goes on after the window."""
 
     standstill: Standstill
     goes_on: bool
 
     @property
     def length(self) -> Ns:
-        """How long it lasts in the window."""
+        """How long the part in the window lasts (ns)."""
         return self.standstill.end - self.standstill.start
 
 
@@ -77,9 +77,10 @@ class Stop(NamedTuple):
 class Drive:
     """How the robot moved: its path, and its standstills.
 
-    `drops` are sudden losses of speed that no standstill follows. `elapsed` is how much time passed
-    between moments of the window, `recorded` for how much of it, from where the path is known on,
-    something was recorded.
+    Attributes:
+        elapsed: tells how much time passed between two moments of the window.
+        drops: sudden losses of speed that no standstill follows.
+        recorded: for how long (ns) anything was recorded since the path is known.
     """
 
     elapsed: Elapsed
@@ -91,29 +92,31 @@ class Drive:
 
     @property
     def valid_trajectory(self) -> Trajectory | None:
-        """The path's trajectory, if it has a valid pose."""
+        """The trajectory of the path; None without a valid pose."""
         trajectory = self.trajectory
         return trajectory if trajectory is not None and trajectory.is_known else None
 
     def stops(self, length: Ns) -> tuple[Stop, ...]:
-        """Returns the standstills that a window of a length lists.
+        """Returns the standstills that a window lists; `length` is the window's (ns).
 
-        Those that fill it, or last half of the shortest one in it: so of windows that follow each
-        other one at least lists it, and none lists the last moment of one before it.
+        They fill the window, or last half of the shortest standstill in it. So at least one of two
+        consecutive windows lists a standstill across their bound, and none lists its last moment.
         """
         least = min(SHORTEST_NS // 2, length)
         return tuple(stop for stop in self.standstills if stop.length >= least)
 
     def stood(self, length: Ns) -> Ns | None:
-        """Returns how long the robot stood in all, in a window of a length; None if not known.
+        """Returns how long (ns) the robot stood in a window; None if that is unknown.
 
-        It is not known where no pose has a valid position, nor where poses are too far apart to
-        show it, or missing for much of the time in which something was recorded: some robots
-        publish none while they stand. Nor where the robot neither moved nor stood for most of the
-        time: noise hides where it stood.
+        It is unknown in these cases, where `length` is the window's (ns):
+
+        - No pose has a valid position.
+        - Poses are too far apart to show standstills.
+        - Poses are missing for much of the recorded time: some robots publish none while they stand.
+        - The robot neither moved nor stood for most of the time: noise hides where it stood.
         """
         stood = self.elapsed.among(
-            (standstill.start, standstill.end) for standstill, _ in self.standstills
+            (stop.standstill.start, stop.standstill.end) for stop in self.standstills
         )
         trajectory = self.valid_trajectory
         if trajectory is None:
@@ -124,23 +127,23 @@ class Drive:
         missing = self.recorded - ns_from_unix(recorded_s)
         if missing > max(SHORTEST_NS, _MOST_MISSING * self.recorded):
             return None
-        else_s = recorded_s - unix_from_ns(stood)
-        is_slow = else_s > recorded_s / 2 and trajectory.totals.distance_m <= CREEP_MPS * else_s
+        moving_s = recorded_s - unix_from_ns(stood)
+        is_slow = moving_s > recorded_s / 2 and trajectory.totals.distance_m <= CREEP_MPS * moving_s
         # A window without a standstill may begin and end beyond its poses.
-        lasted = ns_from_unix(else_s) if stood else length
+        lasted = ns_from_unix(moving_s) if stood else length
         is_hidden = is_slow and lasted >= SHORTEST_NS and not (stood and trajectory.totals.gaps)
         return None if is_hidden else stood
 
 
 def drive_in(view: View, window: TimeWindow) -> Drive:
-    """Returns how the robot moved; nothing, with a note, if that is unknown."""
+    """Returns how the robot moved in a window. If that is unknown, a note says why."""
     elapsed = elapsed_in(view, window)
     try:
         topic = resolve_path_topic(view)
         require_one_robot(view, topic, window)
         path, since = driven_path(view, topic, window)
         begin = window.start if since is None else since
-        standstills, drops = _standstills_in(view, topic, TimeWindow(begin, window.stop))
+        standstills, drops = _stops_and_drops(view, topic, TimeWindow(begin, window.stop))
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")
         return Drive(elapsed)
@@ -154,49 +157,47 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     return Drive(elapsed, path, trajectory, standstills, drops, recorded)
 
 
-def _standstills_in(
+def _stops_and_drops(
     view: View, topic: str, window: TimeWindow
 ) -> tuple[tuple[Stop, ...], tuple[SpeedDrop, ...]]:
-    """Returns where the robot of a pose topic stood still, and where it lost speed without that.
+    """Returns the standstills and the sudden losses of speed in a window, each in order.
 
-    Each in order. A standstill goes on where it does after the window, or up to the last pose that
-    is known, but not where other topics were recorded for long after that pose.
-
-    Poses outside of the window count too: a standstill that goes on beyond an end of the window
-    ends there, however little of it is inside. So those of windows that follow each other add up.
+    Poses outside of the window count too. A standstill across a bound of the window ends there,
+    however little of it is inside: so the standstills of consecutive windows add up.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
     """
     slices = _stands_of_slices(view, topic, window.widened(CONTEXT_NS))
     stands = [stand for _, stand in slices][::-1]
-    standing = standstills_of([stand.blocks for stand in stands])
-    starts = [standstill.start for standstill in standing]
+    standstills = standstills_of([stand.blocks for stand in stands])
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    drops = tuple(
-        drop
-        for stand in stands
-        for drop in stand.drops
-        if start <= drop.time <= end
-        and bisect_left(starts, drop.time - DROP_SLOT_NS)
-        == bisect_left(starts, drop.time + _BRAKING_NS)
-    )
+    begins = [standstill.start for standstill in standstills]
+    drops = []
+    for stand in stands:
+        for drop in stand.drops:
+            first = bisect_left(begins, drop.time - DROP_SLOT_NS)
+            is_braking = first < bisect_left(begins, drop.time + _BRAKING_NS)
+            if start <= drop.time <= end and not is_braking:
+                drops.append(drop)
     last = max((stand.last for stand in stands), default=MIN_NS)
+    # A standstill up to the last known pose goes on, unless other topics were recorded for long
+    # after that.
     later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
     was_recorded_later = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
-    stops = tuple(
-        Stop(
-            stood._replace(start=max(stood.start, start), end=min(stood.end, end)),
-            stood.end > end or (stood.end == last and not was_recorded_later),
-        )
-        for stood in standing
-        if stood.start < end and stood.end > start
-    )
-    return stops, drops
+    stops = []
+    for standstill in standstills:
+        if standstill.start < end and standstill.end > start:
+            part = standstill._replace(
+                start=max(standstill.start, start), end=min(standstill.end, end)
+            )
+            is_newest = standstill.end == last and not was_recorded_later
+            stops.append(Stop(part, standstill.end > end or is_newest))
+    return tuple(stops), tuple(drops)
 
 
 def _stands_of_slices(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, Stands]]:
-    """Yields what shows where the robot stood; see `slices_by_poses`."""
+    """Yields what standstills follow from, slice by slice; see `slices_by_poses`."""
 
     def make(part: PoseSlice) -> Stands:
         return stands_of(part.poses, part.start, part.stop)
@@ -205,9 +206,9 @@ def _stands_of_slices(view: View, topic: str, window: TimeWindow) -> Iterator[tu
 
 
 def make_drive_slices(view: View, window: TimeWindow) -> Iterator[Ns]:
-    """Makes the slices of the path in a window, and of where the robot stood, the newest first.
+    """Makes and stores the slices of the path and of standstills in a window, the newest first.
 
-    Yields the log time (ns) of each.
+    Yields the log time (ns) of each slice.
     """
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_pose_topic(view)

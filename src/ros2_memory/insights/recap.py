@@ -1,6 +1,6 @@
 """A recap of a window, from the data alone: a few sentences, each with its time.
 
-The robot stood, things came into view and left it, booleans toggled, errors were reported, and
+The robot stood, things came into view and left it, booleans toggle_sentence, errors were reported, and
 nothing was recorded. Where there are more events than a planner wants to read, the least important
 are left out, and counted.
 """
@@ -40,9 +40,9 @@ from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
     ChangesBefore,
-    before,
     changes_in,
     is_routine,
+    recap_before,
 )
 from ros2_memory.insights.drive import Drive, Stop, drive_in
 from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
@@ -53,7 +53,7 @@ from ros2_memory.insights.topic_events import (
     flags_before,
     goals_in,
     note_limits,
-    toggled,
+    toggle_sentence,
 )
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
@@ -117,7 +117,7 @@ def recap_or_before(
         return recap(memory, call, span, where=where, frame_id=frame_id, min_score=min_score)
     if where is not None:
         raise InvalidArgumentsError("where cannot be combined with around")
-    return before(memory, call, span.around_s, span.before_s, frame_id)
+    return recap_before(memory, call, span.around_s, span.before_s, frame_id)
 
 
 def recap(
@@ -351,7 +351,7 @@ def _reported_events(
 
 
 def _toggles(view: View, topic: str, events: TopicEvents) -> list[Change]:
-    """Returns when booleans of a topic toggled, also with the first message of a window."""
+    """Returns when booleans of a topic toggle_sentence, also with the first message of a window."""
     flags, toggles = events.of_kind(FLAG)
     before = flags_before(view, topic, events.first) if flags else {}
     first = [
@@ -502,7 +502,7 @@ def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> I
     """
     until: dict[str, Ns] = {}
     for toggle in reversed(toggles):
-        text = toggled(topic, toggle)
+        text = toggle_sentence(topic, toggle)
         end = until.get(toggle.name)
         ceased = bisect_left(ends, toggle.time)
         if ceased < len(ends) and (end is None or ends[ceased] < end):

@@ -64,15 +64,15 @@ def flag_name(topic: str, flag: KnownState | Change) -> str:
     return topic if flag.name == "value" else f"{topic} {flag.name}"
 
 
-def toggled(topic: str, toggle: Change) -> str:
-    """Returns a sentence for a boolean of a topic that toggled."""
+def toggle_sentence(topic: str, toggle: Change) -> str:
+    """Returns a sentence for a boolean of a topic that toggle_sentence."""
     return f"{flag_name(topic, toggle)} became {'true' if toggle.value else 'false'}"
 
 
 def flags_before(view: View, topic: str, first: Ns) -> dict[str, bool]:
     """Returns the booleans of the message before one at a log time (ns), by their names.
 
-    Without those that may have toggled in between, since a message there may be missing.
+    Without those that may have toggle_sentence in between, since a message there may be missing.
     """
     holds_on = is_latched(view, topic)
     message = held_at(view, topic, first) if holds_on else view.stream.last(topic, first)
@@ -302,19 +302,21 @@ def goals_in(
             is_whole = not (earlier.beyond or earlier.undecodable)
             knows_all = is_whole and _lacks_none(view, topic, message_before.time, events.first)
         goals = [*_goal_runs(topic, events, statuses_before, knows_all=knows_all)]
-        lost = last_listed(view, topic, window, {goal.goal for goal in goals if goal.ended is None})
+        lost = last_listings(
+            view, topic, window, {goal.goal for goal in goals if goal.ended is None}
+        )
         for goal in goals:
             last = lost.get(goal.goal)
             yield goal if last is None else goal._replace(last=last, is_lost=True)
 
 
-def last_listed(view: View, topic: str, window: TimeWindow, active: set[str]) -> dict[str, Ns]:
+def last_listings(view: View, topic: str, window: TimeWindow, active: set[str]) -> dict[str, Ns]:
     """Returns those of some active goals that a window's newest message does not list.
 
     Each with the log time of the last message that lists it: a server lists what has not ended for
     as long as it runs.
     """
-    last_listings: dict[str, Ns] = {}
+    listings: dict[str, Ns] = {}
     unlisted = set(active)
     newest = view.stream.messages([topic], window, newest_first=True) if unlisted else iter(())
     for nth, message in enumerate(newest):
@@ -323,10 +325,10 @@ def last_listed(view: View, topic: str, window: TimeWindow, active: set[str]) ->
             break  # what it lists is not known
         listed = {goal.name for goal in events.of_kind(GOAL)[0]} & unlisted
         unlisted -= listed
-        last_listings |= dict.fromkeys(listed if nth else (), message.time)
+        listings |= dict.fromkeys(listed if nth else (), message.time)
         if not unlisted:
             break
-    return last_listings
+    return listings
 
 
 def goals_asked(
