@@ -118,6 +118,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.core.model import Geodetic
     from ros2_memory.extract import Extracted
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
@@ -125,14 +126,17 @@ if TYPE_CHECKING:
 
 A = TypeVar("A", results.Match, results.ValueWhen)
 
+_NOT_A_NUMBER: Final = "the recorded position is not a number"
+
 _MAX_ODD_BAGS: Final = 5
 _FEWEST_OF_A_LINE: Final = 2
 _FINE_PATH_M: Final = 0.05 + 1e-9
-"""The deviation that a simplified path is expected to have; a larger one is noted."""
+"""A note tells that a simplified path deviates by more."""
 _REACH_M: Final = 0.05
-"""How far a robot may have got before the next pose without a note."""
+"""A note tells that a robot got farther before the next pose of a thinned day."""
 _THINNED_POSES_NS: Final = 3 * NS_PER_S
-"""No farther apart are the poses of a thinned day, where they were recorded."""
+"""The longest time between two poses of a thinned day, while poses were recorded."""
+_ROUNDING_MPS: Final = 0.01
 
 
 def topic_value(
@@ -165,12 +169,12 @@ def topic_range(
 ) -> results.TopicRange:
     """Returns samples of a topic, evenly spaced over all its messages in a window.
 
-    With them the extremes of `fields` that hold numbers, unless the messages are too many.
+    And the extremes of those `fields` that hold numbers, unless there are too many messages.
     """
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
-    shown, failures = _show_each(view, picked, fields)
+    shown, failures = _show_messages(view, picked, fields)
     chosen = len(shown) + failures.total()
     if not chosen:
         raise no_data_between(view, (name,), window)
@@ -208,7 +212,7 @@ def position(
 ) -> results.Position:
     """Returns where the robot was: its newest pose at or before a moment, within the tolerance (s).
 
-    In the pose's own frame, or in `frame_id`. A topic of a satellite receiver gives degrees.
+    The pose is in its own frame, or in `frame_id`. A satellite receiver's topic gives degrees.
     """
     view, at, now = open_moment(memory, call, moment)
     name = resolve_path_topic(view, topic, degrees=True)
@@ -225,59 +229,63 @@ def position(
         )
     _require_kind(view, name, "position", "geodetic")
     stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
-    return _position_in(view, stored, at, now, frame_id)
-
-
-def _position_in(
-    view: View, stored: StoredMessage, at: Ns, now: Ns | None, frame_id: str | None
-) -> results.Position:
-    """Returns the pose in a message, as that of a moment; see `position`."""
-    memory, name = view.memory, stored.topic
     _note_latched(view, stored, at)
-    message, type_name = decode(view, stored), stored.type
-    pose, geodetic = memory.extractor.pose(message, type_name), None
-    if pose is None:
-        geodetic = memory.extractor.geodetic(message, type_name)
+    message = decode(view, stored)
+    pose, geodetic = view.extractor.pose(message, stored.type), None
+    if pose is not None:
+        pose = _place_pose(view, stored, pose, frame_id)
+    else:
+        geodetic = view.extractor.geodetic(message, stored.type)
         if geodetic is None:
             raise InvalidArgumentsError(describe_lack(view, "position", stored))
+        _note_geodetic(view, geodetic)
         pose = Pose((math.nan,) * 3, None, geodetic.frame_id)
-        coordinates: tuple[float, ...] = (geodetic.latitude, geodetic.longitude)
-    else:
-        coordinates = pose.position
-    if not all(map(math.isfinite, coordinates)):
-        view.notes.add("the recorded position is not a number")
-    if geodetic is not None and not geodetic.has_fix:
-        view.notes.add("no fix: the receiver states (fix_status -1) that this is not its position")
-    if geodetic is None and pose.orientation is None:
-        view.notes.add("the recorded orientation is not a rotation")
-    if geodetic is None:
-        recording = stored.bag.recording
-        if is_thinned(stored.bag.file):
-            _note_reach(view, stored, pose)
-        if frame_id is not None:
-            pose = placed(view, pose, stored.time, recording, frame_id)
-        view.notes.add(*axes_of(pose.frame_id))
-        if memory.limits.places:
-            pose = with_place(view, pose, stored.time, recording)
     notes = view.notes.sentences()
     return results.Position(name, stored.time, pose, _age(stored, now), geodetic, notes=notes)
 
 
+def _note_geodetic(view: View, geodetic: Geodetic) -> None:
+    """Notes that a satellite receiver gives no valid position."""
+    if not (math.isfinite(geodetic.latitude) and math.isfinite(geodetic.longitude)):
+        view.notes.add(_NOT_A_NUMBER)
+    if not geodetic.has_fix:
+        view.notes.add("no fix: the receiver states (fix_status -1) that this is not its position")
+
+
+def _place_pose(view: View, stored: StoredMessage, pose: Pose, frame_id: str | None) -> Pose:
+    """Returns the pose in a message in `frame_id`, with the named place; notes tell its flaws."""
+    recording = stored.bag.recording
+    if not all(map(math.isfinite, pose.position)):
+        view.notes.add(_NOT_A_NUMBER)
+    if pose.orientation is None:
+        view.notes.add("the recorded orientation is not a rotation")
+    if is_thinned(stored.bag.file):
+        _note_reach(view, stored, pose)
+    if frame_id is not None:
+        pose = placed(view, pose, stored.time, recording, frame_id)
+    view.notes.add(*axes_of(pose.frame_id))
+    if view.limits.places:
+        pose = with_place(view, pose, stored.time, recording)
+    return pose
+
+
 def _note_reach(view: View, stored: StoredMessage, pose: Pose) -> None:
-    """Notes between which coordinates the robot was, in a second of which one pose stayed."""
+    """Notes how far the robot got until the next pose: a thinned day has one pose a second."""
     window = TimeWindow(stored.time + 1, stored.time + 2 * NS_PER_S)
     newer = view.stream.first([stored.topic], window)
     message = None if newer is None else view.bags.decode(newer)
     if newer is None or message is None:
         return
     after = view.extractor.pose(message, newer.type)
-    if after is not None and math.dist(after.position, pose.position) > _REACH_M:
-        spans = zip("xy", pose.position[:2], after.position[:2], strict=True)
-        ends = [f"{axis} {min(span):.2f} to {max(span):.2f}" for axis, *span in spans]
-        view.notes.add(
-            f"it moved: until {unix_text(newer.time)} it was within {' and '.join(ends)} m of "
-            f"{pose.frame_id or 'its frame'}; of that time one pose a second stayed"
-        )
+    if after is None or math.dist(after.position, pose.position) <= _REACH_M:
+        return
+    ends = []
+    for axis, here, there in zip("xy", pose.position[:2], after.position[:2], strict=True):
+        ends.append(f"{axis} {min(here, there):.2f} to {max(here, there):.2f}")
+    view.notes.add(
+        f"it moved: until {unix_text(newer.time)} it was within {' and '.join(ends)} m of "
+        f"{pose.frame_id or 'its frame'}; of that time one pose a second stayed"
+    )
 
 
 def _position_of_body(
@@ -290,39 +298,40 @@ def _position_of_body(
     now: Ns | None,
     frame_id: str | None,
 ) -> results.Position:
-    """Returns where transforms have the robot's body, and the latitude and longitude beside it.
+    """Returns where transforms place the robot's body, and the latitude and longitude then.
 
     Raises:
-        NoDataError: none places it at the moment, or within the tolerance before.
+        NoDataError: no transform places it at the moment, or within the tolerance before.
     """
-    limits, extractor = view.limits, view.extractor
     window, tolerance = _window_before(view, at, tolerance_s, rest_s)
-    of_body = newest_of_body(view, body, window, frame_id)
-    if of_body is None:
-        raise _not_placed(view, body, at, tolerance, frame_id)
-    stored, pose = of_body
+    newest = newest_of_body(view, body, window, frame_id)
+    if newest is None:
+        raise _unplaced_error(view, body, at, tolerance, frame_id)
+    stored, pose = newest
     note_robots_near(view, stored)
     note_unread(view, TimeWindow(stored.time, window.stop))
-    if limits.places:
+    if view.limits.places:
         pose = with_place(view, pose, stored.time, stored.bag.recording)
-    geodetic, fixes = None, topics_of_robot(view, "geodetic")
-    near = TimeWindow.around(stored.time, ns_from_unix(limits.time_tolerance_s))
-    fix = view.stream.newest(fixes[0], near) if len(fixes) == 1 else None
-    if fix is not None and (message := view.bags.decode(fix)) is not None:
-        geodetic = extractor.geodetic(message, fix.type)
+    geodetic, fix_topics = None, topics_of_robot(view, "geodetic")
+    if len(fix_topics) == 1:
+        near = TimeWindow.around(stored.time, ns_from_unix(view.limits.time_tolerance_s))
+        fix = view.stream.newest(fix_topics[0], near)
+        message = None if fix is None else view.bags.decode(fix)
+        if fix is not None and message is not None:
+            geodetic = view.extractor.geodetic(message, fix.type)
     topic, notes = stored.topic, view.notes.sentences()
     return results.Position(topic, stored.time, pose, _age(stored, now), geodetic, notes=notes)
 
 
-def _not_placed(
+def _unplaced_error(
     view: View, body: Body, at: Ns, tolerance: Ns | None, frame_id: str | None
 ) -> NoDataError:
-    """Returns the error for no transform that places the robot's body at a moment."""
+    """Returns why no transform places the robot's body at a moment."""
     try:
         frame_history.transform_at(view, frame_id or body.parent, body.child, at)
         error = no_data_at(view, view.moving_topics, at, tolerance)
-    except NoDataError as none_then:
-        error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), none_then)
+    except NoDataError as no_transform:
+        error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), no_transform)
     fixes = topics_with(view, "geodetic")
     advice = f"; latitude and longitude are on {listed(fixes)}: give topic" if fixes else ""
     return NoDataError(error.reason, error.detail + advice, error.notes)
@@ -389,26 +398,26 @@ def find_last_match(
     """Returns the newest message of a topic, or of all topics of a glob, that meets a condition.
 
     With `before_s` (Unix seconds) only messages up to and including then are searched. Detections
-    of a score below `min_score` do not count.
+    with a score below `min_score` do not count.
     """
     now, until = memory.clock.now(), _search_end(before_s)
 
-    def found(view: View, match: StoredMessage) -> results.Match:
+    def show(view: View, match: StoredMessage) -> results.Match:
         note_robots_near(view, match)
         note_unread(view, _searched_window(view, match, until, now), search=True)
-        # What the view shows may be some days of long ago.
+        # The view may show some days of long ago only.
         newest_known = memory.index.published or view.snapshot
         counted_from = memory.now(now, newest_known.latest, call)
         is_future = match.time > counted_from + FUTURE_NS
         if is_future:
             after = seconds(match.time - counted_from)
             view.notes.add(f"dated {after} after now: when it was is unknown")
-        value_found = _as_value(view, match, fields, None if is_future else counted_from)
-        return results.Match(value_found, notes=value_found.notes)
+        shown = _as_value(view, match, fields, None if is_future else counted_from)
+        return results.Match(shown, notes=shown.notes)
 
     reach = min(now, until)
-    sought = _Sought(topic, condition_type, value, field, min_score, until)
-    return _last_match(View(memory, call, reach), reach, sought, found)
+    search = _Search(topic, condition_type, value, field, min_score, until)
+    return _last_match(View(memory, call, reach), reach, search, show)
 
 
 def value_when(
@@ -426,79 +435,81 @@ def value_when(
 ) -> results.ValueWhen | results.Match:
     """Returns a topic's value at or before the last time that another topic met a condition.
 
-    Else that there was no match. With `before_s` (Unix seconds) the condition is looked for up to
-    and including then. Detections of a score below `min_score` do not count.
+    Or that there was no match. With `before_s` (Unix seconds) only matches up to and including then
+    count. Detections with a score below `min_score` do not.
     """
     now, until = memory.clock.now(), _search_end(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
 
-    def found(view: View, match: StoredMessage) -> results.ValueWhen:
+    def show(view: View, match: StoredMessage) -> results.ValueWhen:
         note_unread(view, _searched_window(view, match, until, now), search=True)
         note_robots_near(view, match)
         matched = _as_value(view, match, (), None)
-        upto = TimeWindow.until(match.time)
-        held = _newest_beside(view, name, upto, match)
-        read = upto if held is None else replace(upto, start=held.time)
-        note_unread(view, read, nothing=not held)
-        if held is None:
+        until_match = TimeWindow.until(match.time)
+        stored = _newest_of_recording(view, name, until_match, match)
+        if stored is None:
+            note_unread(view, until_match, nothing=True)
             view.notes.add(f"no message of {name} is here at or before {unix_text(match.time)}")
             notes = (*matched.notes, *view.notes.sentences())
             return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
-        distance = match.time - held.time
-        latched = still_holds(view, held, match.time)
-        if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
-            view.notes.add(f"the value is {seconds(distance)} older than the match")
-        held_value = _with_latched_age(view, _as_value(view, held, fields, None), held, match.time)
-        notes = (*matched.notes, *held_value.notes)
-        return results.ValueWhen(matched, held_value, notes=tuple(dict.fromkeys(notes)))
+        note_unread(view, replace(until_match, start=stored.time))
+        age = match.time - stored.time
+        is_old = age > ns_from_unix(memory.limits.time_tolerance_s)
+        if is_old and not still_holds(view, stored, match.time):
+            view.notes.add(f"the value is {seconds(age)} older than the match")
+        shown = _as_value(view, stored, fields, None)
+        shown = _with_latched_age(view, shown, stored, match.time)
+        notes = (*matched.notes, *shown.notes)
+        return results.ValueWhen(matched, shown, notes=tuple(dict.fromkeys(notes)))
 
-    sought = _Sought(condition_topic, condition_type, value, field, min_score, until)
-    return _last_match(view, now, sought, found)
+    search = _Search(condition_topic, condition_type, value, field, min_score, until)
+    return _last_match(view, now, search, show)
 
 
 def list_recorded_topics(
     memory: Memory, call: Call, *, pattern: str | None = None
 ) -> tuple[results.TopicRow, ...]:
-    """Returns every topic that has messages, under each of its types; none for an empty memory.
+    """Returns a row for each type of each topic with messages; none for an empty memory.
 
-    With `pattern`, a glob, those that match it. A row has notes where its numbers are of bags that
-    are not whole, or that a wrong clock dated.
+    With `pattern`, a glob, only the topics that match.
 
     Raises:
-        NoDataError: the bag directory or its disk is missing: what was recorded is not known; or
-            no topic matches.
+        NoDataError: no topic matches, or what was recorded is not known since the bag directory or
+            its disk is missing.
     """
     view = View(memory, call, memory.clock.now())
     if view.snapshot.problem is not None:
         require_bags(view)
-    notes = _notes_by_topic(view.snapshot)
-    rows = []
-    for topic in view.timeline.topics():
-        reasons = undecodable_types(view, topic)
-        for type_name, census in sorted(view.census(topic).items()):
-            rows.append(
-                results.TopicRow(
-                    topic,
-                    type_name,
-                    census.first,
-                    census.last,
-                    census.messages,
-                    reasons.get(type_name),
-                    notes.get(topic, ()),
-                )
-            )
+    rows = tuple(_topic_rows(view))
     if pattern is None or not rows:
-        return tuple(rows)
-    matched = {*match_topics([row.topic for row in rows], pattern)}
-    named = tuple(row for row in rows if row.topic in matched)
-    if not named:
+        return rows
+    names = {*match_topics([row.topic for row in rows], pattern)}
+    matching = tuple(row for row in rows if row.topic in names)
+    if not matching:
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
             f"none of the {len(rows)} recorded topics matches {pattern}; "
             "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
         )
-    return named
+    return matching
+
+
+def _topic_rows(view: View) -> Iterator[results.TopicRow]:
+    """Yields the rows of all topics. Notes name damaged bags, and bags that a wrong clock dated."""
+    notes = _notes_by_topic(view.snapshot)
+    for topic in view.timeline.topics():
+        reasons = undecodable_types(view, topic)
+        for type_name, census in sorted(view.census(topic).items()):
+            yield results.TopicRow(
+                topic,
+                type_name,
+                census.first,
+                census.last,
+                census.messages,
+                reasons.get(type_name),
+                notes.get(topic, ()),
+            )
 
 
 def data_time_range(
@@ -506,8 +517,8 @@ def data_time_range(
 ) -> results.DataTimeRange:
     """Returns what the memory spans, where it has gaps, and which files do not answer.
 
-    Bags that a wrong clock dated are listed, and neither begin nor end the span or a gap in it.
-    Gaps, silences and steps of the clock are those that a window overlaps.
+    A window selects the gaps, silences and steps of the clock that it overlaps. Bags that a wrong
+    clock dated are listed, and count neither for the span nor for gaps.
 
     Raises:
         InvalidArgumentsError: the bounds make no window.
@@ -517,23 +528,14 @@ def data_time_range(
     view = View(memory, call, now if memory.limits.now == "wall" else None)
     view.bags.track_all_sources()
     snapshot = view.snapshot
-    if snapshot.problem:
-        view.notes.add(snapshot.problem)
-    if snapshot.dating.note:
-        view.notes.add(snapshot.dating.note)
-    # Except crashes and wrong clocks.
-    odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(snapshot)]
-    odd += memory.scanner.damaged_parts(snapshot.bags)
-    view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))
-    thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
-    if thinned and (since is None or thinned[0].start < since):
-        before = "" if since is None else f" before {unix_text(since)}"
-        view.notes.add(
-            f"silences and steps of the clock within the days of memory/{before} are not known"
-        )
-    view.notes.add(*describe_absent(memory.absent_splits(snapshot)))
+    _note_bags(view)
     undecodable = undecodable_topics(view)
     steps = clock_steps(view, window)
+    silences = tuple(
+        silence
+        for silence in silences_of(memory, snapshot)
+        if window.overlaps(silence.start, silence.end)
+    )
     return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
@@ -548,26 +550,41 @@ def data_time_range(
         notes=view.notes.sentences(),
         undecodable=undecodable,
         clock_faults=clock_faults(snapshot),
-        silences=tuple(
-            silence
-            for silence in silences_of(memory, snapshot)
-            if window.overlaps(silence.start, silence.end)
-        ),
+        silences=silences,
         clock_steps=steps,
     )
 
 
-def _newest_beside(
+def _note_bags(view: View) -> None:
+    """Notes odd, thinned and absent bags. Crashes and wrong clocks are listed, not noted."""
+    snapshot, memory = view.snapshot, view.memory
+    if snapshot.problem:
+        view.notes.add(snapshot.problem)
+    if snapshot.dating.note:
+        view.notes.add(snapshot.dating.note)
+    odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(snapshot)]
+    odd += memory.scanner.damaged_parts(snapshot.bags)
+    view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))
+    thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
+    if thinned and (since is None or thinned[0].start < since):
+        before = "" if since is None else f" before {unix_text(since)}"
+        view.notes.add(
+            f"silences and steps of the clock within the days of memory/{before} are not known"
+        )
+    view.notes.add(*describe_absent(memory.absent_splits(snapshot)))
+
+
+def _newest_of_recording(
     view: View, topic: str, window: TimeWindow, match: StoredMessage
 ) -> StoredMessage | None:
-    """Returns the newest message of a topic in a window, from the match's recording if it has one.
+    """Returns the newest message of a topic in a window, of the match's recording if it has one.
 
-    A note says where recordings of several robots may be mixed.
+    A message of another recording may be another robot's: a note says so.
     """
     newest = view.stream.newest(topic, window)
-    if newest is None or newest.bag.recording == match.bag.recording:
-        return newest
     recording = match.bag.recording
+    if newest is None or newest.bag.recording == recording:
+        return newest
     newest = view.sessions.newest(topic, window, recording) or newest
     if not view.sessions.are_joined(recording, newest.bag.recording):
         view.notes.add(
@@ -589,64 +606,65 @@ def trajectory_summary(
 ) -> results.TrajectorySummary:
     """Returns the driven path in a window, from one pose topic in log-time order.
 
-    Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
-    `farthest` is the point from which the farthest pose is wanted.
+    Its waypoints are in the poses' own frame or in `frame_id`: none for `max_waypoints` 0, the last
+    one for 1. `farthest` is the point from which the farthest pose is wanted.
     """
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
     path, _ = driven_path(view, name, window)
     if path is None:
         raise no_data_between(view, (name,), window)
+    own_frame = path.frames[0]
     note_unrecorded(view, window)
     if len(path.frames) > 1:
         view.notes.add(f"poses in several frames were joined: {', '.join(path.frames)}")
     require_one_robot(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
-    note_runs(view, name, path.frames[0], window)
-    view.notes.add(*axes_of(frame_id or path.frames[0]))
+    note_runs(view, name, own_frame, window)
+    view.notes.add(*axes_of(frame_id or own_frame))
     elapsed = elapsed_in(view, window)
+    # The least line has two ends: fewer waypoints are cut from it.
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
-    driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
-    drawn = driven
+    shown = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
+
     if max_waypoints < _FEWEST_OF_A_LINE:
-        last = driven.waypoints[-1:] if max_waypoints else ()
-        drawn = replace(driven, waypoints=last, waypoint_error_m=0.0)
+        last = shown.waypoints[-1:] if max_waypoints else ()
+        shown = replace(shown, waypoints=last, waypoint_error_m=0.0)
     if frame_id is not None:
-        moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
-        drawn = replace(drawn, waypoints=moved)
+        waypoints = placed_waypoints(view, name, shown.waypoints, own_frame, frame_id)
+        shown = replace(shown, waypoints=waypoints)
         view.notes.retract_outside(window)
-    ends = [(window.start, window.stop - 1)]
-    away = None if farthest is None else farthest_from(view, farthest, name, ends, frame_id)
+    away = None
+    if farthest is not None:
+        spans = [(window.start, window.stop - 1)]
+        away = farthest_from(view, farthest, name, spans, frame_id)
     return results.TrajectorySummary(
         name,
-        frame_id or path.frames[0],
+        frame_id or own_frame,
         path.first,
         path.last,
-        drawn,
+        shown,
         elapsed.skipped_between(path.first, path.last),
-        driven.totals.gap_ns,
+        shown.totals.gap_ns,
         away,
-        notes=(*view.notes.sentences(), *_path_notes(drawn)),
+        notes=(*view.notes.sentences(), *_path_notes(shown)),
     )
 
 
 def _path_notes(path: Trajectory) -> Iterator[str]:
     """Yields what a path leaves out, and how it was measured."""
     yield from length_notes(path)
-    if path.totals.jumps:
-        drawn = sum(point.jump for point in path.waypoints)
-        if drawn:
-            longest = "the longest lead" if drawn < path.totals.jumps else "each leads"
-            yield (
-                f"of the jumps {longest} to a waypoint with jump: true; "
-                "that distance was not driven"
-            )
+    jumps = [point for point in path.waypoints if point.jump]
+    if jumps:
+        longest = "the longest lead" if len(jumps) < path.totals.jumps else "each leads"
+        yield (
+            f"of the jumps {longest} to a waypoint with jump: true; that distance was not driven"
+        )
     mean, fastest = path.avg_speed, path.max_speed
     if path.poses and fastest is not None and path.max_speed_from == "positions":
         yield "max_speed is measured from positions: the messages have no speed"
-    # By more than the rounding of both.
-    if mean is not None and fastest is not None and mean > fastest + 0.01:
+    if mean is not None and fastest is not None and mean > fastest + _ROUNDING_MPS:
         yield (
             "avg_speed, by the positions, is above max_speed of the messages: "
             "one of the two is wrong"
@@ -656,13 +674,13 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
 
 
 def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
-    """Returns the window from a match to where its search began, or to now."""
+    """Returns the window from a match to the end of its search, or to now."""
     stop = until if view.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(stored.time, max(stop, stored.time + 1))
 
 
-class _Sought(NamedTuple):
-    """The condition of a search, and the log time before which its last match is looked for."""
+class _Search(NamedTuple):
+    """A search for the last match of a condition before a log time (ns)."""
 
     topic: str
     condition_type: str
@@ -673,33 +691,32 @@ class _Sought(NamedTuple):
 
 
 def _last_match(
-    view: View, reach: Ns, sought: _Sought, found: Callable[[View, StoredMessage], A]
+    view: View, reach: Ns, search: _Search, show: Callable[[View, StoredMessage], A]
 ) -> A | results.Match:
-    """Returns what `found` makes of the last match in a view that reaches to a time, or older.
+    """Returns what `show` makes of the last match, or that there is none.
 
-    An index of years shows some days at a time. Where these have nothing, those before them are
-    searched, for some seconds in all; the index reports what it has not shown.
+    An index of years shows some days at a time. If these days have no match, the days before are
+    searched, for some seconds in all. The index reports what it has not shown.
+
+    Args:
+        view: shows the days before `reach`.
+        reach: a log time (ns).
+        search: what to find.
+        show: makes an answer of the view and the match.
 
     Raises:
-        NoDataError: none of the days has anything that could be searched.
-        QueryTimeoutError: the call's time is over; reports how far back was searched.
+        NoDataError: no day has anything that could be searched.
+        QueryTimeoutError: the call's time is over; it says how far back was searched.
     """
-    topic, condition_type, value, field, min_score, until = sought
     reading = view.call.partial_after(READING_S)
     missed: results.Match | NoDataError | None = None
     notes: tuple[str, ...] = ()
     while True:
         try:
-            condition = condition_of(
-                view, topic, condition_type, value, field=field, min_score=min_score
-            )
-            search = ReverseSearch(view, topic, condition)
-            if until < MAX_NS:
-                require_recorded(view, TimeWindow(MIN_NS, until))
-            match = search.newest(until)
+            match, notes_on_days = _last_match_in(view, search)
             if match is not None:
-                return found(view, match)
-            notes += _notes_on_never(view, topic, search, until, min_score)
+                return show(view, match)
+            notes += notes_on_days
             missed = results.Match(None, notes=tuple(dict.fromkeys(notes)))
         except NoDataError as error:
             missed = missed or error
@@ -716,27 +733,50 @@ def _last_match(
         view = View(view.memory, view.call, reach)
 
 
-def _notes_on_never(
-    view: View, topic: str, search: ReverseSearch, until: Ns, min_score: float | None
-) -> tuple[str, ...]:
+def _last_match_in(view: View, search: _Search) -> tuple[StoredMessage | None, tuple[str, ...]]:
+    """Returns the last match in the days that a view shows, or the notes on finding none.
+
+    Raises:
+        NoDataError: the days have nothing that could be searched.
+        QueryTimeoutError: the call's time is over.
+    """
+    condition = condition_of(
+        view,
+        search.topic,
+        search.condition_type,
+        search.value,
+        field=search.field,
+        min_score=search.min_score,
+    )
+    reverse_search = ReverseSearch(view, search.topic, condition)
+    if search.until < MAX_NS:
+        require_recorded(view, TimeWindow(MIN_NS, search.until))
+    match = reverse_search.newest(search.until)
+    if match is not None:
+        return match, ()
+    return None, _notes_on_never(view, search, reverse_search)
+
+
+def _notes_on_never(view: View, search: _Search, reverse_search: ReverseSearch) -> tuple[str, ...]:
     """Returns the notes on a search that found nothing; without any the reply is a plain null.
 
-    They are on what was not read, on when recording was interrupted, and on when its topics were
-    silent.
+    They tell what was not read, and when recording was interrupted or topics were silent.
     """
-    window, condition = TimeWindow(MIN_NS, until), search.condition
+    window, condition = TimeWindow(MIN_NS, search.until), reverse_search.condition
+    topics = reverse_search.topics
     notes = (
-        *not_covered(view, search.topics, window),
+        *not_covered(view, topics, window),
         *describe_gaps(view, window, explained=True),
-        *describe_silences(view, search.topics, window),
-        *notes_on_never(view, topic, condition, window, min_score),
+        *describe_silences(view, topics, window),
+        *notes_on_never(view, search.topic, condition, window, search.min_score),
     )
-    is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
-    return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
+    if notes or may_be_elsewhere(view, topics, condition):
+        return (*notes, *compared_frames(view, topics, condition))
+    return ()
 
 
 def _search_end(before_s: float | None) -> Ns:
-    """Returns the end of a search: just after a moment, with the slack of a float of seconds."""
+    """Returns the end of a search (ns), just after a moment: floats of seconds are inexact."""
     if before_s is None:
         return MAX_NS
     return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
@@ -751,32 +791,30 @@ def _newest_at(
     *,
     is_pose: bool = False,
 ) -> StoredMessage:
-    """Returns the newest message of a topic at or before a moment: of any age where it is latched.
+    """Returns the newest message of a topic at or before a moment, within the tolerance (s).
+
+    Without a tolerance given, a latched message may have any age, and a pose of a thinned day holds
+    until the next.
 
     Raises:
-        NoDataError: there is none within the tolerance.
+        NoDataError: there is no such message.
     """
-    latching = view.limits.latching
     window, tolerance = _window_before(view, at, tolerance_s, rest_s)
     stored = view.stream.newest(topic, window)
     if stored is None and tolerance_s is None and is_pose:
-        before = TimeWindow(max(window.stop - _THINNED_POSES_NS, MIN_NS), window.stop)
-        pose = view.stream.newest(topic, before)
-        if pose is not None and is_thinned(pose.bag.file):
-            # A pose of a thinned day holds until the next: farther apart none was recorded.
-            after = TimeWindow(pose.time + 1, pose.time + _THINNED_POSES_NS)
-            stored = pose if view.stream.first([topic], after) is not None else None
+        stored = _thinned_pose(view, topic, window.stop)
     deleted = False
+    latching = view.limits.latching
     if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
         newest = view.stream.last(topic, window.stop)
         if newest is None:
-            tolerance = None
+            tolerance = None  # there is none of any age
         elif latching.holds(view.snapshot, newest):
-            if still_holds(view, newest, at):
-                stored = newest
-            else:
+            deleted = not still_holds(view, newest, at)
+            if deleted:
                 note_unread(view, TimeWindow(newest.time, window.stop), nothing=True)
-                deleted = True
+            else:
+                stored = newest
     if stored is None:
         raise no_data_at(view, (topic,), at, tolerance, deleted=deleted)
     note_robots_near(view, stored)
@@ -784,10 +822,23 @@ def _newest_at(
     return stored
 
 
+def _thinned_pose(view: View, topic: str, stop: Ns) -> StoredMessage | None:
+    """Returns the pose of a thinned day that holds just before a log time (ns).
+
+    It holds until the next pose, which is near unless recording was interrupted.
+    """
+    before = TimeWindow(max(stop - _THINNED_POSES_NS, MIN_NS), stop)
+    pose = view.stream.newest(topic, before)
+    if pose is None or not is_thinned(pose.bag.file):
+        return None
+    after = TimeWindow(pose.time + 1, pose.time + _THINNED_POSES_NS)
+    return pose if view.stream.first([topic], after) is not None else None
+
+
 def _window_before(
     view: View, at: Ns, tolerance_s: float | None, rest_s: float
 ) -> tuple[TimeWindow, Ns | None]:
-    """Returns when a message is near enough before a moment, and the tolerance; None for any."""
+    """Returns the window for a message at a moment, and the tolerance (ns); None for any age."""
     limit = view.limits.time_tolerance_s if tolerance_s is None else tolerance_s
     tolerance: Ns | None = ns_argument("tolerance_s", limit)
     start = at - (tolerance or 0) - START_SLACK_NS
@@ -798,10 +849,12 @@ def _window_before(
 
 
 def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
-    """Checks that a topic of types that are in the schema map can answer, before a time is sought.
+    """Checks, before any message is read, that a topic's types can answer.
+
+    Types that the schema map does not have may answer.
 
     Raises:
-        InvalidArgumentsError: none of its types carries the `what` that is asked for, or another.
+        InvalidArgumentsError: no type has the kind of data `what`, or another one in `or_else`.
     """
     extractor, types = view.extractor, view.timeline.types_of(topic)
     if any(
@@ -817,7 +870,7 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
 def _with_latched_age(
     view: View, value: results.TopicValue, stored: StoredMessage, at: Ns
 ) -> results.TopicValue:
-    """Returns a value with whether it is latched, and then how old it is."""
+    """Returns a value, marked with its age if it is latched."""
     if not still_holds(view, stored, at):
         return value
     age = max(at - stored.time, 0) if value.age is None else value.age
@@ -825,19 +878,16 @@ def _with_latched_age(
 
 
 def _note_latched(view: View, stored: StoredMessage, at: Ns) -> None:
-    """Notes of an answer that does not show its age that it is latched, and how old it is."""
+    """Notes the age of a latched message, for replies that do not show it."""
     if still_holds(view, stored, at):
-        topic = stored.topic
-        view.notes.add(
-            f"{topic} is latched: its value of {seconds(max(at - stored.time, 0))} before is still "
-            "valid"
-        )
+        age = seconds(max(at - stored.time, 0))
+        view.notes.add(f"{stored.topic} is latched: its value of {age} before is still valid")
 
 
 def _decode_shown(
     view: View, stored: StoredMessage, fields: Sequence[str]
 ) -> tuple[object, Extracted]:
-    """Returns a message, and as a reply shows it, with the notes on that message alone."""
+    """Returns a decoded message, and its fields as replies show them."""
     with view.call.stages.timed("extract"):
         message = decode(view, stored)
         return message, view.extractor.shown(message, stored.type, fields)
@@ -846,7 +896,7 @@ def _decode_shown(
 def _as_value(
     view: View, stored: StoredMessage, fields: Sequence[str], now: Ns | None
 ) -> results.TopicValue:
-    """Returns a message as a reply shows it, with all notes of the view so far."""
+    """Returns a message as replies show it, with all notes of the view so far."""
     message, shown = _decode_shown(view, stored, fields)
     return results.TopicValue(
         stored.topic,
@@ -858,8 +908,8 @@ def _as_value(
     )
 
 
-class _Shown(NamedTuple):
-    """A message as a reply shows it, and what is to be noted on it."""
+class _ShownMessage(NamedTuple):
+    """A message as replies show it, with notes on it alone."""
 
     time: Ns
     type_name: str
@@ -867,28 +917,30 @@ class _Shown(NamedTuple):
     notes: tuple[str, ...]
 
 
-def _show_each(
-    view: View, picked: Iterable[StoredMessage], fields: Sequence[str]
-) -> tuple[list[_Shown], Counter[str]]:
-    """Returns messages as a reply shows them, and how often which reason kept one from decoding.
+def _show_messages(
+    view: View, messages: Iterable[StoredMessage], fields: Sequence[str]
+) -> tuple[list[_ShownMessage], Counter[str]]:
+    """Returns messages as replies show them, and how often each error kept one from decoding.
 
-    None is in memory when the next one is read. Those without one of the fields, as of another
-    type, are left out with a note.
+    A message without one of the fields, as of another type, is left out with a note.
 
     Raises:
-        InvalidArgumentsError: none has them.
+        InvalidArgumentsError: no message has the fields.
     """
-    shown: list[_Shown] = []
+    shown: list[_ShownMessage] = []
     failures, lacking = Counter[str](), Counter[str]()
-    for message in picked:
+    for message in messages:
         try:
             _, extracted = _decode_shown(view, message, fields)
-            shown.append(_Shown(message.time, message.type, extracted.value, extracted.notes))
         except NoDataError as error:
             failures[error.detail] += 1
         except InvalidArgumentsError as error:
             lacking[str(error)] += 1
-        del message
+        else:
+            shown.append(
+                _ShownMessage(message.time, message.type, extracted.value, extracted.notes)
+            )
+        del message  # frees it before the next one is read
     for detail, count in lacking.items():
         if not shown:
             raise InvalidArgumentsError(detail)
@@ -901,7 +953,7 @@ def _age(stored: StoredMessage, now: Ns | None) -> Ns | None:
 
 
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
-    """Returns, for topics with odd or misdated bags, the sentences on these."""
+    """Returns the notes on topics with odd bags, or with bags that a wrong clock dated."""
     odd: dict[str, list[BagFile]] = {}
     for bag in snapshot.timeline.faulty(TimeWindow.everything()):
         for topic in _topics_of(bag):
@@ -917,5 +969,5 @@ def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
 
 
 def _topics_of(bag: BagFile) -> frozenset[str]:
-    """Returns the topics that a bag declares; one may be declared under several types."""
+    """Returns the topics that a bag declares, each once, whatever its types."""
     return frozenset(declared.topic for declared in bag.summary.schema.topics)

@@ -1,6 +1,6 @@
-"""One question about several moments, or the same local hours of each day.
+"""One question about several moments, or about the same local hours of each day.
 
-Each is answered as if it were asked alone.
+Each moment or day is answered as if it were the only one.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from dataclasses import replace
 from datetime import datetime, time, timedelta
-from itertools import chain, starmap
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import (
@@ -45,8 +44,8 @@ def at_each(
 ) -> AtEach:
     """Returns the answers for several moments, all from one snapshot of the index.
 
-    Where there is nothing at one of the moments, `NothingAt` takes its place. Where there is
-    nothing at any, for one and the same reason, that is raised as for a single moment.
+    A moment without an answer has `NothingAt` in its place. If all have none for one and the same
+    reason, that error is raised as for a single moment.
     """
     reach = max(ns_argument("timestamps", moment.end_s) for moment in moments)
     fixed = replace(memory, fixed=memory.snapshot(reach))
@@ -58,7 +57,7 @@ def at_each(
         except NoDataError as error:
             at = ns_argument("timestamps", moment.at_s or 0.0)
             answers.append(NothingAt(at, error.reason, error.detail, notes=error.notes))
-            # A traceback has this frame, which has the failures: they would stay for long.
+            # A traceback refers to this frame, and the frame to the failures: break the cycle.
             failures.append(error.with_traceback(None))
     if len(failures) == len(answers) and len({failure.detail for failure in failures}) == 1:
         raise failures.pop(0)
@@ -72,10 +71,10 @@ def in_each(
     between: tuple[time, time],
     ask: Callable[[Memory, TimeRange], OneAnswer],
 ) -> InEach:
-    """Returns the answers for some local hours of each day of a window, in order.
+    """Returns the answers for the same local hours of each day of a window, in order.
 
     The second time may be on the next day. The window ends where the recording does. All answers
-    are of one snapshot of the index.
+    come from one snapshot of the index.
 
     Raises:
         InvalidArgumentsError: the window has too many days, or is around a moment.
@@ -89,35 +88,29 @@ def in_each(
     whole = search_window(span, memory.now(wall, snapshot.latest, call))
     start, end = whole.asked()
     first, last = recorded_reach(snapshot, whole) or (0, -1)
-    # Up to midnight is no part of the next day.
+    # A window up to midnight has nothing of the next day.
     asked = TimeWindow(start, max(end, start + 1)).intersect(TimeWindow(first, last + 1))
     windows = hours_of_days(asked, *between)
+    if not windows:
+        detail = "nothing is recorded between these hours in this window"
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, detail)
     begins = {window.start for window in windows}
     fixed_memory = replace(memory, fixed=snapshot)
     answers: list[InWindow] = []
     notes: tuple[str, ...] = ()
     for window in windows:
-        answer: OneAnswer
+        # A message at the end of these hours counts, unless the next ones begin then.
+        early = START_SLACK_NS if window.stop in begins else 0
+        span_of_day = TimeRange.over(replace(window, stop=window.stop - early))
         try:
-            # Of all hours of a day, what comes as they end is of the next ones.
-            early = START_SLACK_NS if window.stop in begins else 0
-            part = replace(window, stop=window.stop - early)
-            answer = ask(fixed_memory, TimeRange.over(part))
-        except NoDataError as error:
-            if error.reason is NoDataReason.TOPIC_NOT_RECORDED:
-                raise
-            answer = NothingAt(window.start, error.reason, error.detail, notes=error.notes)
+            answers.append(_answer_day(fixed_memory, window, span_of_day, ask))
         except QueryTimeoutError:
             if not answers:
                 raise
             days_left = counted(len(windows) - len(answers), "day is", "days are")
             notes = (f"out of time: the last {days_left} left out; ask about a shorter window",)
             break
-        answers.append(InWindow(window.start, window.stop, answer))
     nothing = [day.answer for day in answers if isinstance(day.answer, NothingAt)]
-    if not answers:
-        detail = "nothing is recorded between these hours in this window"
-        raise NoDataError(NoDataReason.OUTSIDE_RANGE, detail)
     if len(nothing) == len(answers):
         newest = nothing[-1]
         detail = f"none between these hours on any day; on the last {newest.detail}"
@@ -125,11 +118,32 @@ def in_each(
     return InEach(tuple(answers), is_all=len(answers) == len(windows), notes=notes)
 
 
-def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWindow]:
-    """Returns what lies between two local times of day in a window, in order.
+def _answer_day(
+    memory: Memory,
+    window: TimeWindow,
+    span: TimeRange,
+    ask: Callable[[Memory, TimeRange], OneAnswer],
+) -> InWindow:
+    """Returns the answer for the hours of one day, which may be that there is nothing.
 
     Raises:
-        InvalidArgumentsError: it has too many days.
+        NoDataError: the topic is not recorded on any day.
+    """
+    answer: OneAnswer
+    try:
+        answer = ask(memory, span)
+    except NoDataError as error:
+        if error.reason is NoDataReason.TOPIC_NOT_RECORDED:
+            raise
+        answer = NothingAt(window.start, error.reason, error.detail, notes=error.notes)
+    return InWindow(window.start, window.stop, answer)
+
+
+def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWindow]:
+    """Returns the parts of a window between two local times of day, in order.
+
+    Raises:
+        InvalidArgumentsError: the window has too many days.
     """
     if window.empty:
         return []
@@ -141,19 +155,22 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
         raise InvalidArgumentsError(
             f"between takes at most {MOST_WINDOWS} days: ask about a shorter window, or by hour"
         )
-    over = timedelta(days=ends <= begins)
-    # The hours of the day before may go on after midnight.
-    days = [first + timedelta(days=nth) for nth in range(-1, (last - first).days + 1)]
-    bounds = ((datetime.combine(day, begins), datetime.combine(day + over, ends)) for day in days)
-    times = chain.from_iterable(starmap(_times_between, bounds))
-    hours = (window.intersect(TimeWindow(*span)) for span in times)
-    # All hours of a day that begin in an hour that clocks repeat are in two parts, and so are those
-    # of the day before: one of these lies between them.
-    return sorted((part for part in hours if not part.empty), key=lambda part: part.start)
+    nights = timedelta(days=1 if ends <= begins else 0)
+    parts = []
+    # From the day before: its hours may go on after midnight.
+    for nth in range(-1, (last - first).days + 1):
+        day = first + timedelta(days=nth)
+        begin, end = datetime.combine(day, begins), datetime.combine(day + nights, ends)
+        for span in _times_between(begin, end):
+            part = window.intersect(TimeWindow(*span))
+            if not part.empty:
+                parts.append(part)
+    # Where clocks go back, two parts of one day have a part of the other day between them.
+    return sorted(parts, key=lambda part: part.start)
 
 
 def _times_between(begin: datetime, end: datetime) -> list[Span]:
-    """Returns when it is between two local times: twice where clocks that go back repeat one."""
+    """Returns the times (ns) between two local times. Where clocks go back, there may be two."""
     (first, again), (stop, stop_again) = _moments(begin), _moments(end)
     if (first, stop) == (again, stop_again):
         return [(first, stop)]
@@ -162,14 +179,20 @@ def _times_between(begin: datetime, end: datetime) -> list[Span]:
 
 
 def _moments(local: datetime) -> Span:
-    """Returns when it is a local time first and last; for one that clocks skip, when they do."""
+    """Returns the first and the last moment (ns) with a local time.
+
+    A local time that clocks skip has the moment of the change.
+    """
     first, last = (ns_from_unix(local.replace(fold=fold).timestamp()) for fold in (0, 1))
-    # By the time before clocks are put forward, what is skipped is later than by that after.
-    return (first, last) if first <= last else (_change_between(last, first),) * 2
+    if first <= last:
+        return first, last
+    # Clocks skip it: by the old offset the moment is later than by the new one.
+    change = _change_between(last, first)
+    return change, change
 
 
 def _change_between(before: Ns, after: Ns) -> Ns:
-    """Returns when clocks are put forward or back between two moments, to a second."""
+    """Returns when clocks change between two moments (ns), to a second."""
     seconds = range(before // NS_PER_S, after // NS_PER_S)
     offset = local_offset(seconds.start)
     passed_s = bisect_left(seconds, True, key=lambda at: local_offset(at) != offset)

@@ -109,7 +109,7 @@ class ChangesBefore:
         self.events = events
 
     def after(self, at: Ns, length: Ns, *, slack: Ns = 0) -> tuple[PastChange, ...]:
-        """Returns the changes in the time (ns) after a moment, nearest first, with negative `before`.
+        """Returns the changes in the time (ns) after a moment, nearest first; `before` is negative.
 
         A change up to `slack` after the moment is left out: it counts as before.
         """
@@ -122,8 +122,8 @@ class ChangesBefore:
     ) -> tuple[PastChange, ...]:
         """Returns the changes in the time (ns) before a moment, nearest first.
 
-        A change up to `slack` after the moment counts as at the moment. Sentences that begin with
-        `without` are left out: those of the boolean that toggle_sentence then.
+        A change up to `slack` after the moment counts as at the moment. `without` is how sentences
+        begin that are left out: those of the boolean that toggled then.
         """
         changes = {}
         begin = bisect_left(self._changes, (at - length - self._longest,))
@@ -142,7 +142,7 @@ def is_routine(change: PastChange) -> bool:
 
 
 def topics_with_changes(view: View) -> list[str]:
-    """Returns the topics on which changes may show: topics with events, and the topic of commands."""
+    """Returns the topics on which changes may show: those with events, and that of commands."""
     timeline, command = view.timeline, _command_topic(view)
     return [
         topic

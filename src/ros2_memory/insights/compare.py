@@ -39,7 +39,7 @@ from ros2_memory.history.coverage import (
 from ros2_memory.history.driven_path import length_notes, resolve_path_topic
 from ros2_memory.history.view import View, clamped, open_view
 from ros2_memory.insights.drive import Drive, drive_in
-from ros2_memory.insights.recap import found_events
+from ros2_memory.insights.recap import events_by_topic
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.pose_frames import (
     MapPlacement,
@@ -507,7 +507,7 @@ def _minutes_in_places(
 def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns how often each error was reported, by its text."""
     counts: dict[str, float] = defaultdict(float)
-    for events in found_events(view, window, has_errors).values():
+    for events in events_by_topic(view, window, has_errors).values():
         for error in () if events is None else events.errors:
             counts[Quoted(error.text)] += error.reports
     return counts

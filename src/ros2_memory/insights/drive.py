@@ -112,7 +112,7 @@ class Drive:
 
         - No pose has a valid position.
         - Poses are too far apart to show standstills.
-        - Poses are missing for much of the recorded time: some robots publish none while they stand.
+        - Poses are missing for much of the recorded time: some robots have none while they stand.
         - The robot neither moved nor stood for most of the time: noise hides where it stood.
         """
         stood = self.elapsed.among(

@@ -1,7 +1,8 @@
-"""Episodes: what a robot did, as texts that hold until the next one; an empty text ends them.
+"""Episodes: what a robot did, as texts that hold until the next text.
 
-Any topic of plain texts counts (`std_msgs/msg/String`) among whose newest values is an empty one.
-An episode belongs to a window, or to a scope, by whether it held in it, or when it began.
+A topic of plain texts (`std_msgs/msg/String`) says episodes if one of its newest values is an empty
+text, which ends the episode before. An episode belongs to a window if it held in it, and to a scope
+if the scope held when it began.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 from itertools import islice, takewhile
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import shortened
@@ -32,23 +33,37 @@ if TYPE_CHECKING:
     from ros2_memory.places.where import Scope
 
 _MOST_LOOKED_AT: Final = 50
-"""Of the newest values of a topic so many are looked at for an empty text."""
+"""The newest values of a topic that are looked at for an empty text."""
 _LONGEST_STATE: Final = 10_000
-"""No text that says what a robot does is longer (characters)."""
+"""A longer text (characters) does not say what a robot does."""
 _LONGEST_TEXT: Final = 200
 MOST_COUNTED: Final = 20_000
 """Episodes that are counted over time."""
 
 
+class FoundEpisodes(NamedTuple):
+    """Episodes that a search found.
+
+    Attributes:
+        episodes: the newest ones, newest first, or the oldest, oldest first.
+        total: how many there are; None if the search ended before it counted all.
+        since: the log time (ns) since when all was searched; None for all of the window.
+    """
+
+    episodes: list[Episode]
+    total: int | None
+    since: Ns | None
+
+
 def says_episodes(view: View, topics: Sequence[str]) -> bool:
-    """Returns whether these are one topic of texts that an empty one ends.
+    """Returns whether topics are one topic of texts that an empty text ends.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
     if len(topics) != 1 or not is_text(view, topics[0]):
         return False
-    # With notes of its own: what cannot be read there may lie outside of the window.
+    # A view of its own: its notes are of values that may lie outside of the window.
     values = HeldValues(View(view.memory, view.call), topics[0])
     newest = takewhile(lambda held: len(held.word) <= _LONGEST_STATE, values.back(MAX_NS))
     try:
@@ -56,7 +71,7 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
     except QueryTimeoutError:
         if view.call.deadline.expired():
             raise
-        # What can be found without them is.
+        # Messages can still be found one by one.
         view.notes.add_lack(
             f"out of time before it was known whether an empty text ends those on {topics[0]}: "
             "each message counts alone, and may have held for longer than duration_s"
@@ -66,11 +81,8 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
 
 def find_episodes(
     view: View, topic: str, condition: Condition, scope: Scope, *, limit: int, oldest_first: bool
-) -> tuple[list[Episode], int | None, Ns | None]:
-    """Returns the newest episodes whose text meets a condition, newest first, or the oldest.
-
-    With them how many there are, None where the search ended before it had counted all; and since
-    when all was searched, None where all of the window was.
+) -> FoundEpisodes:
+    """Returns the newest episodes whose text meets a condition, or the oldest.
 
     Raises:
         InvalidArgumentsError: no text can meet the condition.
@@ -78,6 +90,7 @@ def find_episodes(
     """
     search = ReverseSearch(view, topic, condition)
     values = HeldValues(view, topic)
+    # One more than asked for shows that there are more.
     episodes: deque[Episode] = deque(maxlen=limit if oldest_first else limit + 1)
     total, since = 0, None
     try:
@@ -85,7 +98,7 @@ def find_episodes(
             episodes.append(episode)
             total += 1
             if total > limit and not oldest_first:
-                since = episodes[-2].first
+                since = episodes[limit - 1].first
                 break
     except QueryTimeoutError as error:
         if values.reached >= scope.window.stop:
@@ -99,54 +112,54 @@ def find_episodes(
     if not episodes:
         search.require_testable()
     chosen = [*reversed(episodes)] if oldest_first else [*episodes][:limit]
-    return chosen, total if since is None else None, since
+    return FoundEpisodes(chosen, total if since is None else None, since)
 
 
 def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -> Iterator[Episode]:
     """Yields the episodes of a scope that meet a condition, newest first.
 
-    Each waits until the text before it is known: when the last one comes, all was searched.
+    An episode waits until the text before it is known, or until that cannot be read in time.
     """
     start, _ = scope.window.asked()
-    pending: Episode | None = None
+    waiting: Episode | None = None
     newer: Held | None = None
-    named = (held for held in values.back(scope.window.stop) if not held.is_blank)
+    texts = (held for held in values.back(scope.window.stop) if not held.is_blank)
     while True:
         try:
-            held = next(named, None)
+            held = next(texts, None)
         except QueryTimeoutError:
-            if pending is not None:
-                yield pending
+            if waiting is not None:
+                yield waiting
             raise
-        if pending is not None:
-            yield pending if held is None else replace(pending, previous=spell_of(held))
-            pending = None
+        if waiting is not None:
+            yield waiting if held is None else replace(waiting, previous=spell_of(held))
+            waiting = None
         if held is None or held.stop <= start:
             return
         if condition.matches({"value": held.exact}) and scope.holds_at(held.start):
             following = newer or values.named_after(held.stop)
             after = None if following is None else spell_of(following)
-            pending = Episode(spell_of(held), None, after)
+            waiting = Episode(spell_of(held), None, after)
         newer = held
 
 
 def spell_of(held: Held) -> Spell:
-    """Returns a value that held as replies show it."""
+    """Returns a value that held, as replies show it."""
     value = held.value
     shown = shortened(value, _LONGEST_TEXT) if isinstance(value, str) else value
     return Spell(shown, held.start, held.stop, held.ended)
 
 
 def with_robot(view: View, topic: str, episode: Episode, frame_id: str | None) -> Episode:
-    """Returns an episode with where the robot was when it began."""
+    """Returns an episode with the robot's pose when it began."""
     recording = recording_at(view, topic, episode.first)
     if recording is None:
         return episode
     return replace(episode, robot=robot_at(view, episode.first, recording, frame_id))
 
 
-class SaidMeanwhile:
-    """What another topic said during intervals.
+class MeanwhileReader:
+    """Reads the values that another topic held during intervals.
 
     Raises:
         InvalidArgumentsError: its messages have more than one value.
@@ -160,17 +173,18 @@ class SaidMeanwhile:
         self._is_over = False
 
     def during(self, first: Ns, until: Ns) -> tuple[Spell, ...] | None:
-        """Returns the values that held at some time of an interval; None where time is over."""
-        if not self._is_over:
-            try:
-                held = self._values.during(first, max(until, first + 1))
-                return tuple(spell_of(value) for value in held if not value.is_blank)
-            except QueryTimeoutError as error:
-                self._is_over = True
-                self._view.notes.add_lack(
-                    f"what {self._topic} said was not read for all of them: {error}"
-                )
-        return None
+        """Returns the values that held at some time of an interval; None if time is over."""
+        if self._is_over:
+            return None
+        try:
+            values = self._values.during(first, max(until, first + 1))
+        except QueryTimeoutError as error:
+            self._is_over = True
+            self._view.notes.add_lack(
+                f"what {self._topic} said was not read for all of them: {error}"
+            )
+            return None
+        return tuple(spell_of(held) for held in values if not held.is_blank)
 
 
 def topic_changes(
@@ -182,12 +196,12 @@ def topic_changes(
     max_samples: int = 100,
     fields: Sequence[str] = (),
 ) -> Changes:
-    """Returns the values that a topic held in a window, in order; texts that are empty end others.
+    """Returns the values that a topic held in a window, in order; an empty text only ends one.
 
     Raises:
         InvalidArgumentsError: more than one field is named, or there is no single value.
         NoDataError: there is no such topic, or it said nothing in the window.
-        QueryTimeoutError: the call's time is over before any was found.
+        QueryTimeoutError: the call's time is over before any value was found.
     """
     if len(fields) > 1:
         raise InvalidArgumentsError("changes are of one field: name one in fields")

@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.stored_message import StoredMessage
 
 MAX_FIELDS: Final = 100
 MAX_MESSAGES: Final = 4_000
-"""How many one question reads where columns do not hold a field: minutes of odometry, an hour of a
+"""How many messages a question reads if columns lack a field: minutes of odometry, an hour of a
 slow topic."""
 
 TOO_MANY: Final = "the window has too many messages to compute extremes: ask for a shorter one"
@@ -35,21 +36,18 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         NoDataError: no topic was recorded under the type, or none of its messages can be decoded.
     """
     view = open_view(memory, call, memory.clock.now())
-    timeline = view.timeline
-    topics = [topic for topic, types in timeline.types.items() if type_name in types]
+    types = view.timeline.types
+    topics = [topic for topic, types_of_topic in types.items() if type_name in types_of_topic]
     if not topics:
-        recorded = sorted(set(chain.from_iterable(timeline.types.values())))
+        recorded = sorted(set(chain.from_iterable(types.values())))
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
             "no topic was recorded under this type; there are "
             f"{listed(recorded, at_most=MAX_FIELDS)}",
         )
-    failure = ""
+    failure = "none is left"
     for topic in topics:
-        # A topic may have changed its type since.
-        last = timeline.totals(topic)[type_name].last
-        messages = view.stream.messages([topic], TimeWindow.until(last), newest_first=True)
-        newest = next((stored for stored in messages if stored.type == type_name), None)
+        newest = _newest_of_type(view, topic, type_name)
         if newest is None:
             continue
         try:
@@ -57,20 +55,25 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         except UndecodableError as error:
             failure = error.reason
             continue
-        value = memory.extractor.exact(message, type_name)
-        fields = dict(fields_of(value))
+        fields = dict(fields_of(memory.extractor.exact(message, type_name)))
         if len(fields) > MAX_FIELDS:
             view.notes.add(f"{MAX_FIELDS} of {len(fields)} fields")
         shown = tuple(fields.items())[:MAX_FIELDS]
         return TypeFields(type_name, tuple(topics), shown, notes=view.notes.sentences())
     raise NoDataError(
-        NoDataReason.UNDECODABLE,
-        f"no newest message of this type can be read: {failure or 'none is left'}",
+        NoDataReason.UNDECODABLE, f"no newest message of this type can be read: {failure}"
     )
 
 
+def _newest_of_type(view: View, topic: str, type_name: str) -> StoredMessage | None:
+    """Returns a topic's newest message of a type: the topic may have changed its type since."""
+    last = view.timeline.totals(topic)[type_name].last
+    messages = view.stream.messages([topic], TimeWindow.until(last), newest_first=True)
+    return next((stored for stored in messages if stored.type == type_name), None)
+
+
 def fields_of(value: JsonValue, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yields dot-paths and the kinds of their values; a list is described by its first element."""
+    """Yields dot-paths and the kinds of their values; a list has its first element's fields."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from fields_of(inner, dotted(path, name))
@@ -94,22 +97,16 @@ def _kind(value: JsonValue) -> str:
 def extremes_of(
     view: View, topic: str, window: TimeWindow, fields: Sequence[str]
 ) -> tuple[Extremes, ...]:
-    """Returns the extremes of each of the fields (dot-paths) that holds numbers.
+    """Returns the extremes of each field (dot-path) of a topic that holds numbers.
 
-    None, with a note, where more than `MAX_MESSAGES` would have to be read from bags. Messages that
-    cannot be decoded do not count, nor do NaN and infinities.
-
-    Args:
-        view: the call's.
-        topic: its name.
-        window: of log time.
-        fields: dot-paths.
+    Messages that cannot be decoded do not count, nor do NaN and infinities. If more than
+    `MAX_MESSAGES` would have to be read from bags, there are no extremes, and a note says so.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
     names = tuple(dict.fromkeys(fields))
-    whole = np.empty(0, np.int64)
+    whole = np.empty(0, np.int64)  # no bounds between bins
     piece_numbers = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES)
     try:
         piece_numbers.collect(window)

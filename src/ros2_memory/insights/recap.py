@@ -1,8 +1,8 @@
 """A recap of a window, from the data alone: a few sentences, each with its time.
 
-The robot stood, things came into view and left it, booleans toggle_sentence, errors were reported, and
-nothing was recorded. Where there are more events than a planner wants to read, the least important
-are left out, and counted.
+The robot stood, things came into view and left it, booleans toggled, errors were reported, and
+nothing was recorded. If there are more events than a planner wants to read, the least important are
+left out, and counted.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from bisect import bisect_left
 from collections import Counter
 from dataclasses import replace
 from heapq import nsmallest
+from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import FLAG, has_events
@@ -45,7 +46,7 @@ from ros2_memory.insights.changes_before import (
     recap_before,
 )
 from ros2_memory.insights.drive import Drive, Stop, drive_in
-from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
+from ros2_memory.insights.silences import group_silences, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import (
     FAILURES,
     GoalRun,
@@ -71,11 +72,11 @@ if TYPE_CHECKING:
 MOST_EVENTS: Final = 25
 
 _MOST_CHANGES: Final = 3
-"""Changes that are listed before an event, the nearest."""
+"""The nearest changes before an event that a recap lists."""
 _MOST_CHARS: Final = 1_200
-"""Characters of changes before all events of a recap: a recap with `around` has them all."""
+"""Characters of all changes in a recap. With `around` it has all of them."""
 _CHANGE_CHARS: Final = 30
-"""What the reply adds to a change's text."""
+"""Characters that the reply adds to a change's text."""
 
 _PLURALS: Final = {
     "gap": "gaps",
@@ -92,7 +93,7 @@ _PLURALS: Final = {
 """The kinds of events, the most important first, and the words for several of each."""
 _KINDS: Final = tuple(_PLURALS)
 _OF_ROBOT: Final = frozenset({"error", "stop", "flip", "drop"})
-"""The kinds of which matters in which place the robot was."""
+"""The kinds of events that name the place where the robot was."""
 
 
 def recap_or_before(
@@ -104,14 +105,17 @@ def recap_or_before(
     frame_id: str | None = None,
     min_score: float | None = None,
 ) -> Recap | Before:
-    """Returns what happened in a window, or what changed before a moment; see both.
+    """Returns what happened in a window, or what changed before a moment.
+
+    See `recap` and `recap_before`.
 
     Raises:
         InvalidArgumentsError: the window and the moment are given in more than one form, or the
             moment with `where`.
     """
     is_bounded = span.start_s is not None or span.end_s is not None
-    if is_bounded + (span.last_s is not None) + (span.around_s is not None) > 1:
+    forms = [is_bounded, span.last_s is not None, span.around_s is not None]
+    if forms.count(True) > 1:
         raise InvalidArgumentsError("last_s, around, or start and end: give one of the three")
     if span.around_s is None:
         return recap(memory, call, span, where=where, frame_id=frame_id, min_score=min_score)
@@ -133,9 +137,10 @@ def recap(
 ) -> Recap:
     """Returns what happened in a window; with `where` only while the robot was in that region.
 
-    Places are in the map where transforms lead there at their time, or in `frame_id`. Things in
-    view count where their best score is `min_score` or more, or where they have none. Of more than
-    `most_events` the most important are returned, `with_changes` with what changed before them.
+    Places are in the map if transforms lead there at their time, or in `frame_id`. Things in view
+    count with a best score of `min_score` or more, or without scores. If there are more than
+    `most_events`, the most important ones are returned. With `with_changes` they have what changed
+    before them.
 
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, `where`
@@ -149,24 +154,17 @@ def recap(
     start, end = window.asked()
     places = robot_places(view, window, frame_id)
     drive = drive_in(view, window)
-    elapsed = drive.elapsed
     region_stays = None
     if region is not None:
         stays = known_track_for(view, region, window).inside(region.region, window)
-        region_stays = _RegionStays(stays, elapsed)
-    events_of_topics = found_events(view, window)
+        region_stays = _RegionStays(stays, drive.elapsed)
+    events_of_topics = events_by_topic(view, window)
     least = memory.limits.min_score if min_score is None else min_score
     reported = _reported_events(view, window, events_of_topics, region_stays)
     things = _things_in_view(
         view, window, events_of_topics, region_stays, min_score=least, most=most_events
     )
-    stops = drive.stops(end - start)
-    if region_stays is not None:
-        stops = tuple(
-            stop
-            for stop in stops
-            if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
-        )
+    stops = _stops_inside(drive.stops(end - start), region_stays)
     longest = nsmallest(most_events, stops, key=lambda stop: -stop.length)
     events = [
         *_stop_events(longest, places),
@@ -175,42 +173,33 @@ def recap(
         *_recording_events(view, window, drive),
     ]
     goals = goals_in(view, window, events_of_topics)
-    events += [_goal_event(goal, start, elapsed) for goal in goals]
+    events += [_goal_event(goal, start, drive.elapsed) for goal in goals]
     if region_stays is not None:
-        events = [event for event in events if region_stays.has(event)]
+        events = [event for event in events if region_stays.contains(event)]
     note_unread(view, window)
     note_edges(view, window)
     _note_foxglove_logs(view, window)
     counts = Counter(event.kind for event in events)
-    counts |= Counter(thing=things.total, stop=len(stops))
+    counts["thing"], counts["stop"] = things.total, len(stops)
     shown = _most_important(view, events, counts, most_events)
     if with_changes:
         shown = _with_changes(changes_in(view, window, events_of_topics), shown)
-    shown = [
-        replace(event, skipped=elapsed.skipped_between(event.start, event.end or event.start))
-        for event in shown
-    ]
+    shown = [_with_skipped_time(event, drive.elapsed) for event in shown]
     if places is not None:
         shown = [_with_place_names(event, places) for event in shown]
-    stood = drive.stood(end - start)
-    if stood is None and drive.valid_trajectory is not None:
-        view.notes.add(
-            "positions are too noisy, too few or missing for too long to detect standstills: "
-            "stood_s is null"
-        )
     answer = Recap(
         start=start,
         end=end,
         now=memory.now(memory.clock.now(), view.snapshot.latest, view.call),
         distance_m=None,
         max_speed=None,
-        stood=stood,
+        stood=_standing_time(view, drive, end - start),
         shortest_stop=SHORTEST_NS,
         frame_id=None if drive.path is None or places is None else places.frame_id,
         events=tuple(shown),
         throughout=tuple(sorted(things.throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
-        skipped=elapsed.skipped_between(start, end),
+        skipped=drive.elapsed.skipped_between(start, end),
     )
     if region_stays is None or region is None:
         answer = _with_path(view, answer, drive)
@@ -220,17 +209,33 @@ def recap(
     return replace(answer, notes=view.notes.sentences())
 
 
+def _standing_time(view: View, drive: Drive, length: Ns) -> Ns | None:
+    """Returns how long the robot stood in a window of a length (ns); if unknown, a note says so."""
+    stood = drive.stood(length)
+    if stood is None and drive.valid_trajectory is not None:
+        view.notes.add(
+            "positions are too noisy, too few or missing for too long to detect standstills: "
+            "stood_s is null"
+        )
+    return stood
+
+
+def _with_skipped_time(event: Event, elapsed: Elapsed) -> Event:
+    end = event.start if event.end is None else event.end
+    return replace(event, skipped=elapsed.skipped_between(event.start, end))
+
+
 def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
-    """Notes the logs whose errors are no events: those that ROS writes alone are read for them."""
+    """Notes the logs of Foxglove's type: their errors are no events, those of ROS logs are."""
     timeline = view.timeline
     for topic in timeline.topics():
         types = timeline.types_of(topic)
         if FOXGLOVE_LOGS.isdisjoint(types):
             continue
         foxglove_types = FOXGLOVE_LOGS & {
-            held.type
+            part.type
             for extent in timeline.extents(topic, window)
-            for held in extent.bag.summary.of(topic)
+            for part in extent.bag.summary.of(topic)
         }
         if foxglove_types:
             # Where the topic has two types, its levels have no names; no log of ROS has a 4.
@@ -245,40 +250,48 @@ def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
 
 
 class _RegionStays:
-    """The stays of robots in a region, and the times of all together (half-open), in order."""
+    """The stays of robots in a region.
 
-    def __init__(self, spans: Sequence[Stay], elapsed: Elapsed) -> None:
-        self.spans = spans
-        self.times = united_spans((stay.start, stay.stop + 1) for stay in spans)
+    Attributes:
+        times: the times of all stays together (half-open), in order.
+    """
+
+    def __init__(self, stays: Sequence[Stay], elapsed: Elapsed) -> None:
+        self.stays = stays
+        self.times = united_spans((stay.start, stay.stop + 1) for stay in stays)
         self._elapsed = elapsed
 
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
-        """Returns whether some of a time, or a moment, is among them."""
+        """Returns whether a stay overlaps a time (inclusive), or a moment."""
         last = start if end is None else end
         return overlaps_any(self.times, start, last)
 
-    def has(self, event: Event) -> bool:
-        """Returns whether an event happened then; how long a boolean held is of no matter."""
+    def contains(self, event: Event) -> bool:
+        """Returns whether an event happened during a stay. A boolean toggles at one moment."""
         end = None if event.kind == "flip" else event.end
         return event.kind != "gap" and self.overlaps(event.start, end)
 
-    def covers(self, start: Ns, end: Ns) -> bool:
-        """Returns whether a time is in one of them as a whole, or in none at all."""
-        inside = any(stay.start <= start and end <= stay.stop for stay in self.spans)
-        return inside or not self.overlaps(start, end)
+    def is_cut_by(self, start: Ns, end: Ns) -> bool:
+        """Returns whether one part of a time (inclusive) is in the stays, and another is not."""
+        is_inside = any(stay.start <= start and end <= stay.stop for stay in self.stays)
+        return not is_inside and self.overlaps(start, end)
 
-    def length_of(self, standstills: Iterable[Stop]) -> Ns:
-        """Returns how long the robot stood in them."""
-        return self._elapsed.among(
-            (max(stood.start, stay.start), min(stood.end, stay.stop))
-            for stood, _ in standstills
-            for stay in self.spans
-            if stood.start < stay.stop and stay.start < stood.end
-        )
+    def standing_time(self, standstills: Iterable[Stop]) -> Ns:
+        """Returns how long (ns) the robot stood during the stays."""
+        spans = []
+        for stop in standstills:
+            for stay in self.stays:
+                start = max(stop.standstill.start, stay.start)
+                end = min(stop.standstill.end, stay.stop)
+                if start < end:
+                    spans.append((start, end))
+        return self._elapsed.among(spans)
 
 
 def _with_path(view: View, answer: Recap, drive: Drive) -> Recap:
-    view.notes.add(*() if drive.trajectory is None else length_notes(drive.trajectory))
+    """Returns a recap with the length and the greatest speed of the path."""
+    if drive.trajectory is not None:
+        view.notes.add(*length_notes(drive.trajectory))
     trajectory = drive.valid_trajectory
     if trajectory is None:
         return answer
@@ -293,21 +306,21 @@ def _with_path(view: View, answer: Recap, drive: Drive) -> Recap:
 
 def _with_path_in_region(answer: Recap, drive: Drive, region_stays: _RegionStays) -> Recap:
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
-    path, driven = drive.path, None
+    path, driven, stays = drive.path, None, region_stays.stays
     if path is not None and path.poses:
-        driven = totals_inside(path.line, region_stays.spans)
+        driven = totals_inside(path.line, stays)
     return replace(
         answer,
         distance_m=None if driven is None else driven.distance_m,
         max_speed=None if driven is None else driven.max_speed,
-        stood=None if answer.stood is None else region_stays.length_of(drive.standstills),
-        visits=len(region_stays.spans),
-        inside=drive.elapsed.among(stay[:2] for stay in region_stays.spans),
+        stood=None if answer.stood is None else region_stays.standing_time(drive.standstills),
+        visits=len(stays),
+        inside=drive.elapsed.among((stay.start, stay.stop) for stay in stays),
     )
 
 
 def _with_place_names(event: Event, places: RobotPlaces) -> Event:
-    """Returns an event with the names of the places in which the robot was then."""
+    """Returns an event with the names of the places where the robot was then."""
     if event.kind not in _OF_ROBOT:
         return event
     at = event.start
@@ -316,10 +329,13 @@ def _with_place_names(event: Event, places: RobotPlaces) -> Event:
     return replace(event, places=places.names_at(at))
 
 
-def found_events(
+def events_by_topic(
     view: View, window: TimeWindow, can_have: Callable[[str], bool] = has_events
 ) -> dict[str, TopicEvents | None]:
-    """Returns the events of each topic whose type can have them; None where it has no message."""
+    """Returns the events of each topic whose type can have them; None for no message.
+
+    `can_have` tells that of a type's name.
+    """
     timeline = view.timeline
     return {
         topic: events_in(view, topic, window)
@@ -334,36 +350,43 @@ def _reported_events(
     events_of_topics: Mapping[str, TopicEvents | None],
     region_stays: _RegionStays | None,
 ) -> list[Event]:
-    """Returns the toggles and errors that messages report; notes say what is left out of them."""
+    """Returns the toggles and errors that messages report. Notes say how many are left out."""
     events: list[Event] = []
     for topic, topic_events in events_of_topics.items():
         if topic_events is None:
             continue
         toggles = _toggles(view, topic, topic_events)
-        if toggles and is_latched(view, topic):  # what it said holds through gaps
+        if toggles and is_latched(view, topic):  # a latched value holds through gaps
             events += _flip_events(topic, toggles, breaks_of(view, topic))
         elif toggles:
             unrecorded = unrecorded_times(view, topic, TimeWindow(*window.asked()))
             events += _flip_events(topic, toggles, [begin for begin, _ in unrecorded])
-        events += map(_error_event, _errors_in_region(view, topic, topic_events, region_stays))
+        errors = _errors_in_region(view, topic, topic_events, region_stays)
+        events += [_error_event(error) for error in errors]
         note_limits(view, topic, topic_events)
     return events
 
 
 def _toggles(view: View, topic: str, events: TopicEvents) -> list[Change]:
-    """Returns when booleans of a topic toggle_sentence, also with the first message of a window."""
+    """Returns when booleans of a topic toggled, also from before a window to its first message."""
     flags, toggles = events.of_kind(FLAG)
     before = flags_before(view, topic, events.first) if flags else {}
     first = [
         Change(FLAG, flag.name, flag.at, flag.first)
         for flag in flags
-        if before.get(flag.name) is (not flag.first)
+        if flag.name in before and before[flag.name] != bool(flag.first)
     ]
     return [*first, *toggles]
 
 
 class _ThingsInView(NamedTuple):
-    """Things that came into view or left it, how many, and the labels seen throughout a window."""
+    """Things that came into view or left it.
+
+    Attributes:
+        events: those that were seen longest.
+        total: how many there are.
+        throughout: the labels that were seen throughout the window.
+    """
 
     events: list[Event]
     total: int
@@ -379,34 +402,34 @@ def _things_in_view(
     min_score: float,
     most: int,
 ) -> _ThingsInView:
-    """Returns the things that were seen; only the `most` that were seen longest are its events.
+    """Returns the things that were seen, with events of at most `most`.
 
-    In a region nothing counts as seen throughout. A note says how many have too low a score.
+    In a region nothing counts as seen throughout. A note says how many scores are too low.
     """
     start, end = window.asked()
     newest = view.snapshot.latest
     known_to = window.stop if newest is None else min(window.stop, newest)
-    visible: list[IntervalTable] = []
+    tables: list[IntervalTable] = []
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
     below = 0
     for topic_events in filter(None, events_of_topics.values()):
-        seen = topic_events.visible.scoring(min_score) if min_score else topic_events.visible
-        below += topic_events.visible.size - seen.size
-        visible.append(seen)
-        throughout.update(seen.throughout(start, end))
-        for label in seen.at_end(topic_events.last, known_to):
+        visible = topic_events.visible.scoring(min_score) if min_score else topic_events.visible
+        below += topic_events.visible.size - visible.size
+        tables.append(visible)
+        throughout.update(visible.throughout(start, end))
+        for label in visible.at_end(topic_events.last, known_to):
             last_seen[label] = max(topic_events.last, last_seen.get(label, topic_events.last))
     if below:
         view.notes.add(
             f"{counted(below, 'sighting')} left out: no score in it reaches min_score {min_score:g}"
         )
-    things = united(visible)
+    things = united(tables)
     if region_stays is None:
         things = things.without(throughout)
     else:
         throughout = set()
-        things = things.during([stay[:2] for stay in region_stays.spans])
+        things = things.during([(stay.start, stay.stop) for stay in region_stays.stays])
     events = [
         Event(
             "thing",
@@ -422,7 +445,7 @@ def _things_in_view(
 
 
 def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[Event]:
-    """Yields losses of speed, and when nothing was recorded, clocks were set or topics silent."""
+    """Yields sudden losses of speed, gaps in the recording, steps of the clock, and silences."""
     for time, before_mps, after_mps in drive.drops:
         text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
         yield Event("drop", time, None, text)
@@ -431,7 +454,7 @@ def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[
     for at, by in clock_steps(view, window):
         how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"
         yield Event("clock step", at, None, f"the clock was set {how}")
-    for group in grouped(silences_in(view, window)):
+    for group in group_silences(silences_in(view, window)):
         topics, first = listed([silence.topic for silence in group]), group[0]
         text = f"{topics} {'was' if len(group) == 1 else 'were'} silent"
         yield Event("silence", first.start, first.end, text, goes_on=first.goes_on)
@@ -446,28 +469,42 @@ def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted"
 
 
+def _stops_inside(stops: Sequence[Stop], region_stays: _RegionStays | None) -> Sequence[Stop]:
+    """Returns the stops that overlap a stay in the region; all without a region."""
+    if region_stays is None:
+        return stops
+    return [
+        stop for stop in stops if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
+    ]
+
+
 def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[Event]:
-    for (start, end, box), goes_on in stops:
-        (x, y, _), frame = box.centre, ""
+    """Yields stops with the point where the robot stood, in the frame of places if it is known."""
+    for stop in stops:
+        start, end, box = stop.standstill
+        x, y, _ = box.centre
         point: tuple[float, float] | None = (x, y)
+        frame = ""
         if places is not None and places.frame_id != places.pose_frame:
             point = places.at(places.within(start, end))
-            x, y = point or (x, y)
-            frame = "" if point else f" in {places.pose_frame}"
+            if point is None:
+                frame = f" in {places.pose_frame}"
+            else:
+                x, y = point
         # z: a rounded -0.00 reads as 0.00.
         text = f"stood at x {x:z.2f}, y {y:z.2f}{frame}"
-        yield Event("stop", start, end, text, goes_on, point=point)
+        yield Event("stop", start, end, text, stop.goes_on, point=point)
 
 
 def _errors_in_region(
     view: View, topic: str, events: TopicEvents, region_stays: _RegionStays | None
 ) -> tuple[Report, ...]:
-    """Returns the errors of a window: of those that reach into a region the reports there.
+    """Returns the errors of a window. If a stay in the region cuts one, the stays are read alone.
 
-    Others may be among them.
+    So only reports in the region count for it.
     """
-    if region_stays is None or all(
-        region_stays.covers(error.first, error.last) for error in events.errors
+    if region_stays is None or not any(
+        region_stays.is_cut_by(error.first, error.last) for error in events.errors
     ):
         return events.errors
     parts = [events_in(view, topic, TimeWindow(*time)) for time in region_stays.times]
@@ -476,7 +513,10 @@ def _errors_in_region(
 
 
 def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
-    """Returns a goal from when it was accepted; one from before the window, from when it ended."""
+    """Returns a goal as an event, from its acceptance on.
+
+    A goal from before the window is an event at the moment when it ended.
+    """
     kind = "failed goal" if goal.outcome in FAILURES else "goal"
     if goal.accepted is None:
         state = "last heard of" if goal.is_lost else goal.outcome or "active"
@@ -496,19 +536,19 @@ def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
 
 
 def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:
-    """Yields each toggle with how long its value held: until the next, or beyond the window.
+    """Yields each toggle with how long its value is known to hold.
 
-    Or as long as it is known to: `ends` are the times from which on it is not, in order.
+    That is until the next toggle, or until one of `ends` (ns, in order); else beyond the window.
     """
-    until: dict[str, Ns] = {}
+    next_toggle: dict[str, Ns] = {}
     for toggle in reversed(toggles):
+        end = next_toggle.get(toggle.name)
+        nth = bisect_left(ends, toggle.time)
+        if nth < len(ends) and (end is None or ends[nth] < end):
+            end = ends[nth]
         text = toggle_sentence(topic, toggle)
-        end = until.get(toggle.name)
-        ceased = bisect_left(ends, toggle.time)
-        if ceased < len(ends) and (end is None or ends[ceased] < end):
-            end = ends[ceased]
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
-        until[toggle.name] = toggle.time
+        next_toggle[toggle.name] = toggle.time
 
 
 def _error_event(error: Report) -> Event:
@@ -518,14 +558,14 @@ def _error_event(error: Report) -> Event:
 
 
 def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event]:
-    """Returns the events, and with each stop, speed drop and toggle what changed before."""
-    past = {
-        event: changes.before(event.start, without=event.text.rpartition(" ")[0])
-        if event.kind == "flip"
-        else changes.before(event.start, slack=SLACK_NS)
-        for event in events
-        if event.kind in {"stop", "drop", "flip"}
-    }
+    """Returns the events with what changed before each stop, speed drop and toggle."""
+    past: dict[Event, tuple[PastChange, ...]] = {}
+    for event in events:
+        if event.kind == "flip":
+            own_sentence, _, _ = event.text.rpartition(" ")
+            past[event] = changes.before(event.start, without=own_sentence)
+        elif event.kind in {"stop", "drop"}:
+            past[event] = changes.before(event.start, slack=SLACK_NS)
     counts_shown = _counts_shown(past)
     return [
         replace(event, before=past[event][: counts_shown[event]]) if event in past else event
@@ -534,15 +574,20 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
 
 
 def _counts_shown(changes_of_events: Mapping[Event, Sequence[PastChange]]) -> dict[Event, int]:
-    """Returns how many of the nearest changes before each event there is room for."""
+    """Returns how many of the nearest changes before each event there is room for.
+
+    The nearest changes of all events come first, then the second nearest, and so on. Events whose
+    changes are all routine come last.
+    """
     counts_shown = dict.fromkeys(changes_of_events, 0)
     chars_left = _MOST_CHARS
-    # What a goal that was meant begins or ends with matters least.
-    routine = {event: all(map(is_routine, changes_of_events[event])) for event in changes_of_events}
-    ranks = [(is_last, nth) for is_last in (False, True) for nth in range(_MOST_CHANGES)]
-    for is_last, nth in ranks:
+    is_routine_event = {
+        event: all(map(is_routine, past)) for event, past in changes_of_events.items()
+    }
+    for is_last, nth in product((False, True), range(_MOST_CHANGES)):
         for event, past in changes_of_events.items():
-            if routine[event] is is_last and len(past) > nth == counts_shown[event]:
+            # An event whose nearer change had no room shows no farther one.
+            if is_routine_event[event] is is_last and len(past) > nth == counts_shown[event]:
                 size = len(past[nth].text) + _CHANGE_CHARS
                 if size <= chars_left:
                     chars_left -= size
@@ -553,9 +598,10 @@ def _counts_shown(changes_of_events: Mapping[Event, Sequence[PastChange]]) -> di
 def _most_important(
     view: View, events: Sequence[Event], counts: Counter[str], most: int
 ) -> list[Event]:
-    """Returns at most `most`, in order of time: of a kind those that lasted longest.
+    """Returns at most `most` events, in order of time: the most important, the longest of a kind.
 
-    `counts` has how many there are of each kind, also of those that are not among `events`.
+    `counts` has how many there are of each kind, with those that are not among `events`. A note
+    says how many are left out.
     """
     ranked = sorted(
         events,
@@ -564,10 +610,12 @@ def _most_important(
     shown = ranked[:most]
     left_out = counts - Counter(event.kind for event in shown)
     if left_out:
-        named = ", ".join(
-            counted(left_out[kind], kind if kind != "thing" else "sight of a thing", _PLURALS[kind])
-            for kind in _KINDS
-            if left_out[kind]
+        named = []
+        for kind in _KINDS:
+            if left_out[kind]:
+                singular = "sight of a thing" if kind == "thing" else kind
+                named.append(counted(left_out[kind], singular, _PLURALS[kind]))
+        view.notes.add(
+            f"left out, because there are too many: {', '.join(named)}; ask for a shorter time"
         )
-        view.notes.add(f"left out, because there are too many: {named}; ask for a shorter time")
     return sorted(shown, key=lambda event: (event.start, _KINDS.index(event.kind)))

@@ -1,4 +1,4 @@
-"""Saved moments: asks the recorder, which alone writes there, to save some, and lists them."""
+"""Saved moments: asks the recorder to save one, and lists them. The recorder alone writes them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ENDED: Final = frozenset({RecorderState.STOPPING, RecorderState.STOPPED})
 def remember_moment(
     memory: Memory, call: Call, label: str, *, seconds_before: float, seconds_after: float
 ) -> RememberedMoment:
-    """Asks the recorder to save what was and will be recorded around now.
+    """Asks the recorder to save the recording around now.
 
     Raises:
         RefusedError: nothing records here, or the recorder does not save it.
@@ -48,11 +48,11 @@ def remember_moment(
     _require_recorder(memory)
     start, end = now - ns_from_unix(seconds_before), now + ns_from_unix(seconds_after)
     asked = memory.clock.now()
-    slot = PendingRequest(
+    request = PendingRequest(
         memory.index.bag_dir, label, max(start, MIN_NS + 1), min(end, MAX_NS - 1), asked
     )
     try:
-        slot.post()
+        request.post()
     except OSError as error:
         raise RefusedError(
             f"the recorder cannot be asked: {error.strerror or error}; this server must be allowed "
@@ -60,10 +60,10 @@ def remember_moment(
             "before the recorder made that: restart it)"
         ) from error
     try:
-        outcome = _await_outcome(slot, call)
+        outcome = _await_outcome(request, call)
     finally:
-        slot.withdraw()
-        slot.close()
+        request.withdraw()
+        request.close()
     if outcome is None:
         raise RefusedError(
             f"the recorder did not answer within {ANSWER_TIMEOUT_S:g} s; memory_status shows "
@@ -78,7 +78,7 @@ def list_moments(memory: Memory, call: Call) -> MomentList:
     """Returns the saved moments, newest first.
 
     Raises:
-        RefusedError: they cannot be listed.
+        RefusedError: they cannot be read.
     """
     return newest_moments(memory, _now(memory, call), MAX_LISTED)
 
@@ -87,10 +87,10 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
     """Returns a saved moment by the name of its folder.
 
     Raises:
-        InvalidArgumentsError: there is none of this name.
-        RefusedError: they cannot be listed.
+        InvalidArgumentsError: there is no moment of this name.
+        RefusedError: the moments cannot be read.
     """
-    with _refused_where_unreadable():
+    with _refuse_unreadable():
         moments = {moment.folder.name: moment for moment in _moments_of(memory)}
     if name not in moments:
         near = get_close_matches(name, moments, n=3, cutoff=0.3)
@@ -100,20 +100,21 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
 
 
 def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
-    """Returns the newest saved moments, the newest first; `now` is what "ago" counts from.
+    """Returns the newest saved moments, newest first. `now` (ns) is what "ago" counts from.
 
     Raises:
-        RefusedError: they cannot be listed.
+        RefusedError: they cannot be read.
     """
-    with _refused_where_unreadable():
+    with _refuse_unreadable():
         stored = _moments_of(memory)
         rules = fired_rules(memory.index.bag_dir)
-    stored.sort(key=lambda moment: (moment.moment.request.end, moment.folder.name), reverse=True)
+    stored.sort(key=lambda saved: (saved.moment.request.end, saved.folder.name), reverse=True)
     return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
 
 
 @contextmanager
-def _refused_where_unreadable() -> Iterator[None]:
+def _refuse_unreadable() -> Iterator[None]:
+    """Raises `RefusedError` in place of an `OSError`."""
     try:
         yield
     except OSError as error:
@@ -124,7 +125,7 @@ def _refused_where_unreadable() -> Iterator[None]:
 
 
 def _moments_of(memory: Memory) -> list[StoredMoment]:
-    """Returns the saved moments; where one recording alone answers, those that hold bags of it."""
+    """Returns the saved moments; if one recording alone answers, the moments with bags of it."""
     recording = memory.limits.recording
     return [
         moment
@@ -136,15 +137,17 @@ def _moments_of(memory: Memory) -> list[StoredMoment]:
 
 
 def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
-    """Returns what the recorder's rules did so far, by name; none where that cannot be read.
+    """Returns what the recorder's rules did so far, by name; nothing if the file is damaged.
 
     Raises:
-        OSError: it is there and cannot be read.
+        OSError: the file is there and cannot be read.
     """
     try:
         state = TRIGGERS.read(bag_dir)
     except ValueError:
         return ()  # the recorder reports that, and starts again
+    if state is None:
+        return ()
     return tuple(
         FiredRule(
             name,
@@ -155,20 +158,21 @@ def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
             rule.always_since,
             rule.problem,
         )
-        for name, rule in sorted(({} if state is None else state.rules).items())
+        for name, rule in sorted(state.rules.items())
     )
 
 
 def _now(memory: Memory, call: Call) -> Ns:
-    """Returns what "ago" counts from."""
+    """Returns the time (ns) that "ago" counts from."""
     wall = memory.clock.now()
-    relative = memory.limits.now == "latest"
-    latest = View(memory, call, wall).snapshot.latest if relative else None
+    latest = None
+    if memory.limits.now == "latest":
+        latest = View(memory, call, wall).snapshot.latest
     return memory.now(wall, latest, call)
 
 
 def _require_recorder(memory: Memory) -> None:
-    """Checks that a recorder is running, which would read a request.
+    """Checks that a recorder runs that would read a request.
 
     Raises:
         RefusedError: nothing records here, or not just now.
@@ -186,16 +190,16 @@ def _require_recorder(memory: Memory) -> None:
         )
 
 
-def _await_outcome(slot: PendingRequest, call: Call) -> Outcome | None:
-    """Returns what the recorder answers; None where it has not begun in time, and never will."""
+def _await_outcome(request: PendingRequest, call: Call) -> Outcome | None:
+    """Returns the recorder's answer; None if it has not begun in time, and never will."""
+    # A request that cannot be withdrawn has been begun: wait for the answer once more.
     for _ in range(2):
         timeout = Deadline.after(ANSWER_TIMEOUT_S)
         while not timeout.expired() and not call.deadline.expired():
-            outcome = slot.outcome()
+            outcome = request.outcome()
             if outcome is not None:
                 return outcome
             time.sleep(_POLL_S)
-        # A request that cannot be withdrawn has been begun: wait for it once more.
-        if slot.withdraw():
+        if request.withdraw():
             return None
-    return slot.outcome()
+    return request.outcome()

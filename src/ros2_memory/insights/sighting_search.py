@@ -1,7 +1,6 @@
 """Finds sightings: runs of matches on each topic, the newest first, over columns.
 
-A sighting is message after message of one topic that meets a condition; see `insights.sightings`.
-Where a scope does not hold, a match counts as no match.
+See `insights.sightings`. A match while the scope does not hold counts as no match.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from ros2_memory.history.reverse_search import RowCondition
 from ros2_memory.history.scan import messages_at, scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -44,9 +43,9 @@ UNKNOWN: Final = 2
 """The message cannot be decoded."""
 
 _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
-"""Messages that the bag decides and are no farther apart are read at once."""
+"""Messages that must be read from the bag, and are no farther apart, are read at once."""
 _MOST_WAITING: Final = 1 << 14
-"""So many messages are looked at together."""
+"""Messages of blocks that are joined together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,8 +54,8 @@ class Tested:
 
     Attributes:
         times: log times (ns).
-        met: `MET`, `NOT_MET` or `UNKNOWN` for each.
-        sources: a number for recording and type of each; by it those of one log time are ordered.
+        met: `MET`, `NOT_MET` or `UNKNOWN` for each message.
+        sources: the number of each message's recording and type, which orders equal log times.
     """
 
     times: IntArray
@@ -68,11 +67,9 @@ class Block(NamedTuple):
     """Messages of a topic between two log times (inclusive).
 
     Attributes:
-        topic: its name.
-        first: no message is earlier.
-        last: none is later.
+        first, last: no message is earlier or later.
         has_match: whether some message may meet the condition.
-        tested: tests them.
+        tested: tests the messages.
     """
 
     topic: str
@@ -86,7 +83,7 @@ class MatchTester:
     """Tests the messages of the topics of a search.
 
     Attributes:
-        ruled_out: whether a message was seen not to match by its columns.
+        ruled_out: whether columns showed of some message that it does not match.
     """
 
     def __init__(self, view: View, search: ReverseSearch) -> None:
@@ -128,6 +125,7 @@ class MatchTester:
             yield waiting
 
     def _block(self, topic: str, rows: Rows, window: TimeWindow) -> Block:
+        """Returns rows as a block. Its messages are tested when that is asked for."""
         truth = self._test.truth(rows) if rows.may_match else nowhere(len(rows.table))
         has_match = not truth.is_none
         self.ruled_out |= not has_match
@@ -136,28 +134,25 @@ class MatchTester:
         return Block(topic, first, last, has_match=has_match, tested=tested)
 
     def _test_rows(self, topic: str, rows: Rows, truth: TruthValues) -> Tested:
-        """Tests the rows that count: by columns, and by messages where these leave it open."""
+        """Tests the rows that count by columns, and reads the messages that columns leave open."""
         counting = slice(None) if rows.index is None else rows.index
         surely, perhaps = truth.surely[counting], truth.perhaps[counting]
         self.ruled_out |= not perhaps.all()
         source = self._source_numbers(topic)[rows.recording, rows.table.channel.type]
-        sources = np.full(len(rows), source)
         met = surely.astype(np.uint8)
         met[self._test.unstated(rows)[counting] & ~surely] = UNKNOWN
         undecided = np.flatnonzero(perhaps & ~surely)
-        if undecided.size:
-            # Messages that lie close together are read at once.
-            edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
-            for together in np.split(undecided, edges):
-                # What cannot be read is no match; a note reports it.
-                met[together] = NOT_MET
-                for nth, message in messages_at(self._view, rows.some(together)):
-                    is_match = self._search.matches(message)
-                    met[together[nth]] = UNKNOWN if is_match is None else int(is_match)
-        return Tested(rows.times, met, sources)
+        # A message that cannot be read is no match; a note reports it.
+        met[undecided] = NOT_MET
+        edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
+        for neighbours in np.split(undecided, edges) if undecided.size else ():
+            for nth, message in messages_at(self._view, rows.some(neighbours)):
+                is_match = self._search.matches(message)
+                met[neighbours[nth]] = UNKNOWN if is_match is None else int(is_match)
+        return Tested(rows.times, met, np.full(len(rows), source))
 
     def _source_numbers(self, topic: str) -> dict[tuple[Path, str], int]:
-        """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
+        """Returns a number for each recording and type of a topic, in the order of `Rows.order`."""
         if topic not in self._numbers:
             timeline = self._view.timeline
             recordings = sorted(timeline.recordings(topic), key=str)
@@ -167,16 +162,16 @@ class MatchTester:
 
 
 def _merged_and_split(waiting: Block, reached: Block) -> tuple[Block | None, Block]:
-    """Returns two blocks that overlap as their messages after the end of `reached`, and all others.
+    """Returns the messages of two overlapping blocks as those after `reached` ends, and the others.
 
-    The former are None where there are none. No block that a scan reaches later has a message
-    after the end of `reached`.
+    No block that a scan reaches later has messages after the end of `reached`. The first block is
+    None if it has no message.
     """
     if not waiting.tested().times.size:
         return None, reached
     if not reached.tested().times.size:
         return None, waiting
-    # Of one log time and recording what the scan reaches later was written before.
+    # In one recording, what the scan reaches later was written before.
     both = stacked([reached.tested(), waiting.tested()])
     ordered = rows_of(both, np.lexsort((both.sources, both.times)))
     cut = int(np.searchsorted(ordered.times, reached.last, side="right"))
@@ -194,14 +189,12 @@ class Run(NamedTuple):
     """Consecutive matches on one topic.
 
     Attributes:
-        topic: its name.
-        first: log time of the first match.
-        last: of the last one.
-        messages: how many there are.
-        until: of the next message, which is no match or comes after a silence; `MAX_NS` where that
-            is not known.
-        later: how many matches have the log time of the last one, and come after it.
-        begun: 1 where what came before the first match is known, else 0.
+        first, last: log times (ns) of the first and the last match.
+        messages: how many matches.
+        until: log time of the next message, which is no match or follows a silence; `MAX_NS` if
+            that is unknown.
+        later: how many matches after the last one have the same log time.
+        begun: 1 if it is known what came before the first match, else 0.
     """
 
     topic: str
@@ -214,18 +207,18 @@ class Run(NamedTuple):
 
 
 _FIRST, _LAST, _MESSAGES, _BEGUN = 1, 2, 3, 6
-"""Columns of runs as an array: as `Run` has them, a topic by its number."""
+"""Columns of runs as an array: the fields of `Run`, with a number for the topic."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchedRuns:
-    """What a search found.
+    """The runs that a search found.
 
     Attributes:
-        topics: their names, by number.
-        table: the runs, a row for each, the newest first.
-        searched_to: a log time; all that is newer was searched. None: all of the window was.
-        is_over: whether the search ended since its time was over.
+        topics: the names of topics by number.
+        table: a row for each run, the newest first.
+        searched_to: the log time since when all was searched; None for all of the window.
+        is_over: whether the search ended because its time was over.
     """
 
     topics: Sequence[str]
@@ -235,32 +228,39 @@ class SearchedRuns:
 
     @property
     def spans(self) -> Ints:
-        """The first and the last log time of each, and whether it is known to begin then."""
+        """The first and the last log time of each run, and whether it is known to begin then."""
         return self.table[:, [_FIRST, _LAST, _BEGUN]]
 
     def runs(self, which: Ints | slice[int | None, int | None]) -> list[Run]:
-        """Returns some of the runs."""
+        """Returns the runs in some rows."""
         return [Run(self.topics[topic], *run) for topic, *run in self.table[which].tolist()]
 
 
 class _TopicRuns:
-    """The runs of one topic, from its newest block on."""
+    """Joins the blocks of one topic, the newest first, into runs.
+
+    Args:
+        topic: its number.
+        apart: whether each match is a run of its own.
+    """
 
     def __init__(self, topic: int, *, apart: bool) -> None:
         self._topic = topic
         self._apart = apart
-        self._runs: list[Ints] = []
+        self._tables: list[Ints] = []
+        # Whether the oldest run may go on in an older block.
         self._is_open = False
+        # The log time of the oldest message; MAX_NS if it is unknown what follows an older one.
         self._begins: Ns = MAX_NS
         self._waiting: list[Tested] = []
         self._messages = 0
 
-    def runs(self, *, cut: bool) -> list[Ints]:
-        """Returns tables of runs. With `cut` the oldest may have begun earlier than is known."""
+    def tables(self, *, cut: bool) -> list[Ints]:
+        """Returns tables of runs. With `cut` an oldest run that may go on has no known begin."""
         self._join()
         if not (cut and self._is_open):
-            return self._runs
-        *newer, last = self._runs
+            return self._tables
+        *newer, last = self._tables
         oldest = last.copy()
         oldest[-1, _BEGUN] = 0
         return [*newer, oldest]
@@ -274,47 +274,49 @@ class _TopicRuns:
                 return
         tested = block.tested()
         if tested.times.size:
-            # Many small blocks take long one by one.
+            # One by one, many small blocks take long.
             self._waiting.append(tested)
             self._messages += tested.times.size
             if self._messages >= _MOST_WAITING:
                 self._join()
 
     def _join(self) -> None:
-        """Joins the runs in the blocks that were added since to those before."""
+        """Joins the matches of the blocks that wait to the runs, which are newer."""
         if not self._waiting:
             return
         tested = stacked(self._waiting[::-1])
         self._waiting, self._messages = [], 0
         after, self._begins = self._begins, int(tested.times[0])
         times, met = tested.times, tested.met
+        goes_on = self._is_open and after - int(times[-1]) <= SILENCE_NS
         is_silent = np.diff(times, prepend=times[0]) > SILENCE_NS
-        is_open = self._is_open and after - int(times[-1]) <= SILENCE_NS
-        others, rows = np.flatnonzero((met == NOT_MET) | is_silent), np.flatnonzero(met == MET)
-        if not rows.size and not others.size:
-            self._is_open = is_open
+        bounds, rows = np.flatnonzero((met == NOT_MET) | is_silent), np.flatnonzero(met == MET)
+        if not rows.size and not bounds.size:
+            self._is_open = goes_on
             return
-        # Of two matches, this differs where a message that is none, or a silence, lies between.
-        ends = np.searchsorted(others, rows, side="right")
-        starts = np.flatnonzero(self._apart | (np.diff(ends, prepend=-1) > 0))
+        # Bounds are messages that do not match, and silences: no run goes on across one.
+        next_bound = np.searchsorted(bounds, rows, side="right")
+        starts = np.flatnonzero(self._apart | (np.diff(next_bound, prepend=-1) > 0))
         stops = np.append(starts, rows.size)[1:]
-        until = np.append(times[others], MAX_NS)[ends[stops - 1]]
+        until = np.append(times[bounds], MAX_NS)[next_bound[stops - 1]]
         lasts = times[rows[stops - 1]]
         later = np.searchsorted(times[rows], lasts, side="right") - stops
         columns = (times[rows[starts]], lasts, stops - starts, np.minimum(until, after), later, 1)
         runs = np.stack(np.broadcast_arrays(self._topic, *columns), axis=1)[::-1]
-        if is_open and ends[-1:].tolist() == [others.size]:
-            self._runs[-1][-1, _FIRST] = runs[0, _FIRST]
-            self._runs[-1][-1, _MESSAGES] += runs[0, _MESSAGES]
+        if goes_on and next_bound[-1:].tolist() == [bounds.size]:
+            # The newest of these runs is the begin of the oldest one before.
+            oldest = self._tables[-1][-1]
+            oldest[_FIRST] = runs[0, _FIRST]
+            oldest[_MESSAGES] += runs[0, _MESSAGES]
             runs = runs[1:]
         if len(runs):
-            self._runs.append(runs)
-        self._is_open = not self._apart and ends[:1].tolist() == [0]
+            self._tables.append(runs)
+        self._is_open = not self._apart and next_bound[:1].tolist() == [0]
 
     def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:
-        """Ends the oldest run if the topic has a message in a time that was not searched.
+        """Ends the oldest run if the topic has a message in a time that is not searched.
 
-        Then, and where no run goes on, what follows an older run is not known.
+        If no run goes on then, it is unknown what follows an older one.
         """
         self._join()
         if not self._is_open or (not gap.empty and view.stream.first([topic], gap) is not None):
@@ -324,16 +326,16 @@ class _TopicRuns:
 def find_runs(
     view: View, search: ReverseSearch, scope: Scope, *, enough: int | None
 ) -> SearchedRuns:
-    """Returns the runs of matches in a scope, on all topics of a search; of a log each message.
+    """Returns the runs of matches in a scope, on all topics of a search; in a log each match.
 
-    What a latched topic states holds on: of its runs there are the parts that lie in the scope.
+    A value of a latched topic holds on: its run has the parts of that time in the scope.
 
     Args:
-        view: what is searched.
-        search: which topics, and for what.
+        view: has the bags.
+        search: has the topics and the condition.
         scope: when matches count.
-        enough: how many of the newest are wanted: the search ends when no older match can change
-            these, and there is one more. None: all of them.
+        enough: how many of the newest runs are wanted. The search ends when these are known, and
+            that there is one more. None for all runs.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
@@ -341,38 +343,28 @@ def find_runs(
         QueryTimeoutError: the call's time is over before the first match was found.
     """
     tester = MatchTester(view, search)
-    # What lies outside of a scope is not read, and may well be decodable.
+    # Messages outside of a scope are not read, and may well be decodable.
     tester.ruled_out = scope.is_bounded
     topics, is_log = search.topics, view.timeline.is_log
     latched = [topic for topic in topics if scope.is_bounded and is_latched(view, topic)]
     if latched:
         enough = None
     by_topic = {topic: _TopicRuns(nth, apart=is_log(topic)) for nth, topic in enumerate(topics)}
-    reached = searched = scope.window.stop
+    windows = [scope.window] if latched else scope.narrowed()
+    reached = scope.window.stop
     try:
-        for window in [scope.window] if latched else scope.narrowed():
-            for topic, topic_runs in by_topic.items():
-                topic_runs.end_in(view, topic, TimeWindow(window.stop, searched))
-            searched = window.start
-            blocks = (tester.newest_first(topic, window) for topic in topics)
-            for block in heapq.merge(*blocks, key=lambda block: -block.last):
-                is_whole = not scope.is_bounded or block.topic in latched
-                counted = block if is_whole else _scoped(block, scope)
-                by_topic[block.topic].add(counted)
-                reached = block.first if len(topics) == 1 else block.last
-                if enough is not None and _has_enough(by_topic.values(), enough, reached):
-                    break
-            else:
-                continue
-            break
+        for block in _blocks_newest_first(view, tester, scope, windows, by_topic):
+            is_whole = not scope.is_bounded or block.topic in latched
+            by_topic[block.topic].add(block if is_whole else _in_scope(block, scope))
+            reached = block.first if len(topics) == 1 else block.last
+            if enough is not None and _has_enough(by_topic.values(), enough, reached):
+                break
     except QueryTimeoutError:
-        found = SearchedRuns(
-            topics, _newest_first(by_topic.values(), cut=True), reached, is_over=True
-        )
-        if not len(found.table):
+        table = _newest_first(by_topic.values(), cut=True)
+        if not len(table):
             raise
-        return _parts_in(view, found, scope, latched)
-    found = SearchedRuns(topics, _newest_first(by_topic.values()))
+        return _parts_in(view, SearchedRuns(topics, table, reached, is_over=True), scope, latched)
+    found = SearchedRuns(topics, _newest_first(by_topic.values(), cut=False))
     found = _parts_in(view, found, scope, latched)
     if enough is not None and len(found.table) > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
@@ -382,36 +374,60 @@ def find_runs(
     return found
 
 
+def _blocks_newest_first(
+    view: View,
+    tester: MatchTester,
+    scope: Scope,
+    windows: Iterable[TimeWindow],
+    by_topic: Mapping[str, _TopicRuns],
+) -> Iterator[Block]:
+    """Yields the blocks of all topics in windows, the newest first; ends runs between windows."""
+    searched = scope.window.stop
+    for window in windows:
+        for topic, topic_runs in by_topic.items():
+            topic_runs.end_in(view, topic, TimeWindow(window.stop, searched))
+        searched = window.start
+        blocks = (tester.newest_first(topic, window) for topic in by_topic)
+        yield from heapq.merge(*blocks, key=lambda block: -block.last)
+
+
 def _parts_in(
     view: View, found: SearchedRuns, scope: Scope, latched: Collection[str]
 ) -> SearchedRuns:
-    """Returns runs, and of those of latched topics the parts of a scope in which they held."""
+    """Returns runs, with those of latched topics as the parts of the scope in which they held."""
     if not latched:
         return found
-    _, end = scope.window.asked()
-    parts: list[tuple[int, ...]] = []
+    parts: list[Run] = []
     for run in found.runs(slice(None)):
-        topic = found.topics.index(run.topic)
-        if run.topic not in latched:
-            parts.append((topic, *run[1:]))
-            continue
-        until = held_until(view, run.topic, run.last, end)
-        for first, stop in scope.parts_of(run.first, until):
+        parts += _latched_parts(view, run, scope) if run.topic in latched else [run]
+    rows = [(found.topics.index(run.topic), *run[1:]) for run in parts]
+    table = np.array(rows, np.int64).reshape(-1, len(Run._fields))
+    return replace(found, table=_in_order(table))
+
+
+def _latched_parts(view: View, run: Run, scope: Scope) -> Iterator[Run]:
+    """Yields the parts of a scope in which a value of a latched topic held."""
+    _, end = scope.window.asked()
+    until = held_until(view, run.topic, run.last, end)
+    for first, stop in scope.parts_of(run.first, until):
+        messages = 0
+        if first <= run.last:
             said = TimeWindow(first, min(run.last, stop) + 1)
-            messages = 0
-            if first <= run.last:
-                messages = sum(1 for _ in view.stream.messages([run.topic], said))
-            if messages or first < stop:
-                last = max(first, min(run.last, stop))
-                begun = run.begun if first == run.first else 0
-                parts.append((topic, first, last, messages, run.until, 0, begun))
-    return replace(found, table=_in_order(np.array(parts, np.int64).reshape(-1, 7)))
+            messages = sum(1 for _ in view.stream.messages([run.topic], said))
+        if messages or first < stop:
+            yield run._replace(
+                first=first,
+                last=max(first, min(run.last, stop)),
+                messages=messages,
+                later=0,
+                begun=run.begun if first == run.first else 0,
+            )
 
 
-def _scoped(block: Block, scope: Scope) -> Block:
-    """Returns a block in which only those are matches that count in a scope."""
+def _in_scope(block: Block, scope: Scope) -> Block:
+    """Returns a block whose matches outside of a scope are no matches."""
 
-    def tested() -> Tested:
+    def test() -> Tested:
         messages = block.tested()
         # The newest first, as a scope reads what the other topic said.
         matches = np.flatnonzero(messages.met == MET)[::-1]
@@ -421,18 +437,19 @@ def _scoped(block: Block, scope: Scope) -> Block:
         met[matches[~counts]] = NOT_MET
         return replace(messages, met=met)
 
-    return block._replace(tested=tested)
+    return block._replace(tested=test)
 
 
 def _has_enough(by_topic: Collection[_TopicRuns], enough: int, reached: Ns) -> bool:
-    """Returns whether no match older than a moment can change the newest runs."""
+    """Returns whether the newest runs are known, whatever matches before a moment (ns) follow."""
     runs = _newest_first(by_topic, cut=True)
     newest = runs[:enough]
     return len(runs) > enough and newest[-1, _LAST] >= reached and bool(newest[:, _BEGUN].all())
 
 
-def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool = False) -> Ints:
-    tables = [table for topic_runs in by_topic for table in topic_runs.runs(cut=cut)]
+def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool) -> Ints:
+    """Returns the runs of all topics in one table; see `_TopicRuns.tables`."""
+    tables = [table for topic_runs in by_topic for table in topic_runs.tables(cut=cut)]
     return _in_order(np.concatenate([np.empty((0, len(Run._fields)), np.int64), *tables]))
 
 

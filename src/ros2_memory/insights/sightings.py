@@ -1,18 +1,17 @@
 """Sightings: consecutive matches of a condition, with where the robot and the thing were.
 
-A sighting is message after message of one topic that meets a condition. It ends with a message of
-that topic that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector may
-publish only what it sees. A message that cannot be decoded is neither a match nor an end. Of the
-status of an action each goal is a sighting, of a log each message.
+A sighting is a run of consecutive messages of one topic that meet a condition. It ends with a
+message that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector may
+publish only what it sees. A message that cannot be decoded is neither a match nor an end. In a
+topic of statuses each goal is a sighting, in a log each message.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -39,14 +38,14 @@ from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.episodes import (
     MOST_COUNTED,
-    SaidMeanwhile,
+    MeanwhileReader,
     find_episodes,
     says_episodes,
     with_robot,
 )
 from ros2_memory.insights.sighting_search import Run, SearchedRuns, find_runs
 from ros2_memory.insights.silences import describe_silences
-from ros2_memory.insights.topic_events import GoalRun, goals_asked
+from ros2_memory.insights.topic_events import GoalRun, goals_matching
 from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
 from ros2_memory.places.where import Scope, WhileCondition
@@ -54,18 +53,18 @@ from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.arrays import Ints
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.stored_message import StoredMessage
 
-_SightingOrEpisode = TypeVar("_SightingOrEpisode", Sighting, Episode)
+Row = TypeVar("Row", Sighting, Episode)
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
 _LEFT_TO_SAY_S: Final = 2.0
-"""A search ends so long before the call's time does: then the messages of matches are read."""
+"""The part of the call's time that a search leaves for reading the messages of matches."""
 
 
 def find_matches(
@@ -90,13 +89,13 @@ def find_matches(
 ) -> Sightings:
     """Returns the newest `limit` sightings on a topic, or on all topics of a glob, newest first.
 
-    Of texts that hold until the next one they are episodes (`insights.episodes`). With `beside`
-    each has what that topic said meanwhile.
+    On a topic of texts that hold until the next one they are episodes (`insights.episodes`).
 
-    `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound what is
-    searched. With `oldest_first` all of it is searched, and the oldest sightings are returned. A
-    sighting has the `fields` (dot-paths) of its last message. Detections of a score below
-    `min_score` do not count.
+    `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound the search.
+    With `oldest_first` all of that time is searched, and the oldest sightings are returned. A
+    sighting has the `fields` (dot-paths) of its last message, and what the topic `beside` said
+    meanwhile. Detections with a score below `min_score` do not count.
+
     With `where` only messages count that were received while the robot was there, with `during`
     while another topic met a condition. Robot positions are in the map, or in `frame_id`.
 
@@ -112,23 +111,23 @@ def find_matches(
     condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     window = clamped(view, asked)
     scope = Scope(view, window, where, during)
-    other = None if beside is None else SaidMeanwhile(view, beside)
-    topics, shown = matching_topics(view, topic), _Selection(limit, oldest_first, frame_id)
-    goals = goals_asked(view, topics, condition, scope)
-    is_spoken = goals is None and says_episodes(view, topics)
+    other = None if beside is None else MeanwhileReader(view, beside)
+    topics, selection = matching_topics(view, topic), _Selection(limit, oldest_first, frame_id)
+    goals = goals_matching(view, topics, condition, scope)
+    are_episodes = goals is None and says_episodes(view, topics)
     sightings: Sequence[Sighting] = ()
     episodes: Sequence[Episode] = ()
     if goals is not None:
-        sightings, total, searched = _goal_sightings(view, goals, scope, shown)
-    elif is_spoken:
-        episodes, total, searched = _episodes_of_text(view, topics[0], condition, scope, shown)
+        sightings, total, searched = _goal_sightings(view, goals, scope, selection)
+    elif are_episodes:
+        episodes, total, searched = _select_episodes(view, topics[0], condition, scope, selection)
     else:
         search = ReverseSearch(view, topic, condition)
-        sightings, total, searched = _runs_as_sightings(view, search, scope, shown, fields)
+        sightings, total, searched = _run_sightings(view, search, scope, selection, fields)
         view.notes.add(*_latched_notes(view, search, window))
     elapsed = elapsed_in(view, searched)
-    sightings = tuple(_completed(sighting, elapsed, other) for sighting in sightings)
-    episodes = tuple(_completed(episode, elapsed, other) for episode in episodes)
+    sightings = tuple(_with_durations(sighting, elapsed, other) for sighting in sightings)
+    episodes = tuple(_with_durations(episode, elapsed, other) for episode in episodes)
     rows: list[Sighting | Episode] = [*sightings, *episodes]
     note_robots_on(view, topics, searched)
     note_unread(view, searched, nothing=total == 0, search=True)
@@ -150,37 +149,46 @@ def find_matches(
         now=now,
         unknown=elapsed.among(scope.unknown),
         topic="" if topics[1:] else topics[0],
-        of_texts=is_spoken,
+        of_texts=are_episodes,
         episodes=episodes,
         notes=notes,
     )
 
 
 def _searched_times(view: View, window: TimeWindow, shown_at: Sequence[Ns]) -> Span:
-    """Returns from when to when a window was searched (inclusive), and has what is shown."""
+    """Returns the first and the last moment (ns) of a window that were searched.
+
+    Bags of a wrong clock are searched too: a match in them may lie outside of the others' time.
+    """
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (start, end)
-    # Also bags of a wrong clock are searched, whose matches lie outside of the others' time.
+
     start = min(max(start, min([first, *shown_at])), end)
     return start, max(min(end, max([last, *shown_at])), start)
 
 
 class _Selection(NamedTuple):
-    """How many rows are shown, which of them, and the frame of the robot's positions."""
+    """How many rows are shown, from which end, and the frame of the robot's positions."""
 
     limit: int
     oldest_first: bool
     frame_id: str | None
 
 
-_Found: TypeAlias = tuple[Sequence[_SightingOrEpisode], int | None, TimeWindow]
-"""The rows of a reply; how many there are, None where the search ended before it had counted all;
-and the part of the window in which all matches are known."""
+class _SelectedRows(NamedTuple, Generic[Row]):
+    """The rows of a reply.
+
+    Attributes:
+        total: how many there are; None if the search ended before it counted all.
+        searched: the part of the window in which all matches are known.
+    """
+
+    rows: Sequence[Row]
+    total: int | None
+    searched: TimeWindow
 
 
-def _completed(
-    row: _SightingOrEpisode, elapsed: Elapsed, other: SaidMeanwhile | None
-) -> _SightingOrEpisode:
+def _with_durations(row: Row, elapsed: Elapsed, other: MeanwhileReader | None) -> Row:
     """Returns a row with how much of its time the clock skipped, and what was said meanwhile."""
     return replace(
         row,
@@ -190,88 +198,110 @@ def _completed(
 
 
 def _goal_sightings(
-    view: View, goals: list[GoalRun], scope: Scope, shown: _Selection
-) -> _Found[Sighting]:
-    """Returns the goals that are shown as sightings; `goals` have the last one first."""
+    view: View, goals: list[GoalRun], scope: Scope, selection: _Selection
+) -> _SelectedRows[Sighting]:
+    """Returns the selected goals as sightings. `goals` have the last one first."""
     view.notes.retract_outside(scope.window)
+    ordered = goals[::-1] if selection.oldest_first else goals
     sightings = [
-        _goal_sighting(view, goal, scope, shown.frame_id)
-        for goal in (goals[::-1] if shown.oldest_first else goals)[: shown.limit]
+        _goal_sighting(view, goal, scope, selection.frame_id)
+        for goal in ordered[: selection.limit]
         if view.call.wants(goal.last)
     ]
-    return sightings, len(goals), scope.window
+    return _SelectedRows(sightings, len(goals), scope.window)
 
 
-def _episodes_of_text(
-    view: View, topic: str, condition: Condition, scope: Scope, shown: _Selection
-) -> _Found[Episode]:
-    found, total, since = find_episodes(
-        view, topic, condition, scope, limit=shown.limit, oldest_first=shown.oldest_first
-    )
-    searched = scope.window if since is None else TimeWindow(since, scope.window.stop)
+def _select_episodes(
+    view: View, topic: str, condition: Condition, scope: Scope, selection: _Selection
+) -> _SelectedRows[Episode]:
+    """Returns the selected episodes, with the robot's pose when they began."""
+    limit, oldest_first = selection.limit, selection.oldest_first
+    found = find_episodes(view, topic, condition, scope, limit=limit, oldest_first=oldest_first)
+    searched = scope.window
+    if found.since is not None:
+        searched = TimeWindow(found.since, searched.stop)
     view.notes.retract_outside(searched)
     episodes = [
-        with_robot(view, topic, episode, shown.frame_id)
-        for episode in found
+        with_robot(view, topic, episode, selection.frame_id)
+        for episode in found.episodes
         if view.call.wants(episode.until)
     ]
-    return episodes, total, searched
+    return _SelectedRows(episodes, found.total, searched)
 
 
-def _search(view: View, search: ReverseSearch, scope: Scope, *, enough: int | None) -> SearchedRuns:
-    """Returns what `find_runs` finds with some of the call's time left to say it."""
+def _find_runs_early(
+    view: View, search: ReverseSearch, scope: Scope, *, enough: int | None
+) -> SearchedRuns:
+    """Returns the runs of matches, and leaves some of the call's time to read their messages."""
     view.bags.end_early(_LEFT_TO_SAY_S)
-    result = find_runs(view, search, scope, enough=enough)
+    searched_runs = find_runs(view, search, scope, enough=enough)
     view.bags.finish_within(_LEFT_TO_SAY_S)
-    return result
+    return searched_runs
 
 
-def _runs_as_sightings(
-    view: View, search: ReverseSearch, scope: Scope, shown: _Selection, fields: Sequence[str]
-) -> _Found[Sighting]:
-    result = _search(view, search, scope, enough=None if shown.oldest_first else shown.limit)
-    if result.is_over:
+def _run_sightings(
+    view: View, search: ReverseSearch, scope: Scope, selection: _Selection, fields: Sequence[str]
+) -> _SelectedRows[Sighting]:
+    """Returns the selected runs of matches as sightings.
+
+    Raises:
+        InvalidArgumentsError: no sighting has one of the fields.
+    """
+    limit, oldest_first = selection.limit, selection.oldest_first
+    searched_runs = _find_runs_early(view, search, scope, enough=None if oldest_first else limit)
+    if searched_runs.is_over:
         view.notes.add_lack(
-            f"the search ran out of time at {unix_text(result.searched_to or MIN_NS)}: to "
+            f"the search ran out of time at {unix_text(searched_runs.searched_to or MIN_NS)}: to "
             "continue, pass that time as end"
         )
-    runs = result.runs(
-        slice(None, -shown.limit - 1, -1) if shown.oldest_first else slice(shown.limit)
-    )
-    searched, total = scope.window, len(result.table) if result.searched_to is None else None
-    if total is None:
-        searched = TimeWindow(runs[0 if shown.oldest_first else -1].first, searched.stop)
+    # The table has the newest run first.
+    runs = searched_runs.runs(slice(None, -limit - 1, -1) if oldest_first else slice(limit))
+    searched, total = scope.window, None
+    if searched_runs.searched_to is None:
+        total = len(searched_runs.table)
+    else:
+        oldest = runs[0] if oldest_first else runs[-1]
+        searched = TimeWindow(oldest.first, searched.stop)
     view.notes.retract_outside(searched)
-    # To say where the robot was takes longest.
     sightings: list[Sighting] = []
     refused: list[InvalidArgumentsError] = []
     for run in runs:
+        # To say where the robot was takes longest.
         newest = _newest_match(view, search, run) if view.call.wants(run.last) else None
         if newest is None:
             continue
         sighting = _sighting(
-            view, search.condition, run, newest, scope=scope, frame_id=shown.frame_id
+            view, search.condition, run, newest, scope=scope, frame_id=selection.frame_id
         )
         if fields:
             try:
                 sighting = _with_fields(view, sighting, newest, fields)
             except InvalidArgumentsError as error:
-                # A traceback has this frame, which has the errors: they would stay for long.
+                # A traceback refers to this frame, and the frame to the errors: break the cycle.
                 refused.append(error.with_traceback(None))
         sightings.append(sighting)
     if refused and len(refused) == len(sightings):
         raise refused.pop(0)
-    return sightings, total, searched
+    return _SelectedRows(sightings, total, searched)
 
 
-def read_sightings(
-    view: View, pattern: str, condition: Condition, scope: Scope
-) -> tuple[Ints, Ns | None, str]:
-    """Returns all sightings in a scope, since when they are known, and what there are too many of.
+class SightingSpans(NamedTuple):
+    """The times of all sightings.
 
-    Of each sighting, as a row, its first and last log time (ns), and whether it is known to begin
-    then: what a latched topic reported before may have begun earlier. The second is None where all
-    was searched; the third is empty where the call's time was over.
+    Attributes:
+        spans: for each sighting its first and last log time (ns), and 1 if it is known to begin
+            then: a value of a latched topic may have held before.
+        since: the log time (ns) since when sightings are known; None for all of the scope.
+        too_many: what there are too many of; empty if the call's time was over instead.
+    """
+
+    spans: Ints
+    since: Ns | None = None
+    too_many: str = ""
+
+
+def read_sightings(view: View, pattern: str, condition: Condition, scope: Scope) -> SightingSpans:
+    """Returns the times of all sightings in a scope.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
@@ -279,67 +309,76 @@ def read_sightings(
         QueryTimeoutError: the call's time is over before the first match was found.
     """
     topics = matching_topics(view, pattern)
-    goals = goals_asked(view, topics, condition, scope)
+    goals = goals_matching(view, topics, condition, scope)
     if goals is not None:
-        spans = held_spans(chain.from_iterable(_goal_spans(view, goal, scope) for goal in goals))
-        return spans, None, ""
+        of_goals = chain.from_iterable(_goal_spans(view, goal, scope) for goal in goals)
+        return SightingSpans(held_spans(of_goals))
     if says_episodes(view, topics):
-        found, _, since = find_episodes(
+        found = find_episodes(
             view, topics[0], condition, scope, limit=MOST_COUNTED, oldest_first=False
         )
-        too_many = f"more than {MOST_COUNTED:,} episodes" if len(found) == MOST_COUNTED else ""
-        spans = held_spans((episode.first, episode.until, True) for episode in found)
-        return spans, since, too_many
-    result = _search(view, ReverseSearch(view, pattern, condition), scope, enough=None)
-    start, end = scope.window.asked()
-    spans, is_log = result.spans, np.array([*map(view.timeline.is_log, topics)], np.bool_)
-    states = np.flatnonzero(~is_log[result.table[:, 0]])
+        is_full = len(found.episodes) == MOST_COUNTED
+        return SightingSpans(
+            held_spans((episode.first, episode.until, True) for episode in found.episodes),
+            found.since,
+            f"more than {MOST_COUNTED:,} episodes" if is_full else "",
+        )
+    return _run_spans(view, ReverseSearch(view, pattern, condition), scope)
+
+
+def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans:
+    """Returns the times of all runs of matches; a value lasts until a message says otherwise."""
+    searched_runs = _find_runs_early(view, search, scope, enough=None)
+    spans, topics = searched_runs.spans, search.topics
     # Without a scope the oldest may have begun before what there was time to search.
     spans[:, 2] |= not scope.is_bounded
+    is_log = np.array([*map(view.timeline.is_log, topics)], np.bool_)
+    states = np.flatnonzero(~is_log[searched_runs.table[:, 0]])
     known = 0
     try:
-        for known, run in zip(states.tolist(), result.runs(states), strict=True):
+        for known, run in zip(states.tolist(), searched_runs.runs(states), strict=True):
             spans[known, 1] = _lasted_until(view, run, scope)
     except QueryTimeoutError:
-        # Those of several topics overlap.
+        # The runs of several topics overlap: since when all are known cannot be said.
         if not known or len(topics) > 1:
             raise
         view.bags.finish_within(_LEFT_TO_SAY_S)
-        return spans[:known], int(spans[known - 1, 0]), ""
-    if result.is_over:
-        return spans, int(spans[-1, 0]), ""
+        return SightingSpans(spans[:known], int(spans[known - 1, 0]))
+    if searched_runs.is_over:
+        return SightingSpans(spans, int(spans[-1, 0]))
+    start, end = scope.window.asked()
     earlier = [
         (first, last, False)
         for topic in topics
-        if met_before(view, topic, condition, start)
+        if met_before(view, topic, search.condition, start)
         for first, last in scope.parts_of(start, held_until(view, topic, start, end))
     ]
-    return np.concatenate((spans, held_spans(earlier))), None, ""
+    return SightingSpans(np.concatenate((spans, held_spans(earlier))))
 
 
 def _goal_spans(view: View, goal: GoalRun, scope: Scope) -> Iterator[tuple[Ns, Ns, bool]]:
-    """Yields when a goal was active; one of before the window counts where it ended, if it did."""
+    """Yields when a goal was active. If that began before the window, its end counts as well."""
     yield goal.first, _goes_on_until(view, goal, scope), goal.accepted is not None
     if goal.accepted is None and goal.ended is not None:
         yield goal.ended, goal.ended, True
 
 
 def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:
-    """Returns times (inclusive), and whether each is known to begin then, as an array, N x 3."""
+    """Returns spans (inclusive), and whether each is known to begin then, as an array (N x 3)."""
     return np.array([*spans], np.int64).reshape(-1, 3)
 
 
 def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> StoredMessage | None:
-    """Returns what a latched topic had said last before a moment, if it meets a condition."""
+    """Returns the last message of a latched topic before a moment, if it meets a condition."""
     held = held_at(view, topic, moment)
     if held is None:
         return None
-    own = condition.of_type(held.type, view.extractor)
-    return held if own.matches(view.value(held)) else None
+    for_type = condition.of_type(held.type, view.extractor)
+    return held if for_type.matches(view.value(held)) else None
 
 
 def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:
-    """Yields which latched topics met a condition when a window began, by an earlier message."""
+    """Yields a note for each latched topic whose value met the condition when the window began."""
     for topic in search.topics:
         before = met_before(view, topic, search.condition, window.asked()[0])
         if before is not None:
@@ -350,7 +389,10 @@ def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Ite
 
 
 def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage | None:
-    """Returns the last match, or what held without one; None where its bag was deleted since."""
+    """Returns the last match of a run, or the message before it if the run has none.
+
+    None if its bag was deleted since.
+    """
     if not run.messages:
         return view.stream.last(run.topic, run.last + 1)
     at = TimeWindow(run.last, run.last + 1)
@@ -359,10 +401,10 @@ def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage 
 
 
 def _lasted_until(view: View, run: Run, scope: Scope) -> Ns:
-    """Returns until when a state lasted: to the message that says otherwise, or the window's end.
+    """Returns until when (ns) a state lasted: until a message says otherwise, or the window ends.
 
-    To its last match where a silence is next; so does a log entry. What a latched topic states
-    lasts through silences. Not beyond the end of a scope.
+    A state lasts until its last match if a silence follows, and so does a log entry. A state of a
+    latched topic lasts through silences. No state lasts beyond the scope.
     """
     last = run.last
     if view.timeline.is_log(run.topic):
@@ -383,12 +425,13 @@ def _sighting(
     scope: Scope,
     frame_id: str | None,
 ) -> Sighting:
-    """Returns the result, with where the robot was and, at the newest match, the thing.
+    """Returns a run as a sighting, with the places of the thing and of the robot.
 
-    What happens is where the robot was when it began; a thing is where it was last seen from.
+    The thing is where its newest match has it; the robot where it was then, or without a thing,
+    where it was at the first match.
     """
     message = view.memory.reader.decode(newest.record)
-    value, detections = _counted(view, condition, newest.type, message)
+    value, detections = _counted_content(view, condition, newest.type, message)
     labels = {detection.label for detection in detections}
     thing = _sought_detection(detections, condition)
     robot_at_first = thing is None and run.begun > 0
@@ -416,16 +459,16 @@ def _sighting(
     )
 
 
-def _counted(
+def _counted_content(
     view: View, condition: Condition, type_name: str, message: object
 ) -> tuple[JsonValue, Sequence[Detection]]:
-    """Returns what of a message counts for a condition, and the detections in that."""
+    """Returns the part of a message that counts for a condition, and the detections in it."""
     value = condition.counted(view.extractor.exact(message, type_name))
     return value, detections_of(value, view.extractor.frame(message))
 
 
 def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
-    """Returns until when a goal went on; one that has not ended until another run of a recorder."""
+    """Returns until when (ns) a goal was active: until it ended, or the recorder's run did."""
     if goal.ended is not None or goal.is_lost:
         return goal.last
     _, end = scope.window.asked()
@@ -435,7 +478,7 @@ def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
 
 
 def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None) -> Sighting:
-    """Returns a goal as a sighting, with where the robot was when it ended or was last listed."""
+    """Returns a goal as a sighting, with the robot's pose when it ended or was last listed."""
     message = view.stream.last(goal.topic, goal.last + 1)
     robot = None
     if message is not None:
@@ -456,10 +499,10 @@ def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None
 def _with_fields(
     view: View, sighting: Sighting, newest: StoredMessage, fields: Sequence[str]
 ) -> Sighting:
-    """Returns a sighting with the fields of its last message in place of matched texts.
+    """Returns a sighting with fields of its last message in place of matched texts.
 
     Raises:
-        InvalidArgumentsError: the message does not have them.
+        InvalidArgumentsError: the message does not have the fields.
     """
     shown = view.extractor.shown(view.memory.reader.decode(newest.record), newest.type, fields)
     view.notes.add(*shown.notes)
@@ -476,42 +519,42 @@ def _place_of_thing(
     thing: Detection | None,
     frame_id: str | None,
 ) -> LabelledPlace | None:
-    """Returns where the thing of a sighting was, by its newest message that can be placed.
+    """Returns where the thing of a sighting was, by the newest message that can be placed.
 
-    The newest message of all may be newer than the last transform: then one of those just before it
-    counts. A note says where none of them can be placed.
+    The newest message of all may be newer than the last transform. If no message can be placed, a
+    note says so, and the place is in the frame of the message.
     """
     targets = _target_frames(view, robot, frame_id)
-    spot = _place_of_detection(view, thing, newest, targets)
-    if spot is None or spot.frame_id in targets:
-        return spot
+    place = _place_of_detection(view, thing, newest, targets)
+    if place is None or place.frame_id in targets:
+        return place
     try:
         near = TimeWindow.around(newest.time, TF_CACHE_NS)
-        if not any(connects(view, (target, spot.frame_id), near) for target in targets):
-            return spot
+        if not any(connects(view, (target, place.frame_id), near) for target in targets):
+            return place
     except QueryTimeoutError:
-        return spot
+        return place
     window = TimeWindow(first, newest.time)
     before = view.stream.messages([newest.topic], window, newest_first=True)
     for stored in islice(before, _MOST_TRIED):
         message = view.bags.decode(stored)
         if message is None:
             continue
-        value, detections = _counted(view, condition, stored.type, message)
+        value, detections = _counted_content(view, condition, stored.type, message)
         if condition.of_type(stored.type, view.extractor).matches(value):
             thing = _sought_detection(detections, condition)
             earlier = _place_of_detection(view, thing, stored, targets)
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(
-        f"the place of the sighting at {unix_text(newest.time)} is in {spot.frame_id}: "
+        f"the place of the sighting at {unix_text(newest.time)} is in {place.frame_id}: "
         f"no transform leads to {' or '.join(targets)} at that time"
     )
-    return spot
+    return place
 
 
 def _target_frames(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str, ...]:
-    """Returns the frames that places are given in, the first that can be had."""
+    """Returns the frames in which places are wanted, the best one first."""
     if frame_id is not None:
         return (frame_id,)
     frames = (view.limits.map_frame, "" if robot is None else robot.frame_id)
@@ -521,7 +564,10 @@ def _target_frames(view: View, robot: Pose | None, frame_id: str | None) -> tupl
 def _place_of_detection(
     view: View, thing: Detection | None, message: StoredMessage, targets: Sequence[str]
 ) -> LabelledPlace | None:
-    """Returns where the thing of a message was: in one of some frames, or the message's own."""
+    """Returns where a message has a thing, in the first target that it can be placed in.
+
+    In no such frame it is in the message's own.
+    """
     if thing is None or thing.place is None:
         return None
     seen, time = Pose(thing.place, None, thing.frame_id), seen_at(view, message)
@@ -536,9 +582,9 @@ def _place_of_detection(
 
 
 def _sought_detection(detections: Sequence[Detection], condition: Condition) -> Detection | None:
-    """Returns the detection that a condition is about: by label or place, or the only one.
+    """Returns the detection that a condition is about, by its label or place, or the only one.
 
-    Of several it is one with a place, and of these the one with the best score.
+    Of several it is one with a place, if any; of these the one with the best score.
     """
     test = condition.test
     if isinstance(test, NearPosition):

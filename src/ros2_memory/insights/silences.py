@@ -1,4 +1,4 @@
-"""Silences that bear on a question: a topic with a usual rate had no message, the robot was on."""
+"""Silences that bear on a question: a topic with a usual rate had no messages while others had."""
 
 from __future__ import annotations
 
@@ -42,41 +42,42 @@ _ALIKE_NS: Final[Ns] = 30 * NS_PER_S
 def silences_of(
     memory: Memory, snapshot: Snapshot, first: Ns = MIN_NS, last: Ns = MAX_NS
 ) -> list[Silence]:
-    """Returns all silences that reach into a time (inclusive), in order of time.
+    """Returns all silences that overlap a time (ns, inclusive), in order of time.
 
-    A latched topic holds, and is never silent. Nor was one silent where its messages were deleted.
+    A latched topic is never silent, since its value holds. Where messages were deleted, no topic
+    was silent.
     """
-    bag_dir, everything = memory.index.bag_dir, TimeWindow.everything()
-    is_latched = cache(partial(memory.limits.latching.is_latched, snapshot))
+    bag_dir, latching = memory.index.bag_dir, memory.limits.latching
     excluded = excluded_spans(bag_dir)
-    deleted = cache(lambda topic: cut_spans(bag_dir, topic, everything))
-    found: list[Silence] = []
+    deleted = cache(lambda topic: cut_spans(bag_dir, topic, TimeWindow.everything()))
+    is_latched = cache(partial(latching.is_latched, snapshot))
+    silences: list[Silence] = []
     for silence in _all_silences(bag_dir, snapshot):
         if silence.within(first, last) is not None and not is_latched(silence.topic):
-            found += _outside_deleted(snapshot, silence, excluded, deleted(silence.topic))
-    return sorted(found, key=lambda silence: (silence.start, silence.end, silence.topic))
+            silences += _outside_deleted(snapshot, silence, excluded, deleted(silence.topic))
+    return sorted(silences, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
 def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
-    """Returns those that bags show, and those that deleted bags showed."""
-    shown: defaultdict[str, Spans] = defaultdict(list)
-    for kept in snapshot.silences:
-        shown[kept.topic].append((kept.start, kept.end))
-    # Until its bags are deleted, they show it as well.
-    deleted = [
-        silence
-        for silence in map(snapshot.prolonged, map(Silence._make, read_thinned(bag_dir).silences))
-        if not overlaps_any(shown[silence.topic], silence.start, silence.end - 1)
-    ]
-    return [*snapshot.silences, *deleted]
+    """Returns the silences in bags, and in thinned bags before they were thinned."""
+    silences = [*snapshot.silences]
+    spans_by_topic: defaultdict[str, Spans] = defaultdict(list)
+    for silence in silences:
+        spans_by_topic[silence.topic].append((silence.start, silence.end))
+    for columns in read_thinned(bag_dir).silences:
+        silence = snapshot.prolonged(Silence._make(columns))
+        # Until the original bags are deleted, they show the same silence.
+        if not overlaps_any(spans_by_topic[silence.topic], silence.start, silence.end - 1):
+            silences.append(silence)
+    return silences
 
 
 def _outside_deleted(
     snapshot: Snapshot, silence: Silence, excluded: Spans, deleted: Sequence[Span]
 ) -> Iterator[Silence]:
-    """Yields a silence, or the parts of it before and after messages that were deleted.
+    """Yields a silence, or its parts before and after deleted messages, if they are long enough.
 
-    None that lasts long enough only with times that were excluded.
+    Nothing, if a silence is only long enough with the times in which recording was excluded.
     """
     shortest = snapshot.shortest_silence(silence.topic)
     whole = [(silence.start, silence.end)]
@@ -87,7 +88,7 @@ def _outside_deleted(
         yield silence
         return
     if silence.length < silence.end - silence.start:
-        return  # the robot was off for a while, and which part that was in is not known
+        return  # the robot was off for a while, and it is unknown in which part
     for start, end in without(whole, deleted):
         if end - start >= shortest:
             goes_on = silence.goes_on and end == silence.end
@@ -95,7 +96,7 @@ def _outside_deleted(
 
 
 def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
-    """Yields the silences in a window, in order, as far as they are inside."""
+    """Yields the parts of silences in a window, in order."""
     start, end = window.asked()
     for silence in silences_of(view.memory, view.snapshot, start, end):
         part = silence.within(start, end)
@@ -104,19 +105,19 @@ def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
 
 
 def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[Span]:
-    """Returns the times of a window in which a topic was not recorded, in order, none overlapping.
+    """Returns the times of a window without messages of a topic, in order, none overlapping.
 
-    Nothing was recorded, or the topic has a usual rate and was silent.
+    These are gaps in the recording, and silences of the topic.
     """
-    silences = (silence for silence in silences_in(view, window) if silence.topic == topic)
-    silent = ((silence.start, silence.end) for silence in silences)
+    silences = [silence for silence in silences_in(view, window) if silence.topic == topic]
+    silent = [(silence.start, silence.end) for silence in silences]
     return united([*recording_gaps(view, window), *silent])
 
 
 def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:
-    """Returns the sentence on when topics were silent in a window, for an answer of "never".
+    """Returns the sentence on the longest silences of topics in a window, if there were any.
 
-    The longest silences are named. Empty where there was none.
+    An answer of "never" needs it: matches may be missing there.
     """
     silences = [silence for silence in silences_in(view, window) if silence.topic in topics]
     if not silences:
@@ -130,11 +131,10 @@ def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -
     return (f"silent while the robot was on, so not searched: {listed(names, len(silences))}",)
 
 
-def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:
-    """Returns silences, in order, with those of several topics at about the same time together."""
+def group_silences(silences: Iterable[Silence]) -> list[list[Silence]]:
+    """Returns silences, in order, in groups that begin and end at about the same time."""
     groups: list[list[Silence]] = []
     for silence in silences:
-        # They fell silent together, and returned together.
         nth = bisect_left(groups, silence.start - _ALIKE_NS, key=lambda group: group[0].start)
         alike = [group for group in groups[nth:] if abs(silence.end - group[0].end) <= _ALIKE_NS]
         if alike:

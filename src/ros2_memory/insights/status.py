@@ -38,23 +38,23 @@ from ros2_memory.retention.inventory import state_bytes_in
 from ros2_memory.things.unseen import describe_hung
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.history.context import Call, Latching, Memory
     from ros2_memory.index.snapshot import Snapshot
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
 _UNHEARD_NS: Final[Ns] = 30 * NS_PER_S
-"""As long as a silence lasts at least."""
+"""The shortest time without messages that is a problem: as long as the shortest silence."""
 DIED: Final = "died"
 MAX_MOMENTS: Final = 5
 """Saved moments in a status; the resource has more."""
 _SILENT_PERIODS: Final = 10
-"""A topic is silent after so many of its usual periods without a message."""
+"""A topic falls silent after this many of its usual periods without a message."""
 _MIN_MESSAGES: Final = 5
 """A topic with fewer messages has no usual period."""
 _GROWTH_NS: Final[Ns] = 24 * 3600 * NS_PER_S
-"""Growth is measured over the newest data of this length."""
+"""Growth is measured over the newest day."""
 _SHORTEST_RATED_NS: Final[Ns] = 10 * NS_PER_MS
 _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 _LEAST_GROWTH_NS: Final[Ns] = NS_PER_S
@@ -70,14 +70,11 @@ def memory_status(memory: Memory, call: Call) -> Status:
     latest = snapshot.dating.latest
     now = memory.now(wall, latest, call)
     live = heartbeat is not None and heartbeat.is_live(wall)
-    # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
-    notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
     heard = _last_heard(snapshot) if live else latest
     recorder = ANOTHER if any(bag.growing for bag in snapshot.active) else None
     if heartbeat is not None:
         recorder = state_of(heartbeat, live=live)
     mixed = describe_mixed(memory, call)
-    until_now = TimeWindow(MIN_NS, max(wall, latest or wall) + 1)
     gaps = [*unexcluded(view, view.gaps(TimeWindow.everything()))]
     stalls = {*gaps} & {pause.span for pause in snapshot.suspects}
     moments = None
@@ -106,41 +103,60 @@ def memory_status(memory: Memory, call: Call) -> Status:
         unread=len(snapshot.unread),
         budget=budget_of(memory, snapshot, heartbeat, wall),
         moments=moments,
-        problems=(
-            *problems_of(snapshot, heartbeat, wall),
-            *_describe_unheard(heard, latest),
-            *missing_data(view),
-            *describe_hung(view, until_now),
-            *dict.fromkeys(f"{sentence.partition(':')[0]} (see notes)" for sentence in mixed),
-            *describe_gaps(view, until_now, explained=True),
-            *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
-        ),
-        notes=(
-            *view.notes.sentences(),
-            *filter(None, (*notes, describe_leaving(memory.index.bag_dir))),
-            *mixed,
-            *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
-            *describe_cut(memory.index.bag_dir, TimeWindow.everything()),
-        ),
+        problems=tuple(_status_problems(view, heartbeat, heard, mixed, wall)),
+        notes=tuple(_status_notes(view, heartbeat, mixed, live=live)),
     )
 
 
+def _status_problems(
+    view: View, heartbeat: Heartbeat | None, heard: Ns | None, mixed: Sequence[str], wall: Ns
+) -> Iterator[str]:
+    """Yields what is wrong. `mixed` are the sentences on recordings of several robots."""
+    latest, bag_dir = view.snapshot.dating.latest, view.memory.index.bag_dir
+    until_now = TimeWindow(MIN_NS, max(wall, latest or wall) + 1)
+    yield from problems_of(view.snapshot, heartbeat, wall)
+    yield from _describe_unheard(heard, latest)
+    yield from missing_data(view)
+    yield from describe_hung(view, until_now)
+    yield from dict.fromkeys(f"{sentence.partition(':')[0]} (see notes)" for sentence in mixed)
+    yield from describe_gaps(view, until_now, explained=True)
+    yield from describe_lost(bag_dir, TimeWindow.everything())
+
+
+def _status_notes(
+    view: View, heartbeat: Heartbeat | None, mixed: Sequence[str], *, live: bool
+) -> Iterator[str]:
+    """Yields what explains a status, and is no problem."""
+    bag_dir, everything = view.memory.index.bag_dir, TimeWindow.everything()
+    yield from view.notes.sentences()
+    if heartbeat is not None and live:
+        # What is kept too long while the clock may be wrong, and what no lake has.
+        yield from filter(None, (heartbeat.age_held, heartbeat.unshipped))
+    leaving = describe_leaving(bag_dir)
+    if leaving:
+        yield leaving
+    yield from mixed
+    yield from describe_excluded(bag_dir, everything)
+    yield from describe_cut(bag_dir, everything)
+
+
 def gaps_with_deleted(view: View, gaps: Iterable[Span]) -> tuple[Gap, ...]:
-    """Returns gaps, each with how much of it retention deleted."""
+    """Returns gaps, each with how much of it (ns) retention deleted."""
     deleted = deleted_between(view, TimeWindow.everything())
     return tuple(Gap(start, end, length_in(deleted, start, end)) for start, end in gaps)
 
 
 def state_of(heartbeat: Heartbeat, *, live: bool) -> str:
-    """Returns the recorder's state; `died` where it ended without saying so."""
-    is_over = live or heartbeat.state is RecorderState.STOPPED
-    return str(heartbeat.state) if is_over else DIED
+    """Returns the recorder's state; `died` if it ended without saying so."""
+    if live or heartbeat.state is RecorderState.STOPPED:
+        return str(heartbeat.state)
+    return DIED
 
 
 def _last_heard(snapshot: Snapshot) -> Ns | None:
-    """Returns the newest time of a topic that no recorder publishes itself; else of any.
+    """Returns the newest time (ns) on the robot's own topics; on any topic without these.
 
-    The recorder logs at each split, so its own topics go on when the robot is dead.
+    The recorder logs at each split, so its topics go on when the robot is dead.
     """
     times = [
         totals.last
@@ -153,7 +169,7 @@ def _last_heard(snapshot: Snapshot) -> Ns | None:
 
 
 def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:
-    """Yields that only the recorder's own topics go on, if they do."""
+    """Yields that only the recorder's own topics have messages, if that is so."""
     if heard is not None and latest is not None and latest - heard > _UNHEARD_NS:
         yield (
             f"no message since {unix_text(heard)} but on topics that the recorder publishes "
@@ -164,8 +180,7 @@ def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:
 def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
     """Yields why answers may be missing something.
 
-    A recorder that should be recording is a problem where it does not; one that was stopped is
-    none.
+    That a recorder was stopped is no problem. That it does not record otherwise is one.
     """
     if snapshot.problem:
         yield snapshot.problem
@@ -179,7 +194,8 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
     if not heartbeat.is_live(wall):
         yield "the recorder died"
         return
-    if reason := _why_not_recording(heartbeat):
+    reason = _why_not_recording(heartbeat)
+    if reason is not None:
         yield reason
     if heartbeat.held_back is not None:
         yield heartbeat.held_back
@@ -188,7 +204,7 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
 
 
 def _why_not_recording(heartbeat: Heartbeat) -> str | None:
-    """Returns why a live recorder does not record, where that is known or lasts; else None."""
+    """Returns why a live recorder does not record; None if it does, or if it only just started."""
     error = heartbeat.last_error
     match heartbeat.state:
         case RecorderState.PAUSED:
@@ -202,13 +218,13 @@ def _why_not_recording(heartbeat: Heartbeat) -> str | None:
 
 
 def required_missing(heartbeat: Heartbeat) -> Iterator[str]:
-    """Yields which topics of `recording.required` are not recorded as required, if any."""
+    """Yields that topics of `recording.required` are not recorded, if any."""
     if heartbeat.required_missing:
         yield f"required, and not recorded: {listed(heartbeat.required_missing)}"
 
 
 def unrecorded(heartbeat: Heartbeat) -> Iterator[str]:
-    """Yields the topics that are offered and not recorded, a sentence for each reason."""
+    """Yields a sentence for each reason why offered topics are not recorded."""
     if unknown := heartbeat.unknown_types:
         yield f"not recorded, since ros2 bag record does not know the type: {listed(unknown)}"
     if heartbeat.unheard:
@@ -226,40 +242,42 @@ def missing_data(view: View) -> Iterator[str]:
     snapshot = view.snapshot
     if snapshot.problem is None and not snapshot.bags:
         yield nothing_here(snapshot)
-    undecided = [bag for bag in snapshot.active if not bag.growing and bag.reason != HELD_BACK]
-    broken = view.memory.scanner.damaged_parts(snapshot.bags)
     at, details = "data_time_range", "data_time_range has the details"
-    for number, one, several, what in (
-        (len(undecided), "file has", "files have", "no end yet: being written, or left by a crash"),
-        (
-            snapshot.timeline.disk_use[1],
-            "bag was",
-            "bags were",
-            "left open by a crash: unwritten messages are lost",
-        ),
-        (len(snapshot.unread), "file is", "files are", f"not read; {at} says why"),
-        (
-            len(bags_with_remarks(snapshot)),
-            "bag is",
-            "bags are",
-            f"incomplete or contradictory; {details}",
-        ),
-        (len(broken), "bag", "bags", f"could not be read whole; {at} names what is damaged"),
-        (len(snapshot.dating.misdated), "bag is", "bags are", f"dated by a wrong clock; {details}"),
-    ):
-        if number:
-            yield f"{counted(number, one, several)} {what}"
+    undecided = [bag for bag in snapshot.active if not bag.growing and bag.reason != HELD_BACK]
+    if undecided:
+        files = counted(len(undecided), "file has", "files have")
+        yield f"{files} no end yet: being written, or left by a crash"
+    _, left_open_bags = snapshot.timeline.disk_use
+    if left_open_bags:
+        bags = counted(left_open_bags, "bag was", "bags were")
+        yield f"{bags} left open by a crash: unwritten messages are lost"
+    if snapshot.unread:
+        files = counted(len(snapshot.unread), "file is", "files are")
+        yield f"{files} not read; {at} says why"
+    contradictory = bags_with_remarks(snapshot)
+    if contradictory:
+        bags = counted(len(contradictory), "bag is", "bags are")
+        yield f"{bags} incomplete or contradictory; {details}"
+    broken = view.memory.scanner.damaged_parts(snapshot.bags)
+    if broken:
+        bags = counted(len(broken), "bag", "bags")
+        yield f"{bags} could not be read whole; {at} names what is damaged"
+    if snapshot.dating.misdated:
+        bags = counted(len(snapshot.dating.misdated), "bag is", "bags are")
+        yield f"{bags} dated by a wrong clock; {details}"
     yield from describe_absent(view.memory.absent_splits(snapshot))
-    if alone := [topic for topic in view.timeline.topics() if _has_times_alone(view, topic)]:
+    alone = [topic for topic in view.timeline.topics() if _has_times_alone(view, topic)]
+    if alone:
         topics = counted(len(alone), "topic")
         yield f"of {topics} there are only the times here: {listed(alone)}"
-    if undecodable := {row.topic for row in undecodable_topics(view)}:
+    undecodable = {row.topic for row in undecodable_topics(view)}
+    if undecodable:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
 
 
 def _has_times_alone(view: View, topic: str) -> bool:
-    """Returns whether the first bag of a topic has no payloads of it: in a lake the oldest are."""
+    """Returns whether the first bag of a topic lacks its payloads: in a lake the oldest bags do."""
     first = (view.timeline.first_with(topic, name) for name in view.timeline.types_of(topic))
     with suppress(BagError):  # it was deleted just now
         return any(topic in view.memory.reader.times_alone(bag.path) for bag in first)
@@ -267,10 +285,10 @@ def _has_times_alone(view: View, topic: str) -> bool:
 
 
 def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
-    """Yields topics that had messages often, and none when the newest data was recorded.
+    """Yields topics that had messages often, and have none in the newest data.
 
-    Not those of before a long gap: that may be another robot's recording. Nor those that were
-    silent for as long before, as those of a robot that drives are whenever it is docked.
+    A topic from before a long gap does not count: it may be another robot's. Nor does a topic that
+    was silent for as long before, such as those of a robot that is docked at times.
     """
     latest, latching = snapshot.dating.latest, memory.limits.latching
     begin = snapshot.newest_stretch
@@ -286,8 +304,8 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
             continue
         first = min(totals.first for totals in parts)
         recorded = last - first - length_in(snapshot.gaps, first, last)
-        usual = recorded // (messages - 1)
-        longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))
+        usual_period = recorded // (messages - 1)
+        longest = max(_SILENT_PERIODS * usual_period, snapshot.longest_silence(topic))
         since = TimeWindow(last + 1, latest + 1)
         excluded = length_in(excluded_spans(memory.index.bag_dir, since), last, latest)
         is_long = latest - last - excluded > max(SILENT_AFTER_NS, longest)
@@ -298,10 +316,10 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
 def budget_of(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:
     """Returns what counts in the budget, how fast that grows, and how much may be kept.
 
-    Growth is only predicted while a live recorder records. Where none is configured there is no
-    budget either.
+    Growth is only predicted while a live recorder records. Without a configured recorder there is
+    no budget.
     """
-    kept, latest = memory.limits.kept, snapshot.dating.latest
+    kept = memory.limits.kept
     used, _ = snapshot.timeline.disk_use
     if kept is None:
         return Budget(used, None, None, None)
@@ -313,19 +331,27 @@ def budget_of(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, w
     if heartbeat is not None and recording and heartbeat.is_live(wall):
         if heartbeat.counted_bytes is not None:
             used, state = heartbeat.counted_bytes, heartbeat.state_bytes
-        since = latest or 0
-        recent = takewhile(lambda bag: bag.end >= since - _GROWTH_NS, reversed(snapshot.bags))
-        others = frozenset[str]() if foreign is None else foreign.files
-        own = [bag for bag in recent if bag.file not in others]
-        span = since - min((bag.start for bag in own), default=since)
-        if span >= _LEAST_GROWTH_NS:
-            per_day = sum(bag.size for bag in own) * _GROWTH_NS // span
+        per_day = _growth_per_day(snapshot, frozenset() if foreign is None else foreign.files)
     foreign_bytes = None if foreign is None else foreign.total_bytes
     return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes, state)
 
 
+def _growth_per_day(snapshot: Snapshot, foreign: Collection[str]) -> int | None:
+    """Returns how many bytes the bags of the newest day grow per day; None if they span too little.
+
+    `foreign` are the files that the recorder did not make.
+    """
+    latest = snapshot.dating.latest or 0
+    recent = takewhile(lambda bag: bag.end >= latest - _GROWTH_NS, reversed(snapshot.bags))
+    own = [bag for bag in recent if bag.file not in foreign]
+    span = latest - min((bag.start for bag in own), default=latest)
+    if span < _LEAST_GROWTH_NS:
+        return None
+    return sum(bag.size for bag in own) * _GROWTH_NS // span
+
+
 def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
-    """Returns the bags that a crash left open, each with what is lost of it."""
+    """Returns the bags that a crash left open, with what is lost of each."""
     return tuple(
         SetAside(bag.path, "; ".join(bag.summary.remarks) or "left open by a crash")
         for bag in snapshot.timeline.faulty(TimeWindow.everything())
@@ -334,13 +360,13 @@ def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
 
 
 def bags_with_remarks(snapshot: Snapshot) -> list[BagFile]:
-    """Returns the bags with remarks other than on a crash or a clock, in bag order."""
+    """Returns the bags with remarks on anything but a crash or a clock, in bag order."""
     bags = snapshot.timeline.faulty(TimeWindow.everything())
     return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
 
 
 def clock_faults(snapshot: Snapshot) -> tuple[SetAside, ...]:
-    """Returns the bags that a wrong clock dated, each with how that is known."""
+    """Returns the bags that a wrong clock dated, with how that is known."""
     return tuple(SetAside(fault.bag.path, fault.reason) for fault in snapshot.dating.faults)
 
 
@@ -354,19 +380,22 @@ def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
 
 
 def undecodable_types(view: View, topic: str) -> dict[str, str]:
-    """Returns why messages of a topic cannot be decoded, by type; from one bag for each type."""
-    types = view.timeline.types_of(topic)
-    reasons = {type_name: _why_undecodable(view, topic, type_name) for type_name in types}
-    return {type_name: reason for type_name, reason in reasons.items() if reason}
+    """Returns why messages of a topic cannot be decoded, by type."""
+    reasons = {}
+    for type_name in view.timeline.types_of(topic):
+        reason = _why_undecodable(view, topic, type_name)
+        if reason:
+            reasons[type_name] = reason
+    return reasons
 
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
-    timeline, columns = view.timeline, view.memory.scanner
-    bag = timeline.first_with(topic, type_name)
-    channels = columns.channels(timeline, bag)
+    """Returns why the first bag with a topic of a type cannot be decoded; None if it can."""
+    bag = view.timeline.first_with(topic, type_name)
+    channels = view.memory.scanner.channels(view.timeline, bag) or view.bags.channels(bag)
     reasons = [
         view.memory.reader.undecodable(channel)
-        for channel in channels or view.bags.channels(bag)
+        for channel in channels
         if channel.topic == topic and channel.type == type_name
     ]
     return next(filter(None, reversed(reasons)), None)
@@ -375,8 +404,8 @@ def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
     """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
 
-    None for a latched topic, for a log, whose lines come when something happens, and if no bag has
-    two messages of it, or all came at once.
+    None for latched topics, and for logs, whose lines come when something happens. None as well if
+    no bag has two messages, or all came at once.
     """
     if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None

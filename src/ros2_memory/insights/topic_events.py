@@ -1,11 +1,12 @@
 """The events of one topic in a window, from what its messages state; and the goals of actions.
 
-A status message of an action lists every goal that its server still knows, also those that ended
-some minutes before. So a goal begins where a message lists it that the one before does not, and
-ends where its status becomes succeeded, canceled or aborted (action_msgs/msg/GoalStatus).
+A status message of an action lists every goal that its server still knows, also goals that ended
+some minutes before. So a goal begins with the first message that lists it, unless it may have been
+listed before. It ends when its status becomes succeeded, canceled or aborted
+(action_msgs/msg/GoalStatus).
 
-`goals_asked` is for searches: a condition on the status of such a topic is met by goals, not by
-messages, since what a server lists says nothing of when it happened.
+A search for a status finds goals, not messages (`goals_matching`): a message that lists a goal says
+nothing of when the goal got that status.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -60,37 +62,37 @@ _UNDECODED: Final = Reason("could not be decoded, so their content is missing", 
 
 
 def flag_name(topic: str, flag: KnownState | Change) -> str:
-    """Returns how a boolean of a topic is called."""
+    """Returns the name of a boolean of a topic, for sentences."""
     return topic if flag.name == "value" else f"{topic} {flag.name}"
 
 
 def toggle_sentence(topic: str, toggle: Change) -> str:
-    """Returns a sentence for a boolean of a topic that toggle_sentence."""
+    """Returns "... became true" for a boolean that toggled."""
     return f"{flag_name(topic, toggle)} became {'true' if toggle.value else 'false'}"
 
 
 def flags_before(view: View, topic: str, first: Ns) -> dict[str, bool]:
-    """Returns the booleans of the message before one at a log time (ns), by their names.
+    """Returns the booleans in the message before a log time (ns), by their names.
 
-    Without those that may have toggle_sentence in between, since a message there may be missing.
+    Empty if a message may be missing in between: the booleans may have toggled there.
     """
     holds_on = is_latched(view, topic)
     message = held_at(view, topic, first) if holds_on else view.stream.last(topic, first)
-    if message is None or not (holds_on or _lacks_none(view, topic, message.time, first)):
+    if message is None or not (holds_on or _is_unbroken(view, topic, message.time, first)):
         return {}
     flags, _ = (events_of_messages(view, [message]) or TopicEvents(1, 0)).of_kind(FLAG)
     return {flag.name: bool(flag.last) for flag in flags}
 
 
-def _lacks_none(view: View, topic: str, before: Ns, first: Ns) -> bool:
-    """Returns whether no message of a topic may be missing between two, by their log times (ns)."""
+def _is_unbroken(view: View, topic: str, before: Ns, first: Ns) -> bool:
+    """Returns whether no message of a topic can be missing between two log times (ns)."""
     between = TimeWindow(before, first)
     is_broken = any(between.contains(at) for at in breaks_of(view, topic))
     return not is_broken and not unrecorded_times(view, topic, between)
 
 
 def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
-    """Returns what the messages of a topic report in a window; None where there is no message.
+    """Returns what the messages of a topic report in a window; None without messages.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -99,9 +101,7 @@ def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
 
 
 def events_back(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, TopicEvents]]:
-    """Yields the events in times that do not overlap, the newest first.
-
-    Each with a log time (ns) before which none of its events is.
+    """Yields the events in consecutive times, the newest first, with the start of the time (ns).
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -116,74 +116,78 @@ def events_back(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns
             is_whole = all(rows.part is not None for rows in overlapping)
             is_wanted = is_whole or stretch.parts is not None or not view.call.stored
             if stretch.window.contains(first) and is_wanted:
-                # Those before it in the stretch are wanted next.
+                # The older parts of the stretch are asked for next.
                 before = min(first - stretch.window.start, STRETCH_NS)
-                yield first, _events_of_tables(view, columns, overlapping, before)
+                yield first, _events_of_rows(view, columns, overlapping, before)
 
     return joined_back(view, opened, EVENTS, make, lambda stretch: stretch.key(topic))
 
 
 def make_events(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterator[Ns]:
-    """Makes the events of the parts of some topics in a window, the newest first.
+    """Makes and stores the events of parts in a window, the newest first.
 
-    Yields a log time (ns) of each.
+    Yields the log time (ns) of each part.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    # The parts that lie across a bound of the window are made, too.
+    # Widened, so that parts across a bound of the window are made, too.
     of_topics = [events_back(view, topic, window.widened(PART_NS)) for topic in topics]
     yield from merge(*((at for at, _ in timed) for timed in of_topics), reverse=True)
 
 
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
-    """Returns what messages of one topic report; None without any."""
+    """Returns what messages of one topic report; None without messages."""
     return events_of(_stated_in_messages(view, messages))
 
 
 def events_by_bag(
     view: View, tables: Iterable[Rows], files: Container[str]
 ) -> dict[str, TopicEvents]:
-    """Returns the events that a topic has in each of some bags alone, by their files.
+    """Returns the events that a topic has in each bag alone, by the bag's file.
 
     Args:
         view: of the call.
-        tables: all rows of the topic, of these bags and of others.
+        tables: all rows of the topic, in these bags and in others.
         files: of the bags.
     """
     columns = StatedColumns(view.extractor)
     stated_of_bags: dict[str, list[Stated]] = defaultdict(list)
     for rows in tables:
         stated = _stated_in_rows(view, columns, rows)
+        is_whole = len(stated.times) == len(rows)  # else some messages are undecodable
         for bag, positions in rows.bag_rows(files):
-            is_whole = len(stated.times) == len(rows)  # else some are undecodable
-            some = rows.some(positions)
-            of_bag = stated.at(positions) if is_whole else _stated_in_rows(view, columns, some)
-            stated_of_bags[bag.file].append(of_bag)
-    return {
-        file: events
-        for file, parts in stated_of_bags.items()
-        if (events := events_of(joined_stated(parts))) is not None
-    }
+            if is_whole:
+                stated_of_bags[bag.file].append(stated.at(positions))
+            else:
+                of_bag = _stated_in_rows(view, columns, rows.some(positions))
+                stated_of_bags[bag.file].append(of_bag)
+    events_of_bags = {}
+    for file, parts in stated_of_bags.items():
+        events = events_of(joined_stated(parts))
+        if events is not None:
+            events_of_bags[file] = events
+    return events_of_bags
 
 
-def _events_of_tables(
-    view: View, columns: StatedColumns, together: list[Rows], also_before: Ns
+def _events_of_rows(
+    view: View, columns: StatedColumns, overlapping: list[Rows], also_before: Ns
 ) -> TopicEvents:
-    """Returns the events of tables that overlap in time; those of whole parts are remembered."""
+    """Returns the events of rows that overlap in time; of whole parts from the store."""
 
     def make() -> TopicEvents:
-        stated = joined_stated([_stated_in_rows(view, columns, rows) for rows in together])
+        stated = joined_stated([_stated_in_rows(view, columns, rows) for rows in overlapping])
         return events_of(stated) or TopicEvents(1, 0)
 
-    parts = tuple(rows.part for rows in together if rows.part is not None)
-    topic = together[0].table.channel.topic
-    key = FragmentKey(together[0].first, topic, parts) if len(parts) == len(together) else None
+    parts = tuple(rows.part for rows in overlapping if rows.part is not None)
+    key = None
+    if len(parts) == len(overlapping):
+        key = FragmentKey(overlapping[0].first, overlapping[0].table.channel.topic, parts)
     return remembered(view, EVENTS, key, make, also_before=also_before)
 
 
 def _stated_in_rows(view: View, columns: StatedColumns, rows: Rows) -> Stated:
-    """Returns what the messages of some rows state: by their columns, else by reading them."""
+    """Returns what the messages of rows state: by columns where possible, else by the messages."""
     states = of_columns(view, rows, lambda counting: _stated_by_columns(view, columns, counting))
     if states is None:
         return _stated_in_messages(view, messages_of(view, rows))
@@ -191,7 +195,7 @@ def _stated_in_rows(view: View, columns: StatedColumns, rows: Rows) -> Stated:
 
 
 def _stated_by_columns(view: View, columns: StatedColumns, rows: Rows) -> Stated | None:
-    """Returns what the messages of some rows state; None where all of them have to be read."""
+    """Returns what the messages of rows state; None if all of them must be read."""
     of_table = columns.of(rows.table)
     if of_table is None:
         return None
@@ -206,18 +210,18 @@ def _stated_by_columns(view: View, columns: StatedColumns, rows: Rows) -> Stated
 
 
 def _stated_in_messages(view: View, messages: Iterable[StoredMessage]) -> Stated:
-    """Returns what messages state, in order of log time; nothing of one that is undecodable."""
+    """Returns what messages state, in order of log time; undecodable messages state nothing."""
     states = []
     for message in messages:
         value = view.value(message)
         states.append((message.time, None if value is None else state_of(value, message.type)))
-    # Those of a part come bag after bag, in the order in which bags were stored.
+    # The messages of a part come bag after bag.
     states.sort(key=lambda timed_state: timed_state[0])
     return stated_by([time for time, _ in states], [state for _, state in states])
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:
-    """Adds notes on events of a topic that are left out: too many, or undecodable."""
+    """Notes the messages of a topic that cannot be decoded, and the events that are too many."""
     if events.undecodable:
         messages = counted(events.undecodable, "message")
         view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
@@ -225,7 +229,7 @@ def note_limits(view: View, topic: str, events: TopicEvents) -> None:
 
 
 def note_left_out(view: View, topic: str, events: TopicEvents) -> None:
-    """Adds notes on events of a topic that are too many."""
+    """Notes the events of a topic that are too many."""
     if events.left_out:
         view.notes.add(f"{topic} changes too often to list each change: {events.left_out} more")
     if events.beyond:
@@ -245,12 +249,15 @@ _FAILED: Final = "failed"
 
 
 class GoalRun(NamedTuple):
-    """A goal: when it was accepted and when it ended, as log times, and its last status.
+    """A goal in a window. Times are log times (ns).
 
-    `accepted` is None for a goal that was active before the window, `ended` for one that no message
-    says to have ended. `first` and `last` are the log times between which it is known (inclusive);
-    `goal` is its id in hexadecimal digits. `is_lost`: its server went on without it, as after a
-    restart, and listed it at `last` for the last time.
+    Attributes:
+        goal: its id in hexadecimal digits.
+        accepted: None if it was active before the window.
+        ended: None if no message says that it ended.
+        status: its last status (action_msgs/msg/GoalStatus).
+        first, last: the times between which it is known (inclusive).
+        is_lost: its server went on without it, as after a restart. It was last listed at `last`.
     """
 
     topic: str
@@ -264,81 +271,92 @@ class GoalRun(NamedTuple):
 
     @property
     def action(self) -> str:
-        """The name of its action."""
+        """The name of the action."""
         return action_of(self.topic)
 
     @property
     def outcome(self) -> str | None:
-        """How it ended; None for one that has not."""
+        """How the goal ended; None if it did not."""
         return None if self.ended is None else GOAL_WORDS[self.status]
 
     @property
     def status_word(self) -> str:
-        """Its last status in a word."""
+        """The last status in a word."""
         return _STATUS_WORDS.get(self.status, str(self.status))
 
 
 def action_of(topic: str) -> str:
-    """Returns the name of an action by the topic of its statuses."""
+    """Returns the name of an action by its topic of statuses."""
     return topic.removesuffix(STATUS_TOPIC)
 
 
 def goals_in(
     view: View, window: TimeWindow, events_of_topics: Mapping[str, TopicEvents | None]
 ) -> Iterator[GoalRun]:
-    """Yields the goals that a message of a window lists and that were active in it.
+    """Yields the goals that were active in a window, and that a message in it lists.
 
     `events_of_topics` has what the messages of each topic report in the window.
     """
     for topic, events in events_of_topics.items():
         if events is None or GOALS not in view.timeline.types_of(topic):
             continue
-        # Which goals it listed before: what a window's first message lists need not be new.
-        message_before = view.stream.last(topic, window.start)
-        earlier = None if message_before is None else events_of_messages(view, [message_before])
-        statuses_before, knows_all = dict[str, int](), False
-        if message_before is not None and earlier is not None:
-            statuses_before = {goal.name: goal.last for goal in earlier.of_kind(GOAL)[0]}
-            is_whole = not (earlier.beyond or earlier.undecodable)
-            knows_all = is_whole and _lacks_none(view, topic, message_before.time, events.first)
-        goals = [*_goal_runs(topic, events, statuses_before, knows_all=knows_all)]
-        lost = last_listings(
-            view, topic, window, {goal.goal for goal in goals if goal.ended is None}
-        )
+        goals = [*_goal_runs(topic, events, *_listed_before(view, topic, window, events))]
+        active = {goal.goal for goal in goals if goal.ended is None}
+        listings = last_listings(view, topic, window, active)
         for goal in goals:
-            last = lost.get(goal.goal)
+            last = listings.get(goal.goal)
             yield goal if last is None else goal._replace(last=last, is_lost=True)
 
 
-def last_listings(view: View, topic: str, window: TimeWindow, active: set[str]) -> dict[str, Ns]:
-    """Returns those of some active goals that a window's newest message does not list.
+def _listed_before(
+    view: View, topic: str, window: TimeWindow, events: TopicEvents
+) -> tuple[dict[str, int], bool]:
+    """Returns the goals in the last message before a window, with their statuses.
 
-    Each with the log time of the last message that lists it: a server lists what has not ended for
-    as long as it runs.
+    And whether they are all the goals until the first message of the window.
+    """
+    message = view.stream.last(topic, window.start)
+    earlier = None if message is None else events_of_messages(view, [message])
+    if message is None or earlier is None:
+        return {}, False
+    goals, _ = earlier.of_kind(GOAL)
+    is_whole = not (earlier.beyond or earlier.undecodable)
+    is_all = is_whole and _is_unbroken(view, topic, message.time, events.first)
+    return {goal.name: goal.last for goal in goals}, is_all
+
+
+def last_listings(view: View, topic: str, window: TimeWindow, active: set[str]) -> dict[str, Ns]:
+    """Returns the active goals that a window's newest message lacks, each with its last listing.
+
+    That is the log time (ns) of the last message that lists the goal. A server lists an active goal
+    for as long as it runs, so it has been restarted since.
     """
     listings: dict[str, Ns] = {}
-    unlisted = set(active)
-    newest = view.stream.messages([topic], window, newest_first=True) if unlisted else iter(())
-    for nth, message in enumerate(newest):
+    missing = set(active)
+    if not missing:
+        return listings
+    messages = view.stream.messages([topic], window, newest_first=True)
+    for nth, message in enumerate(messages):
         events = events_of_messages(view, [message])
         if events is None or events.beyond or events.undecodable:
-            break  # what it lists is not known
-        listed = {goal.name for goal in events.of_kind(GOAL)[0]} & unlisted
-        unlisted -= listed
-        listings |= dict.fromkeys(listed if nth else (), message.time)
-        if not unlisted:
+            break  # the message may list goals that are not known
+        goals, _ = events.of_kind(GOAL)
+        listed = missing.intersection(goal.name for goal in goals)
+        missing -= listed
+        if nth > 0:
+            listings |= dict.fromkeys(listed, message.time)
+        if not missing:
             break
     return listings
 
 
-def goals_asked(
+def goals_matching(
     view: View, topics: Sequence[str], condition: Condition, scope: Scope
 ) -> list[GoalRun] | None:
-    """Returns the goals whose last status meets a condition, the one that is known last first.
+    """Returns the goals whose last status meets a condition, the last one first.
 
-    A status is its number and its word; canceled and aborted are failed as well. With a bounded
-    scope a goal counts by where that held when it ended. None where the condition is not on the
-    status of goals alone.
+    With a bounded scope a goal counts by where the scope held when the goal ended. Returns None if
+    the topics do not all list goals, or if the condition is on another field than the status.
 
     Raises:
         InvalidArgumentsError: no status meets the condition.
@@ -348,50 +366,61 @@ def goals_asked(
     field = None if condition.field is None else condition.field.rsplit(".", 1)[-1]
     if types != {GOALS} or field not in {None, _STATUS}:
         return None
-    on_status = replace(condition, field=_STATUS)
-    wanted = {
-        number
-        for number, word in _STATUS_WORDS.items()
-        if on_status.matches({_STATUS: [number, word, *([_FAILED] if word in FAILURES else [])]})
-    }
+    wanted = _statuses_matching(condition)
     if not wanted:
         raise InvalidArgumentsError(
             f"{topics[0]}: the status of a goal is {', '.join(_STATUS_WORDS.values())} "
             f"(0 to {max(_STATUS_WORDS)}), or {_FAILED}, which is canceled or aborted"
         )
-    events_of_topics = {topic: events_in(view, topic, scope.window) for topic in topics}
-    for topic, events in events_of_topics.items():
-        if events is not None:
-            note_limits(view, topic, events)
-    start, _ = scope.window.asked()
-    active = {topic: _active_at(view, topic, start) for topic in topics}
-    known = [
-        goal._replace(first=start)
-        if goal.accepted is None and goal.goal in active[goal.topic]
-        else goal
-        for goal in goals_in(view, scope.window, events_of_topics)
-    ]
-    known += [
-        GoalRun(topic, goal, None, None, status, start, start)
-        for topic, events in events_of_topics.items()
-        if events is None
-        for goal, status in active[topic].items()
-    ]
-    goals = [goal for goal in known if goal.status in wanted]
+    goals = [goal for goal in _known_goals(view, topics, scope.window) if goal.status in wanted]
     goals.sort(key=lambda goal: (goal.last, goal.first, goal.goal), reverse=True)
     goals = [goal for goal in goals if scope.holds_at(goal.last)]
-    if lost := sum(goal.is_lost for goal in goals):
+    lost = [goal for goal in goals if goal.is_lost]
+    if lost:
         view.notes.add(
-            f"{counted(lost, 'goal')} whose end was not published, and which the action server "
-            "listed no more: last is when it did"
+            f"{counted(len(lost), 'goal')} whose end was not published, and which the action "
+            "server listed no more: last is when it did"
         )
     return goals
 
 
-def _active_at(view: View, topic: str, moment: Ns) -> dict[str, int]:
-    """Returns the goals that a latched topic listed last before a moment as active, by statuses.
+def _statuses_matching(condition: Condition) -> set[int]:
+    """Returns the statuses whose number or word meets a condition.
 
-    Empty where another run of the recorder has begun since.
+    Canceled and aborted are also called failed.
+    """
+    on_status = replace(condition, field=_STATUS)
+    matching = set()
+    for number, word in _STATUS_WORDS.items():
+        names: list[JsonValue] = [number, word]
+        if word in FAILURES:
+            names.append(_FAILED)
+        if on_status.matches({_STATUS: names}):
+            matching.add(number)
+    return matching
+
+
+def _known_goals(view: View, topics: Sequence[str], window: TimeWindow) -> Iterator[GoalRun]:
+    """Yields the goals that were active in a window, also those that no message in it lists."""
+    events_of_topics = {topic: events_in(view, topic, window) for topic in topics}
+    for topic, events in events_of_topics.items():
+        if events is not None:
+            note_limits(view, topic, events)
+    start, _ = window.asked()
+    active_at_start = {topic: _active_at(view, topic, start) for topic in topics}
+    for goal in goals_in(view, window, events_of_topics):
+        was_active = goal.accepted is None and goal.goal in active_at_start[goal.topic]
+        yield goal._replace(first=start) if was_active else goal
+    for topic, events in events_of_topics.items():
+        if events is None:
+            for name, status in active_at_start[topic].items():
+                yield GoalRun(topic, name, None, None, status, start, start)
+
+
+def _active_at(view: View, topic: str, moment: Ns) -> dict[str, int]:
+    """Returns the active goals in a latched topic's last message before a moment, with statuses.
+
+    Empty if another run of the recorder has begun since.
     """
     held = held_at(view, topic, moment)
     if held is None or any(held.time <= start < moment for start, _ in view.snapshot.breaks):
@@ -402,11 +431,12 @@ def _active_at(view: View, topic: str, moment: Ns) -> dict[str, int]:
 
 
 def _goal_runs(
-    topic: str, events: TopicEvents, statuses_before: Mapping[str, int], *, knows_all: bool
+    topic: str, events: TopicEvents, statuses_before: Mapping[str, int], knows_all: bool
 ) -> Iterator[GoalRun]:
-    """Yields the goals of an action, given those that were listed before with their statuses.
+    """Yields the goals that an action's messages list, but for those that ended before.
 
-    `knows_all`: these are all until the first message, so what else it lists as ended just did.
+    `statuses_before` has the goals that were listed before. `knows_all`: there were no others, so a
+    goal that is new in the first message has just begun, even if it is listed as ended.
     """
     ends: dict[str, tuple[Ns, int]] = {}
     goals, changes = events.of_kind(GOAL)

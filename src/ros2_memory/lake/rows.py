@@ -44,7 +44,7 @@ from ros2_memory.history.detections import DetectionRows
 from ros2_memory.history.poses import poses_by_bag
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
-from ros2_memory.insights.topic_events import events_by_bag, toggled
+from ros2_memory.insights.topic_events import events_by_bag, toggle_sentence
 from ros2_memory.lake.tables import KEYS, ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import TrackReader
@@ -382,7 +382,9 @@ class RowMaker:
             yield _event(topic, "thing", seen.first, seen.label, **columns)
         _, flips = events.of_kind(FLAG)
         for flip in flips:
-            yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
+            yield _event(
+                topic, "flip", flip.time, toggle_sentence(topic, flip), value=float(flip.value)
+            )
         for error in events.errors:
             reports = {"last_ns": error.last, "count": error.reports}
             yield _event(topic, "error", error.first, error.text, **reports)

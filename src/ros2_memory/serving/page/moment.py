@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.reply import POSE_KEYS, TENTHS_OF_S, JsonObject, Scope, keys, render, rounded
 from ros2_memory.history.view import TimeRange, open_span
-from ros2_memory.insights.changes_before import before
-from ros2_memory.insights.recap import found_events, recap
+from ros2_memory.insights.changes_before import recap_before
+from ros2_memory.insights.recap import events_by_topic, recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.serving.page.span import EVENT, SUMMARY
 
@@ -32,7 +32,7 @@ def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
-    preceding = before(memory, call, at_s, _CHANGES_S, None)
+    preceding = recap_before(memory, call, at_s, _CHANGES_S, None)
     around = recap(
         memory,
         call,
@@ -96,7 +96,7 @@ def sightings_shown(
     view, window = open_span(memory, call, TimeRange(start_s, end_s))
     detectors = [
         topic
-        for topic, events in found_events(view, window).items()
+        for topic, events in events_by_topic(view, window).items()
         if events is not None and events.visible.size
     ]
     rows: list[JsonObject] = []

@@ -32,7 +32,7 @@ from ros2_memory.history.no_data import (
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.fields import fields_of
-from ros2_memory.insights.recap import found_events
+from ros2_memory.insights.recap import events_by_topic
 from ros2_memory.insights.status import usual_rate
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     view = View(memory, call.within(_PATIENT_S), window.stop)
     least = memory.limits.min_score
     in_view = [
-        events.visible for events in found_events(view, window).values() if events is not None
+        events.visible for events in events_by_topic(view, window).values() if events is not None
     ]
     if least:
         in_view = [visible.scoring(least) for visible in in_view]
