@@ -105,13 +105,7 @@ from ros2_memory.insights.status import (
     undecodable_types,
 )
 from ros2_memory.places.driven_inside import farthest_from
-from ros2_memory.places.pose_frames import (
-    axes_of,
-    note_runs,
-    placed,
-    placed_waypoints,
-    with_place,
-)
+from ros2_memory.places.pose_frames import axes_of, note_runs, placed, placed_waypoints, with_place
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:

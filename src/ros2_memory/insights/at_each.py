@@ -18,13 +18,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import (
-    NS_PER_S,
-    START_SLACK_NS,
-    Ns,
-    Span,
-    ns_from_unix,
-)
+from ros2_memory.core.timebase import NS_PER_S, START_SLACK_NS, Ns, Span, ns_from_unix
 from ros2_memory.counts.bins import local_offset
 from ros2_memory.history.coverage import recorded_reach
 from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_window

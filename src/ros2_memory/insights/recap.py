@@ -53,10 +53,10 @@ from ros2_memory.insights.topic_events import (
     events_in,
     flags_before,
     goals_in,
+    note_foxglove_logs,
     note_limits,
     toggle_sentence,
 )
-from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import RobotPlaces, robot_places
 from ros2_memory.places.where import known_track_for, parse_where
@@ -164,7 +164,13 @@ def recap(
     things = _things_in_view(
         view, window, events_of_topics, region_stays, min_score=least, most=most_events
     )
-    stops = _stops_inside(drive.stops(end - start), region_stays)
+    stops = drive.stops(end - start)
+    if region_stays is not None:
+        stops = tuple(
+            stop
+            for stop in stops
+            if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
+        )
     longest = nsmallest(most_events, stops, key=lambda stop: -stop.length)
     events = [
         *_stop_events(longest, places),
@@ -178,13 +184,16 @@ def recap(
         events = [event for event in events if region_stays.contains(event)]
     note_unread(view, window)
     note_edges(view, window)
-    _note_foxglove_logs(view, window)
+    note_foxglove_logs(view, window)
     counts = Counter(event.kind for event in events)
     counts["thing"], counts["stop"] = things.total, len(stops)
     shown = _most_important(view, events, counts, most_events)
     if with_changes:
         shown = _with_changes(changes_in(view, window, events_of_topics), shown)
-    shown = [_with_skipped_time(event, drive.elapsed) for event in shown]
+    shown = [
+        replace(event, skipped=drive.elapsed.skipped_between(event.start, event.end or event.start))
+        for event in shown
+    ]
     if places is not None:
         shown = [_with_place_names(event, places) for event in shown]
     answer = Recap(
@@ -218,35 +227,6 @@ def _standing_time(view: View, drive: Drive, length: Ns) -> Ns | None:
             "stood_s is null"
         )
     return stood
-
-
-def _with_skipped_time(event: Event, elapsed: Elapsed) -> Event:
-    end = event.start if event.end is None else event.end
-    return replace(event, skipped=elapsed.skipped_between(event.start, end))
-
-
-def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
-    """Notes the logs of Foxglove's type: their errors are no events, those of ROS logs are."""
-    timeline = view.timeline
-    for topic in timeline.topics():
-        types = timeline.types_of(topic)
-        if FOXGLOVE_LOGS.isdisjoint(types):
-            continue
-        foxglove_types = FOXGLOVE_LOGS & {
-            part.type
-            for extent in timeline.extents(topic, window)
-            for part in extent.bag.summary.of(topic)
-        }
-        if foxglove_types:
-            # Where the topic has two types, its levels have no names; no log of ROS has a 4.
-            search = '"above", field "level", value "WARN"'
-            if len(types) > 1:
-                search = '"equals", field "level", value 4'
-            type_name = min(foxglove_types)
-            view.notes.add(
-                f"errors in {topic} are not among the events, since it is of {type_name}: "
-                f"find_matches with condition_type {search} lists them"
-            )
 
 
 class _RegionStays:
@@ -469,15 +449,6 @@ def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted"
 
 
-def _stops_inside(stops: Sequence[Stop], region_stays: _RegionStays | None) -> Sequence[Stop]:
-    """Returns the stops that overlap a stay in the region; all without a region."""
-    if region_stays is None:
-        return stops
-    return [
-        stop for stop in stops if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
-    ]
-
-
 def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[Event]:
     """Yields stops with the point where the robot stood, in the frame of places if it is known."""
     for stop in stops:
@@ -515,24 +486,21 @@ def _errors_in_region(
 def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     """Returns a goal as an event, from its acceptance on.
 
-    A goal from before the window is an event at the moment when it ended.
+    A goal from before the window is an event at the moment when it ended; an active one at `start`.
     """
-    kind = "failed goal" if goal.outcome in FAILURES else "goal"
+    kind, name = "failed goal" if goal.outcome in FAILURES else "goal", f"{goal.action} goal"
+    is_over = goal.is_lost or goal.ended is not None
     if goal.accepted is None:
         state = "last heard of" if goal.is_lost else goal.outcome or "active"
-        at = goal.last if goal.is_lost or goal.ended is not None else start
-        goes_on = goal.ended is None and not goal.is_lost
-        return Event(
-            kind, at, None, f"{goal.action} goal {state}, accepted before", goes_on=goes_on
-        )
+        at = goal.last if is_over else start
+        return Event(kind, at, None, f"{name} {state}, accepted before", goes_on=not is_over)
+    if not is_over:
+        return Event(kind, goal.accepted, None, f"{name} accepted", goes_on=True)
+    after = f"after {seconds(elapsed.between(goal.accepted, goal.last))}"
+    text = f"{name} {goal.outcome} {after}"
     if goal.is_lost:
-        after = f"after {seconds(elapsed.between(goal.accepted, goal.last))}"
-        text = f"{goal.action} goal last heard of {after}, and listed no more by its server"
-        return Event(kind, goal.accepted, goal.last, text)
-    if goal.ended is None:
-        return Event(kind, goal.accepted, None, f"{goal.action} goal accepted", goes_on=True)
-    after = f"after {seconds(elapsed.between(goal.accepted, goal.ended))}"
-    return Event(kind, goal.accepted, goal.ended, f"{goal.action} goal {goal.outcome} {after}")
+        text = f"{name} last heard of {after}, and listed no more by its server"
+    return Event(kind, goal.accepted, goal.last, text)
 
 
 def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:

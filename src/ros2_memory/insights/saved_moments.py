@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
-from ros2_memory.bag_dir.moment_file import (
-    Outcome,
-    PendingRequest,
-    StoredMoment,
-    stored_moments_in,
-)
+from ros2_memory.bag_dir.moment_file import Outcome, PendingRequest, StoredMoment, stored_moments_in
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.text import abbreviate

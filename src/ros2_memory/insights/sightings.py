@@ -28,11 +28,7 @@ from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
 from ros2_memory.history.held_values import held_at, held_until, is_latched
 from ros2_memory.history.no_data import matching_topics, require_recorded
-from ros2_memory.history.reverse_search import (
-    ReverseSearch,
-    compared_frames,
-    condition_of,
-)
+from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
@@ -156,10 +152,7 @@ def find_matches(
 
 
 def _searched_times(view: View, window: TimeWindow, shown_at: Sequence[Ns]) -> Span:
-    """Returns the first and the last moment (ns) of a window that were searched.
-
-    Bags of a wrong clock are searched too: a match in them may lie outside of the others' time.
-    """
+    """Returns from when to when (ns) a window was searched, also in bags of a wrong clock."""
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (start, end)
 
@@ -364,7 +357,7 @@ def _goal_spans(view: View, goal: GoalRun, scope: Scope) -> Iterator[tuple[Ns, N
 
 
 def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:
-    """Returns spans (inclusive), and whether each is known to begin then, as an array (N x 3)."""
+    """Returns spans (ns, inclusive), and whether each begins there for sure, as an N x 3 array."""
     return np.array([*spans], np.int64).reshape(-1, 3)
 
 
@@ -389,10 +382,7 @@ def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Ite
 
 
 def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage | None:
-    """Returns the last match of a run, or the message before it if the run has none.
-
-    None if its bag was deleted since.
-    """
+    """Returns a run's last match, or the message before a run without; None if it was deleted."""
     if not run.messages:
         return view.stream.last(run.topic, run.last + 1)
     at = TimeWindow(run.last, run.last + 1)

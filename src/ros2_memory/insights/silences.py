@@ -12,20 +12,8 @@ from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, overlaps_any, united, without
 from ros2_memory.core.text import MAX_NAMED, listed
-from ros2_memory.core.timebase import (
-    MAX_NS,
-    MIN_NS,
-    NS_PER_S,
-    Ns,
-    Span,
-    local_text,
-)
-from ros2_memory.history.coverage import (
-    cut_spans,
-    excluded_spans,
-    recording_gaps,
-    unix_text,
-)
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span, local_text
+from ros2_memory.history.coverage import cut_spans, excluded_spans, recording_gaps, unix_text
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence

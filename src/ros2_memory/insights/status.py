@@ -115,7 +115,11 @@ def _status_problems(
     latest, bag_dir = view.snapshot.dating.latest, view.memory.index.bag_dir
     until_now = TimeWindow(MIN_NS, max(wall, latest or wall) + 1)
     yield from problems_of(view.snapshot, heartbeat, wall)
-    yield from _describe_unheard(heard, latest)
+    if heard is not None and latest is not None and latest - heard > _UNHEARD_NS:
+        yield (
+            f"no message since {unix_text(heard)} but on topics that the recorder publishes "
+            "itself, such as /rosout"
+        )
     yield from missing_data(view)
     yield from describe_hung(view, until_now)
     yield from dict.fromkeys(f"{sentence.partition(':')[0]} (see notes)" for sentence in mixed)
@@ -166,15 +170,6 @@ def _last_heard(snapshot: Snapshot) -> Ns | None:
     ]
     latest = snapshot.dating.latest
     return latest if latest is None or not times else min(max(times), latest)
-
-
-def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:
-    """Yields that only the recorder's own topics have messages, if that is so."""
-    if heard is not None and latest is not None and latest - heard > _UNHEARD_NS:
-        yield (
-            f"no message since {unix_text(heard)} but on topics that the recorder publishes "
-            "itself, such as /rosout"
-        )
 
 
 def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:

@@ -45,6 +45,7 @@ from ros2_memory.history.scan import (
     remembered,
 )
 from ros2_memory.insights.silences import unrecorded_times
+from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
@@ -237,6 +238,30 @@ def note_left_out(view: View, topic: str, events: TopicEvents) -> None:
             f"{topic} has too many booleans or things in one message: {events.beyond} more are "
             "not followed"
         )
+
+
+def note_foxglove_logs(view: View, window: TimeWindow) -> None:
+    """Notes the logs of Foxglove's type: their errors are no events, those of ROS logs are."""
+    timeline = view.timeline
+    for topic in timeline.topics():
+        types = timeline.types_of(topic)
+        if FOXGLOVE_LOGS.isdisjoint(types):
+            continue
+        foxglove_types = FOXGLOVE_LOGS & {
+            part.type
+            for extent in timeline.extents(topic, window)
+            for part in extent.bag.summary.of(topic)
+        }
+        if foxglove_types:
+            # Where the topic has two types, its levels have no names; no log of ROS has a 4.
+            search = '"above", field "level", value "WARN"'
+            if len(types) > 1:
+                search = '"equals", field "level", value 4'
+            type_name = min(foxglove_types)
+            view.notes.add(
+                f"errors in {topic} are not among the events, since it is of {type_name}: "
+                f"find_matches with condition_type {search} lists them"
+            )
 
 
 STATUS_TOPIC: Final = "/_action/status"

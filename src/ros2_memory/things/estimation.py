@@ -17,14 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.sights import STOREY_MM, Score, Spot
-from ros2_memory.core.arrays import (
-    Flags,
-    Ints,
-    distinct_rows,
-    in_ranges,
-    rows_by,
-)
-from ros2_memory.things.false_stays import remove_false_stays
+from ros2_memory.core.arrays import Flags, Ints, distinct_rows, in_ranges, rows_by
 from ros2_memory.things.instances import (
     Estimate,
     Instance,
@@ -35,25 +28,16 @@ from ros2_memory.things.instances import (
     count_names,
 )
 from ros2_memory.things.labels import Labels, moves_by_itself
-from ros2_memory.things.observations import (
+from ros2_memory.things.places import GATE_MM, MIDDLE, places_of, stays_in, with_synonyms
+from ros2_memory.things.presence import Evidence, evidence_at, stays_at
+from ros2_memory.things.stays import (
     FEWEST,
     LabelGroup,
     Observations,
     groups_in,
     lowest_bin,
     placed_stays,
-)
-from ros2_memory.things.places import (
-    GATE_MM,
-    MIDDLE,
-    places_of,
-    stays_in,
-    with_synonyms,
-)
-from ros2_memory.things.presence import (
-    Evidence,
-    evidence_at,
-    stays_at,
+    remove_false_stays,
 )
 
 if TYPE_CHECKING:

@@ -76,6 +76,7 @@ def find_things(
     limits = memory.limits
     region = None if where is None else parse_where(limits, where)
     nearness = None if near is None else parse_near(limits, near)
+    lowest = limits.min_score if min_score is None else min_score
     view, now, asked_window = open_search(memory, call, TimeRange(start_s, end_s))
     searched = asked_window
     ahead_from = view.snapshot.dating.ahead_from
@@ -84,7 +85,6 @@ def find_things(
         searched = TimeWindow(asked_window.start, ahead_from)
     require_recorded(view, searched)
     window = clamped(view, searched)
-    lowest = limits.min_score if min_score is None else min_score
     if lowest > 1:
         raise InvalidArgumentsError(
             f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
@@ -99,14 +99,11 @@ def find_things(
     finder = _Finder(known, window, region, places_asked(limits, region, known.frames), now)
     found = sorted(finder.find(wanted), key=lambda thing: (-thing.last, thing.label, thing.place))
     if nearness is not None:
-        landmarks: list[_FoundThing] = []
-        if nearness.label:
-            key = known.labels.key(nearness.label)
-            landmarks = [*replace(finder, where=None).find({key})]
-            if not landmarks:
-                wanted[key] = nearness.label
+        landmarks = nearness.landmarks(finder)
         found = [*nearness.select(found, landmarks)]
         view.notes.add(*nearness.describe_lack(found, landmarks))
+        if nearness.label and not landmarks:
+            wanted[known.labels.key(nearness.label)] = nearness.label
     note_unread(view, asked_window, nothing=not found, gaps=not found)
     if not found and searched != asked_window:
         view.notes.add(describe_misdated(view.snapshot.misdated))
@@ -114,15 +111,17 @@ def find_things(
     totals: Counter[str] = Counter()
     for thing in found:
         totals[thing.label] += thing.at_once or 1
+    bounds = []
+    if start_s is not None or end_s is not None:
+        bounds.append("window")
+    if region is not None or nearness is not None:
+        bounds.append("region")
     question = ThingsQuestion(
         labels=wanted,
         found=frozenset(key for thing in found for key in thing.keys),
         vague=frozenset(thing.label for thing in found if known.estimate.is_vague(thing.rows)),
         window=window,
-        bounds=_bounds_text(
-            has_window=start_s is not None or end_s is not None,
-            has_region=region is not None or nearness is not None,
-        ),
+        bounds=f" in this {' and '.join(bounds)}" if bounds else "",
         min_score=f"min_score {lowest:g}{' (data.min_score)' if min_score is None else ''}",
         undecoded=undecoded,
     )
@@ -135,16 +134,6 @@ def find_things(
         all_counted=known.reaches_back(window),
         notes=(*view.notes.sentences(), *notes_on(view, known.by_all, question)),
     )
-
-
-def _bounds_text(*, has_window: bool, has_region: bool) -> str:
-    """Returns " in this window and region", with the bounds that the question has."""
-    bounds = []
-    if has_window:
-        bounds.append("window")
-    if has_region:
-        bounds.append("region")
-    return f" in this {' and '.join(bounds)}" if bounds else ""
 
 
 def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
@@ -196,6 +185,13 @@ class Near(NamedTuple):
 
     circle: Circle
     label: str
+
+    def landmarks(self, finder: _Finder) -> list[_FoundThing]:
+        """Returns the things of the label anywhere in the window; none for a point."""
+        if not self.label:
+            return []
+        key = finder.known.labels.key(self.label)
+        return [*replace(finder, where=None).find({key})]
 
     def select(
         self, things: Iterable[_FoundThing], landmarks: Sequence[_FoundThing]

@@ -17,7 +17,6 @@ import numpy as np
 from ros2_memory.analysis.sights import Spot, Unplaced
 from ros2_memory.core.arrays import Columns, Flags, Groups, Ints, begins_of, in_ranges, narrowed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
-from ros2_memory.things.presence import Evidence, Looks, Stay, count_misses
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +24,9 @@ if TYPE_CHECKING:
     from ros2_memory.columns.sights import JoinedSights
     from ros2_memory.core.model import TimeWindow, Vector3
     from ros2_memory.things.labels import Labels
+    from ros2_memory.things.presence import Evidence, Looks, Stay
 
+_MISSED_BY_CHANCE: Final = 0.01
 _FEWEST_BESIDE: Final = 3
 _NEWEST_BESIDE: Final = 9
 """The newest slices say how many there are now: of more, some may have been taken away since."""
@@ -306,3 +307,47 @@ def most_at_once(spots: Ints) -> int:
     slices = np.unique(spots[:, Spot.SLICE], return_inverse=True)[1]
     together = np.sort(np.minimum(spots[:, Spot.TOGETHER], np.bincount(slices)[slices]))
     return max(1, int(together[-max(1, len(together) // 100)]))
+
+
+def count_misses(
+    looks: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: Span
+) -> tuple[int, Ns | None]:
+    """Returns how many messages of a window [start, stop) could have had a thing, and have not.
+
+    And when (ns) the chance that all of them missed it fell below 1 %; None if it never did.
+
+    Only looks from cells that saw the thing during its stay count. Those are the looks up to
+    `seen_to`, and later ones with a hit. A cell's rate is known as well as its messages tell (a
+    uniform prior). `evidence` is that of one place; see `Evidence.at_place`.
+    """
+    numbers, is_hit = evidence.looks, evidence.hits > 0
+    slices, first, last = looks.slice[numbers], looks.first[numbers], looks.last[numbers]
+    during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
+    during &= (last <= seen_to) | is_hit
+    start, stop = window
+    misses = (first >= start) & (last < stop) & evidence.fair & ~during & ~is_hit
+    distinct, cell_of = np.unique(evidence.cell, return_inverse=True)
+    hits, n = (
+        np.bincount(cell_of[during], column[during], len(distinct))
+        for column in (evidence.hits, evidence.n)
+    )
+    alphas, betas = (1.0 + hits).tolist(), (1.0 + n - hits).tolist()
+    log_chance, messages = 0.0, 0
+    crossed: Ns | None = None
+    for look in np.flatnonzero(misses).tolist():
+        cell, n_missed = int(cell_of[look]), int(evidence.n[look])
+        alpha, beta = alphas[cell], betas[cell]
+        if alpha <= 1.0:
+            continue
+        # The chance of so many misses in a row, by a beta distribution of the rate.
+        log_chance += (
+            math.lgamma(beta + n_missed)
+            - math.lgamma(beta)
+            + math.lgamma(alpha + beta)
+            - math.lgamma(alpha + beta + n_missed)
+        )
+        betas[cell] += n_missed
+        messages += n_missed
+        if crossed is None and log_chance < math.log(_MISSED_BY_CHANCE):
+            crossed = int(last[look])
+    return messages, crossed

@@ -304,12 +304,13 @@ class _Loader:
         session_of = _numbered_in_time(
             pair for part in stretches for pair in zip(part.starts, part.sessions, strict=True)
         )
-        sections = [
-            (epoch_of[self._odometry(session, stretch.frame_id)], session_of[session])
-            for stretch in stretches
-            for _ in stretch.sights
-            for session in stretch.sessions
-        ]
+        packed, epochs, sessions = [], [], []
+        for stretch in stretches:
+            for sights_of_topic in stretch.sights:
+                packed.append(sights_of_topic.packed)
+                for session in stretch.sessions:
+                    epochs.append(epoch_of[self._odometry(session, stretch.frame_id)])
+                    sessions.append(session_of[session])
         estimating = self._view.call.partial_after(_ESTIMATING_S)
 
         def go_on() -> None:
@@ -319,16 +320,12 @@ class _Loader:
                 raise _TakesTooLongError
 
         self._view.memory.large.acquire()
-        sights = joined(
-            [topic.packed for stretch in stretches for topic in stretch.sights],
-            [epoch for epoch, _ in sections],
-            [session for _, session in sections],
-        )
+        sights = joined(packed, epochs, sessions)
         things = estimate(sights, self._labels, self._min_score, go_on)
         since = self._read_from
         if crowded:
             since = max(_begin(parts[0]), MIN_NS if since is None else since)
-        has_map = bool(sights.topics) and any(epoch == 0 for epoch, _ in sections)
+        has_map = bool(sights.topics) and 0 in epochs
         return KnownThings(
             things, self._labels, frames, since, has_map, crowded=crowded, until=self._until
         )

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.sights import JoinedSights
-    from ros2_memory.core.timebase import Ns, Span
+    from ros2_memory.core.timebase import Ns
 
 
 _FALSE_RATE: Final = 0.01
@@ -62,7 +62,6 @@ _UNPLACED_HIT: Final = 2.0
 """The evidence of a hit from an unknown pose."""
 _PRIOR: Final = 0.5
 """The hits, and the messages without one, that each cell begins with (Jeffreys' prior)."""
-_MISSED_BY_CHANCE: Final = 0.01
 _LEFT_BY_CHANCE: Final = 0.05
 _FEWEST_HITS: Final = 3
 _RARE_OF: Final = 20
@@ -73,8 +72,6 @@ _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
 """A cell with many looks is blocked if its share of hits is below a tenth of the others' share."""
 _YAWS: Final = 3600 // CELL_DECIDEG
-_VIEW_SHARE: Final = 0.02
-"""The share of detections outside of each side of a field of view: they are mistaken."""
 
 
 class Cells:
@@ -232,28 +229,6 @@ def _row_keys(rows: Ints, sizes: Ints) -> Ints:
     return numbers
 
 
-def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topics: int) -> Floats:
-    """Returns how far (mm), and from and to which directions (degrees), each detector sees.
-
-    Nearly all detections of its topic lie there. `topics` is the number of topics; `n` has the
-    detections at each distance and bearing. The field of a topic without detections is -1.
-    """
-    fields = np.full((topics, 3), -1.0)
-    for number in np.flatnonzero(np.bincount(topic)).tolist():
-        rows = topic == number
-        [far] = _weighted_quantiles(distance[rows], n[rows], 1 - _VIEW_SHARE)
-        sides = _weighted_quantiles(bearing[rows], n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
-        fields[number] = far, *sides
-    return fields
-
-
-def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
-    order = np.argsort(values)
-    running = np.cumsum(n[order])
-    ranks = [int(np.searchsorted(running, share * running[-1])) for share in shares]
-    return [float(values[order[min(rank, len(order) - 1)]]) for rank in ranks]
-
-
 class Evidence(NamedTuple):
     """The looks at the places of a label, and how many of their messages have it there.
 
@@ -347,7 +322,7 @@ def evidence_at(
 
     Args:
         cells: the looks.
-        fields: the field of view of each topic; see `fields_of_view`.
+        fields: the field of view of each topic; see `Observations.fields`.
         places: x and y (mm) of each place.
         rows: the hits as rows of `Hit`, with the slice in place of `SPOT`.
         place: the number of each hit's place.
@@ -576,50 +551,6 @@ def _look_odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floa
     is_repeated = cells.repeated_misses(evidence.looks, evidence.hits)
     np.multiply(odds, _STANDING, out=odds, where=is_repeated)
     return odds
-
-
-def count_misses(
-    looks: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: Span
-) -> tuple[int, Ns | None]:
-    """Returns how many messages of a window [start, stop) could have had a thing, and have not.
-
-    And when (ns) the chance that all of them missed it fell below 1 %; None if it never did.
-
-    Only looks from cells that saw the thing during its stay count. Those are the looks up to
-    `seen_to`, and later ones with a hit. A cell's rate is known as well as its messages tell (a
-    uniform prior). `evidence` is that of one place; see `Evidence.at_place`.
-    """
-    numbers, is_hit = evidence.looks, evidence.hits > 0
-    slices, first, last = looks.slice[numbers], looks.first[numbers], looks.last[numbers]
-    during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
-    during &= (last <= seen_to) | is_hit
-    start, stop = window
-    misses = (first >= start) & (last < stop) & evidence.fair & ~during & ~is_hit
-    distinct, cell_of = np.unique(evidence.cell, return_inverse=True)
-    hits, n = (
-        np.bincount(cell_of[during], column[during], len(distinct))
-        for column in (evidence.hits, evidence.n)
-    )
-    alphas, betas = (1.0 + hits).tolist(), (1.0 + n - hits).tolist()
-    log_chance, messages = 0.0, 0
-    crossed: Ns | None = None
-    for look in np.flatnonzero(misses).tolist():
-        cell, n_missed = int(cell_of[look]), int(evidence.n[look])
-        alpha, beta = alphas[cell], betas[cell]
-        if alpha <= 1.0:
-            continue
-        # The chance of so many misses in a row, by a beta distribution of the rate.
-        log_chance += (
-            math.lgamma(beta + n_missed)
-            - math.lgamma(beta)
-            + math.lgamma(alpha + beta)
-            - math.lgamma(alpha + beta + n_missed)
-        )
-        betas[cell] += n_missed
-        messages += n_missed
-        if crossed is None and log_chance < math.log(_MISSED_BY_CHANCE):
-            crossed = int(last[look])
-    return messages, crossed
 
 
 def _runs_of_presence(odds: Floats, place: Ints) -> tuple[Ints, Ints]:

@@ -214,8 +214,9 @@ class SightReader:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        spots = 0
-        for nth, stretches in enumerate(self._stretches_in(TimeWindow(MIN_NS, until))):
+        spots, window = 0, TimeWindow(MIN_NS, until)
+        self._scans = self._open_scans(window)
+        for nth, stretches in enumerate(self._stretches_in(window)):
             joined = self._joined_sights(stretches) if nth else None
             if joined is not None and spots + spots_in(joined) < most:
                 parts: Iterable[list[SeenStretch[Session]]] = [joined]
@@ -235,7 +236,9 @@ class SightReader:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        for stretches in self._stretches_in(window.widened(SIGHTS_NS)):
+        reach = window.widened(SIGHTS_NS)
+        self._scans = self._open_scans(reach)
+        for stretches in self._stretches_in(reach):
             start = stretches[0].start // STRETCH_NS * STRETCH_NS
             if is_joined and window.covers(start, start + STRETCH_NS - 1):
                 self._joined_sights(stretches)
@@ -244,16 +247,20 @@ class SightReader:
                     self._seen_in(stretch)
                 yield stretch.start
 
+    def _open_scans(self, window: TimeWindow) -> list[Scan]:
+        """Returns a scan of each topic that sights follow from; none without a store."""
+        if not self._topics or self._view.memory.scanner.store is None:
+            return []
+        reach = window.widened(AROUND_NS + SIGHTS_NS)
+        return [
+            open_scan(self._view, topic, reach, copies=topic not in self._topics)
+            for topic in self._needed
+        ]
+
     def _stretches_in(self, window: TimeWindow) -> Iterator[list[TimeWindow]]:
         """Yields the stretches of each `STRETCH_NS` that may have messages, the newest first."""
         if not self._topics:
             return
-        if self._view.memory.scanner.store is not None:
-            reach = window.widened(AROUND_NS + SIGHTS_NS)
-            self._scans = [
-                open_scan(self._view, topic, reach, copies=topic not in self._topics)
-                for topic in self._needed
-            ]
         is_inside = (self._firsts < window.stop) & (self._lasts >= window.start)
         numbers = self._numbers_of(self._firsts[is_inside], self._lasts[is_inside])
         stretches = map(_stretch_window, reversed(numbers))

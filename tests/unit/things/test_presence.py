@@ -12,10 +12,10 @@ from ros2_memory.analysis.sights import CELL_MM, Hit, Look
 from ros2_memory.columns.sights import JoinedSights
 from ros2_memory.core.arrays import Columns
 from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.things.instances import count_misses
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
-    count_misses,
     evidence_at,
     stays_at,
 )

@@ -1,0 +1,345 @@
+"""Stays of labels at places: what is observed of them, and which of them are false.
+
+A label that is a small share of another's detections at a place, and is never in one message with
+it there, is that other thing under a wrong name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.sights import (
+    SCORE_BINS,
+    STOREY_MM,
+    Beside,
+    Floats,
+    Hit,
+    Score,
+    Spot,
+    Unplaced,
+)
+from ros2_memory.core.arrays import Flags, Ints, distinct_rows, in_ranges, numbered, rows_by
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.things.instances import PlacedStay, Tally, count_labels
+from ros2_memory.things.places import Sightings, poorly_localised
+from ros2_memory.things.presence import Cells, Evidence, Stay
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from ros2_memory.columns.sights import JoinedSights
+
+FEWEST: Final = 3
+"""Fewer detections are no thing: a detector sees what is not there."""
+_LOWEST_RATE: Final = 0.15
+"""A thing that is seen less often than this when looked at is a false detection that repeats."""
+_SAME_PLACE_MM: Final = 450.0
+_HALO_MM: Final = 950.0
+"""A false stay is this near to its host, and under another label at the same place."""
+_SMALL_SHARE: Final = 1 / 3
+"""A wrong name has at most this share of its host's detections, ..."""
+_HALO_SHARE: Final = 0.2
+"""... noise under the same label this share, ..."""
+_TINY_SHARE: Final = 0.1
+"""... and this share of all that the host ever has."""
+_BESIDE_SHARE: Final = 0.2
+"""A label that is beside the host in this share of its detections is a thing of its own."""
+_VIEW_SHARE: Final = 0.02
+"""The share of detections outside of each side of a field of view: they are mistaken."""
+_STAYS_AT_ONCE: Final = 64
+"""Stays that are compared with all others at once."""
+
+
+@dataclass(slots=True)
+class LabelGroup:
+    """The spots of one label in one epoch, to which estimating adds places, stays and evidence.
+
+    Attributes:
+        rows: the spots.
+        unplaced: rows of `Sights.unplaced` with the label, in all epochs.
+        places: the spots at each place.
+    """
+
+    key: str
+    epoch: int
+    rows: Ints
+    unplaced: Ints
+    places: list[Ints] = field(default_factory=list)
+    stays: list[PlacedStay] = field(default_factory=list)
+    evidence: Evidence = field(init=False)
+
+
+class Observations:
+    """The sights of an estimate, and what is computed once for all labels.
+
+    Attributes:
+        counts: how many detections of each spot count.
+        poor: which spots were seen while localisation was poor: they move nothing.
+        hits: the looks of detections that count, by spot; -1 where localisation was poor.
+        groups: a number for each spot, equal for spots of one slice, topic and label.
+        fields: the field of view of each topic; see `_fields_of_view`.
+        side: for each spot, the mean of the unit vectors to it from where it was seen; 0 if that
+            is unknown.
+        go_on: as in `estimate`.
+    """
+
+    def __init__(self, sights: JoinedSights, min_score: float, go_on: Callable[[], None]) -> None:
+        spots, self.sights, self.go_on = sights.spots, sights, go_on
+        self.counts = spots[:, Spot.N]
+        low = np.flatnonzero(sights.scores[:, Score.BIN] < lowest_bin(min_score))
+        spot, n = (sights.scores[low, name] for name in (Score.SPOT, Score.N))
+        self.counts -= np.bincount(spot, n, len(spots)).astype(np.int64)
+        self.poor, poor_looks = poorly_localised(sights)
+        # Which hits are of detections that count is not known: as many in proportion, rounded up.
+        spot, look, n = (sights.hits[:, name] for name in Hit)
+        n = -(-n * self.counts[spot] // spots[spot, Spot.N])
+        look[np.append(poor_looks, [False])[look]] = -1
+        spot, look, n = (column[n > 0] for column in (spot, look, n))
+        self.hits = Tally.of(len(spots), spot, look, n)
+        names = (Spot.SLICE, Spot.TOPIC, Spot.LABEL)
+        _, self.groups = distinct_rows([spots[:, name] for name in names])
+        self.cells = Cells(sights, poor_looks)
+        spot, look, n = (column[look >= 0] for column in (spot, look, n))
+        distance, bearing = self.cells.seen_at(look, spots[spot, Spot.X], spots[spot, Spot.Y])
+        topic = spots[spot, Spot.TOPIC]
+        self.fields = _fields_of_view(topic, distance, bearing, n, len(sights.topics))
+        angle = np.radians(bearing + self.cells.heading(look))
+        sums = [np.bincount(spot, n * part, len(spots)) for part in (np.cos(angle), np.sin(angle))]
+        total = np.maximum(np.bincount(spot, n, len(spots)), 1)
+        self.side = np.stack(sums, axis=1) / total[:, None]
+
+    def firm(self, rows: Ints) -> Ints:
+        """Returns the spots seen while localisation was good; all spots if those are too few."""
+        good: Ints = rows[~self.poor[rows]]
+        return good if self.counts[good].sum() >= FEWEST else rows
+
+    def sightings(self, rows: Ints) -> Sightings:
+        """Returns spots as sightings."""
+        names = (Spot.X, Spot.Y, Spot.DEV, Spot.FIRST, Spot.LAST)
+        x, y, dev, *times = (self.sights.spots[rows, name] for name in names)
+        place = np.stack((x, y), axis=1, dtype=np.float64)
+        return Sightings(place, self.counts[rows], dev, self.side[rows], *times)
+
+
+def _fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topics: int) -> Floats:
+    """Returns how far (mm), and from and to which directions (degrees), each detector sees.
+
+    Nearly all detections of its topic lie there. `topics` is the number of topics; `n` has the
+    detections at each distance and bearing. The field of a topic without detections is -1.
+    """
+    fields = np.full((topics, 3), -1.0)
+    for number in np.flatnonzero(np.bincount(topic)).tolist():
+        rows = topic == number
+        [far] = _weighted_quantiles(distance[rows], n[rows], 1 - _VIEW_SHARE)
+        sides = _weighted_quantiles(bearing[rows], n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
+        fields[number] = far, *sides
+    return fields
+
+
+def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
+    order = np.argsort(values)
+    running = np.cumsum(n[order])
+    ranks = [int(np.searchsorted(running, share * running[-1])) for share in shares]
+    return [float(values[order[min(rank, len(order) - 1)]]) for rank in ranks]
+
+
+def lowest_bin(min_score: float) -> int:
+    """Returns the lowest bin of scores that count."""
+    return min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
+
+
+def groups_in(observed: Observations, keys: Sequence[str]) -> list[LabelGroup]:
+    """Returns the labels in each epoch that have detections that count."""
+    distinct, key_of_label = numbered(keys)
+    spots, unplaced = observed.sights.spots, observed.sights.unplaced
+    width = len(distinct) + 1
+    epoch = observed.sights.epochs[spots[:, Spot.SLICE]]
+    group_of = epoch * width + key_of_label[spots[:, Spot.LABEL]]
+    counting = np.flatnonzero(observed.counts)
+    numbers, nth = np.unique(group_of[counting], return_inverse=True)
+    lost = rows_by(key_of_label[unplaced[:, Unplaced.LABEL]], len(distinct))
+    groups = []
+    for number, rows in zip(numbers.tolist(), rows_by(nth, len(numbers)), strict=True):
+        group_epoch, key = divmod(number, width)
+        groups.append(LabelGroup(distinct[key], group_epoch, counting[rows], unplaced[lost[key]]))
+    return groups
+
+
+def placed_stays(
+    observed: Observations, stays: Sequence[tuple[int, Stay]], rows: Ints, sizes: Ints
+) -> list[PlacedStay]:
+    """Returns stays with what their spots say. Each comes with the number of its place.
+
+    `rows` are the spots of one stay after the other, `sizes` how many each has, at least one.
+    """
+    if not stays:
+        return []
+    spots, n = observed.sights.spots[rows], observed.counts[rows]
+    begins, stay_of = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(stays)), sizes)
+    count = np.add.reduceat(n, begins)
+    x, y, z = (
+        np.add.reduceat(n * spots[:, axis], begins) / count for axis in (Spot.X, Spot.Y, Spot.Z)
+    )
+    off = (spots[:, Spot.X] - x[stay_of]) ** 2 + (spots[:, Spot.Y] - y[stay_of]) ** 2
+    squares = np.add.reduceat(n * (spots[:, Spot.DEV] ** 2 + off), begins)
+    dev_mm = np.sqrt(squares / count)
+    slices, first, last = spots[:, Spot.SLICE], spots[:, Spot.FIRST], spots[:, Spot.LAST]
+    firm_from, firm_to = np.array([(stay.firm_first, stay.firm_last) for _, stay in stays]).T
+    is_firm = (slices >= firm_from[stay_of]) & (slices <= firm_to[stay_of])
+    # Without a firm spot, or without firm slices (-1), all spots count as firm.
+    has_firm = np.maximum.reduceat(is_firm, begins) & (firm_from >= 0)
+    is_firm |= ~has_firm[stay_of]
+    firm_first = np.minimum.reduceat(np.where(is_firm, first, MAX_NS), begins)
+    firm_last = np.maximum.reduceat(np.where(is_firm, last, -MAX_NS), begins)
+    first, last = np.minimum.reduceat(first, begins), np.maximum.reduceat(last, begins)
+    return [
+        PlacedStay(
+            x=float(x[number]),
+            y=float(y[number]),
+            z=float(z[number]),
+            dev_mm=float(dev_mm[number]),
+            first=int(first[number]),
+            last=int(last[number]),
+            firm_first=int(firm_first[number]),
+            firm_last=int(firm_last[number]),
+            left=None if stay.left is None else observed.cells.looked_in(stay.left),
+            count=int(count[number]),
+            spots=rows[begins[number] : begins[number] + sizes[number]],
+            place=place,
+            stay=stay,
+            weak=stay.clear_hits < FEWEST or stay.hits < _LOWEST_RATE * stay.messages,
+        )
+        for number, (place, stay) in enumerate(stays)
+    ]
+
+
+def remove_false_stays(
+    groups: Sequence[LabelGroup], observed: Observations, keys: Sequence[str]
+) -> None:
+    """Removes stays that are another thing under a wrong name, noise, or too rare.
+
+    Wrong names are counted in `PlacedStay.misread_as` of the thing that had them.
+    """
+    stays = [(group, stay) for group in groups for stay in group.stays]
+    hosts_of = dict(_HostSearch(stays, observed, keys).find())
+    false_stays: set[int] = set()
+    for number in sorted(hosts_of, key=lambda number: (stays[number][1].count, number)):
+        host = next((host for host in hosts_of[number] if host not in false_stays), None)
+        if host is None:
+            continue
+        false_stays.add(number)
+        (group, stay), (host_group, host_stay) = stays[number], stays[host]
+        if host_group is not group:
+            host_stay.misread_as += count_labels(observed.sights, observed.counts, stay.spots)
+    for group in groups:
+        group.stays = []
+    for number, (group, stay) in enumerate(stays):
+        if number not in false_stays and not stay.weak:
+            group.stays.append(stay)
+
+
+class _HostSearch:
+    """Searches for the hosts of false stays.
+
+    A host is a stay at the same time and near a false one: that is the host's thing under a wrong
+    name, or noise around it.
+    """
+
+    def __init__(
+        self,
+        stays: Sequence[tuple[LabelGroup, PlacedStay]],
+        observed: Observations,
+        keys: Sequence[str],
+    ) -> None:
+        self._observed = observed
+        # Columns of the stays.
+        self._keys, self._key_of_label = numbered(keys)
+        self._key = _column(self._keys.index(group.key) for group, _ in stays)
+        self._epoch = _column(group.epoch for group, _ in stays)
+        self._count = _column(stay.count for _, stay in stays)
+        self._first = _column(stay.first for _, stay in stays)
+        self._last = _column(stay.last for _, stay in stays)
+        self._is_weak = _column(stay.weak for _, stay in stays) > 0
+        self._first_slice = _column(stay.stay.first_slice for _, stay in stays)
+        self._last_slice = _column(stay.stay.last_slice for _, stay in stays)
+        places = np.array([(stay.x, stay.y, stay.z) for _, stay in stays], np.float64)
+        self._places = places.reshape(-1, 3).T
+        self._by_x = np.argsort(self._places[0], kind="stable")
+        # Each spot's stay and slice as one number, in order; and how many detections are before it.
+        sizes = [len(stay.spots) for _, stay in stays]
+        self._rows = np.concatenate([np.zeros(0, np.int64), *(stay.spots for _, stay in stays)])
+        self._stay_of = np.repeat(np.arange(len(stays)), sizes)
+        spots = observed.sights.spots[self._rows]
+        self._width = len(observed.sights.epochs) + 1
+        self._slices = self._stay_of * self._width + spots[:, Spot.SLICE]
+        self._counts_before = np.append(0, np.cumsum(observed.counts[self._rows]))
+        has_several = np.bincount(self._stay_of, spots[:, Spot.TOGETHER] > 1, len(stays))
+        self._are_several = 2 * has_several >= sizes
+        beside_spots = (observed.sights.beside[:, name] for name in Beside)
+        self._beside = Tally.of(len(observed.counts), *beside_spots)
+
+    def find(self) -> Iterator[tuple[int, list[int]]]:
+        """Yields the numbers of possibly false stays, each with its hosts, the likeliest first."""
+        count = len(self._key)
+        for begin in range(0, count, _STAYS_AT_ONCE):
+            self._observed.go_on()
+            numbers = np.arange(begin, min(begin + _STAYS_AT_ONCE, count))
+            stay, host = self._candidates(numbers)
+            is_apart = self._are_beside(numbers)[stay - begin, self._key[host]]
+            pairs = zip(stay[~is_apart].tolist(), host[~is_apart].tolist(), strict=True)
+            for number, pairs_of_stay in groupby(pairs, itemgetter(0)):
+                yield number, [other for _, other in pairs_of_stay]
+
+    def _candidates(self, numbers: Ints) -> tuple[Ints, Ints]:
+        """Returns pairs of a stay and a possible host, by the stay, the likeliest host first.
+
+        The stay's detections must be few beside those of the host at that time.
+        """
+        stay, host, away_mm = self._pairs_near(numbers)
+        begin = np.searchsorted(self._slices, host * self._width + self._first_slice[stay])
+        end = np.searchsorted(self._slices, host * self._width + self._last_slice[stay] + 1)
+        hosted = self._counts_before[end] - self._counts_before[begin]
+        count, is_same = self._count[stay], self._key[stay] == self._key[host]
+        is_tiny = (count <= hosted) & (count <= _TINY_SHARE * self._count[host])
+        # Where most messages with one of the label have both, the lighter one is no noise.
+        is_tiny &= ~(self._are_several[stay] & is_same) | (2 * count <= hosted)
+        is_part = is_tiny | (count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
+        is_part &= (is_same | (away_mm <= _SAME_PLACE_MM)) & (hosted > 0)
+        order = np.lexsort((host, -hosted, stay))
+        order = order[is_part[order]]
+        return stay[order], host[order]
+
+    def _are_beside(self, numbers: Ints) -> Flags:
+        """Returns for each stay and key whether messages have both: then they are two things.
+
+        `numbers` are consecutive. A stay's own key never counts.
+        """
+        spots = slice(*np.searchsorted(self._stay_of, (numbers[0], numbers[-1] + 1)))
+        labels_per_spot, label, n = self._beside.rows_of(self._rows[spots])
+        nth_stay = np.repeat(self._stay_of[spots] - numbers[0], labels_per_spot)
+        cells = nth_stay * len(self._keys) + self._key_of_label[label]
+        often = np.bincount(cells, n, len(numbers) * len(self._keys)).reshape(len(numbers), -1)
+        are_beside: Flags = often >= _BESIDE_SHARE * self._count[numbers, None]
+        are_beside[np.arange(len(numbers)), self._key[numbers]] = False
+        return are_beside
+
+    def _pairs_near(self, numbers: Ints) -> tuple[Ints, Ints, Floats]:
+        """Returns pairs of a stay and another near it at that time, and their distances (mm)."""
+        x, y, z = self._places
+        start = np.searchsorted(x[self._by_x], x[numbers] - _HALO_MM)
+        stop = np.searchsorted(x[self._by_x], x[numbers] + _HALO_MM)
+        one, other = np.repeat(numbers, stop - start), self._by_x[in_ranges(start, stop - start)]
+        away = np.hypot(x[other] - x[one], y[other] - y[one])
+        is_near = (away <= _HALO_MM) & (np.abs(z[other] - z[one]) <= STOREY_MM) & (other != one)
+        is_near &= (self._first[other] <= self._last[one]) & (self._last[other] >= self._first[one])
+        is_near &= (self._epoch[other] == self._epoch[one]) & ~self._is_weak[other]
+        return one[is_near], other[is_near], away[is_near]
+
+
+def _column(values: Iterable[int]) -> Ints:
+    return np.array([*values], np.int64)
