@@ -621,7 +621,6 @@ def trajectory_summary(
     # The least line has two ends: fewer waypoints are cut from it.
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
     shown = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
-
     if max_waypoints < _FEWEST_OF_A_LINE:
         last = shown.waypoints[-1:] if max_waypoints else ()
         shown = replace(shown, waypoints=last, waypoint_error_m=0.0)

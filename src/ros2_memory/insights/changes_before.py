@@ -122,8 +122,8 @@ class ChangesBefore:
     ) -> tuple[PastChange, ...]:
         """Returns the changes in the time (ns) before a moment, nearest first.
 
-        A change up to `slack` after the moment counts as at the moment. `without` is how sentences
-        begin that are left out: those of the boolean that toggled then.
+        A change up to `slack` after the moment counts as at the moment. Sentences that begin with
+        `without` are left out.
         """
         changes = {}
         begin = bisect_left(self._changes, (at - length - self._longest,))
@@ -142,7 +142,7 @@ def is_routine(change: PastChange) -> bool:
 
 
 def topics_with_changes(view: View) -> list[str]:
-    """Returns the topics on which changes may show: those with events, and that of commands."""
+    """Returns the topics on which changes may show: topics with events, and the commands."""
     timeline, command = view.timeline, _command_topic(view)
     return [
         topic

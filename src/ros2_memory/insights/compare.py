@@ -111,7 +111,12 @@ def compare(
     except InvalidArgumentsError as error:
         raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
     view = open_view(memory, call, min(max(asked.stop, other.stop), memory.clock.now()))
-    unlisted = [_unlisted_number(view, window) for window in (asked, other)]
+    unlisted: list[float | None] = [0.0, 0.0]
+    for nth, window in enumerate((asked, other)):
+        if gap_around(view, window) is not None:
+            # An error that is not listed there is unknown, rather than 0.
+            note_unrecorded(view, window)
+            unlisted[nth] = None
     windows = call.asked = clamped(view, asked), clamped(view, other)
     frame, things = _compare_things(view, windows, region)
     drives = [drive_in(view, window) for window in windows]
@@ -150,17 +155,6 @@ def compare(
         farthest=paths.farthest,
         notes=view.notes.sentences(),
     )
-
-
-def _unlisted_number(view: View, window: TimeWindow) -> float | None:
-    """Returns the number of errors that a window does not list: 0, or None if nothing is recorded.
-
-    A note says so then.
-    """
-    if gap_around(view, window) is None:
-        return 0.0
-    note_unrecorded(view, window)
-    return None
 
 
 def _compare_things(

@@ -312,10 +312,7 @@ def _with_place_names(event: Event, places: RobotPlaces) -> Event:
 def events_by_topic(
     view: View, window: TimeWindow, can_have: Callable[[str], bool] = has_events
 ) -> dict[str, TopicEvents | None]:
-    """Returns the events of each topic whose type can have them; None for no message.
-
-    `can_have` tells that of a type's name.
-    """
+    """Returns the events of each topic that can have them, by its types; None for no message."""
     timeline = view.timeline
     return {
         topic: events_in(view, topic, window)
@@ -363,7 +360,7 @@ class _ThingsInView(NamedTuple):
     """Things that came into view or left it.
 
     Attributes:
-        events: those that were seen longest.
+        events: the things that were seen longest.
         total: how many there are.
         throughout: the labels that were seen throughout the window.
     """
@@ -568,8 +565,8 @@ def _most_important(
 ) -> list[Event]:
     """Returns at most `most` events, in order of time: the most important, the longest of a kind.
 
-    `counts` has how many there are of each kind, with those that are not among `events`. A note
-    says how many are left out.
+    `counts` has how many there are of each kind; there may be more than `events`. A note says how
+    many are left out.
     """
     ranked = sorted(
         events,

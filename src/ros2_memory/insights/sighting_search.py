@@ -83,7 +83,7 @@ class MatchTester:
     """Tests the messages of the topics of a search.
 
     Attributes:
-        ruled_out: whether columns showed of some message that it does not match.
+        ruled_out: whether columns showed for any message that it does not match.
     """
 
     def __init__(self, view: View, search: ReverseSearch) -> None:
@@ -162,10 +162,10 @@ class MatchTester:
 
 
 def _merged_and_split(waiting: Block, reached: Block) -> tuple[Block | None, Block]:
-    """Returns the messages of two overlapping blocks as those after `reached` ends, and the others.
+    """Returns two overlapping blocks as one after the end of `reached`, and one up to its end.
 
-    No block that a scan reaches later has messages after the end of `reached`. The first block is
-    None if it has no message.
+    No block that a scan reaches later has messages after that end. The first block is None if it
+    has no message.
     """
     if not waiting.tested().times.size:
         return None, reached
@@ -394,7 +394,7 @@ def _blocks_newest_first(
 def _parts_in(
     view: View, found: SearchedRuns, scope: Scope, latched: Collection[str]
 ) -> SearchedRuns:
-    """Returns runs, with those of latched topics as the parts of the scope in which they held."""
+    """Returns runs, with the parts of a scope in which values of latched topics held."""
     if not latched:
         return found
     parts: list[Run] = []

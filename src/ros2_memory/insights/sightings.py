@@ -554,9 +554,9 @@ def _target_frames(view: View, robot: Pose | None, frame_id: str | None) -> tupl
 def _place_of_detection(
     view: View, thing: Detection | None, message: StoredMessage, targets: Sequence[str]
 ) -> LabelledPlace | None:
-    """Returns where a message has a thing, in the first target that it can be placed in.
+    """Returns where a message has a thing, in the first target that transforms lead to.
 
-    In no such frame it is in the message's own.
+    If they lead to none, the place is in the message's own frame.
     """
     if thing is None or thing.place is None:
         return None

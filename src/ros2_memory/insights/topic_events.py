@@ -426,7 +426,7 @@ def _statuses_matching(condition: Condition) -> set[int]:
 
 
 def _known_goals(view: View, topics: Sequence[str], window: TimeWindow) -> Iterator[GoalRun]:
-    """Yields the goals that were active in a window, also those that no message in it lists."""
+    """Yields the goals that were active in a window, even if no message in it lists them."""
     events_of_topics = {topic: events_in(view, topic, window) for topic in topics}
     for topic, events in events_of_topics.items():
         if events is not None:
@@ -458,7 +458,7 @@ def _active_at(view: View, topic: str, moment: Ns) -> dict[str, int]:
 def _goal_runs(
     topic: str, events: TopicEvents, statuses_before: Mapping[str, int], knows_all: bool
 ) -> Iterator[GoalRun]:
-    """Yields the goals that an action's messages list, but for those that ended before.
+    """Yields the goals that an action's messages list, unless they ended before.
 
     `statuses_before` has the goals that were listed before. `knows_all`: there were no others, so a
     goal that is new in the first message has just begun, even if it is listed as ended.

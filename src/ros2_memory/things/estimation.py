@@ -51,7 +51,7 @@ _SEVERAL_SHARE: Final = 0.1
 """Where more of the slices have several of a label at one place, several things stand there."""
 _FEWEST_IN_PART: Final = 10
 _SEVERAL_IN_PART: Final = 0.5
-"""So do they where more have several in the time between the outer percentiles of such slices."""
+"""So they do where more have several between the first and the last decile of such slices."""
 _SPOTS_AT_ONCE: Final = 16_384
 """About how many spots of labels are looked at together."""
 _RESTLESS_MOVES: Final = 6

@@ -111,17 +111,13 @@ def find_things(
     totals: Counter[str] = Counter()
     for thing in found:
         totals[thing.label] += thing.at_once or 1
-    bounds = []
-    if start_s is not None or end_s is not None:
-        bounds.append("window")
-    if region is not None or nearness is not None:
-        bounds.append("region")
     question = ThingsQuestion(
         labels=wanted,
         found=frozenset(key for thing in found for key in thing.keys),
         vague=frozenset(thing.label for thing in found if known.estimate.is_vague(thing.rows)),
         window=window,
-        bounds=f" in this {' and '.join(bounds)}" if bounds else "",
+        is_bounded=start_s is not None or end_s is not None,
+        has_region=region is not None or nearness is not None,
         min_score=f"min_score {lowest:g}{' (data.min_score)' if min_score is None else ''}",
         undecoded=undecoded,
     )
@@ -142,13 +138,13 @@ def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
         return shown[0].frame_id
     if known.has_map:
         return known.frames[0]
-    # The newest odometry; there is none where no detector published.
+    # The newest odometry, if any detector published.
     odometry = known.frames[1:]
     return odometry[-1] if odometry else ""
 
 
 class _FoundThing(NamedTuple):
-    """A thing that a question selects. Only those that are shown are described: of thousands, few.
+    """A thing that a question selects. It is described only if it is shown.
 
     Attributes:
         label: the name to show; `keys` are the keys of all its names.
@@ -402,7 +398,7 @@ class _Finder:
         )
 
     def _count_names(self, rows: Ints) -> dict[str, int]:
-        """Returns how often each name was seen in some spots, the commonest name first."""
+        """Returns how often each name was seen in spots, the commonest name first."""
         estimate = self.known.estimate
         labels = count_labels(estimate, estimate.counts, rows)
         return count_names(labels, self.known.labels, estimate.names)
@@ -423,8 +419,8 @@ class _Finder:
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
         """Returns the best and the median score of the detections that count; None without scores.
 
-        The median is known to 0.05, the width of a bin. Where a spot has its best score in that
-        bin, the median is the highest such score.
+        The median is known to 0.05, the width of a bin: it is the highest best score of a spot in
+        that bin, or the middle of the bin.
         """
         best = self.known.estimate.spots[rows, Spot.BEST]
         _, bins, n = self.known.estimate.scores.rows_of(rows)
@@ -467,7 +463,7 @@ def _commonest(counts: Counter[str], without: Collection[str]) -> tuple[str, ...
 
 
 def _grouped_by_place(stays: Sequence[_StayInWindow]) -> list[list[_StayInWindow]]:
-    """Returns stays in groups: those that follow each other at one place are one group.
+    """Returns stays in groups of consecutive stays at one place.
 
     A stay that was seen to end also ends its group: the thing was taken away and brought back.
     """

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _MISSED_BY_CHANCE: Final = 0.01
 _FEWEST_BESIDE: Final = 3
 _NEWEST_BESIDE: Final = 9
-"""The newest slices say how many there are now: of more, some may have been taken away since."""
+"""The newest slices say how many there are now: after older ones, some may have been taken away."""
 
 
 @dataclass(slots=True)
@@ -318,7 +318,7 @@ def count_misses(
 
     Only looks from cells that saw the thing during its stay count. Those are the looks up to
     `seen_to`, and later ones with a hit. A cell's rate is known as well as its messages tell (a
-    uniform prior). `evidence` is that of one place; see `Evidence.at_place`.
+    uniform prior). `evidence` has the looks at one place; see `Evidence.at_place`.
     """
     numbers, is_hit = evidence.looks, evidence.hits > 0
     slices, first, last = looks.slice[numbers], looks.first[numbers], looks.last[numbers]

@@ -1,10 +1,10 @@
 """The things of a memory: estimated from the sights of all its bags, once for each timeline.
 
-Of a window that ended in the past they are estimated from the sightings until its end, so that an
-answer about it stays what it was: a thing that was moved since is where it was then.
+For a window that ended in the past, things are estimated from the sightings until its end. So an
+answer about it never changes: a thing that was moved since is where it was then.
 
-Where gathering sights takes too long an estimate begins later, and says so. So it does where there
-are too many sightings: a detector that sees things everywhere has thousands in an hour.
+If gathering sights takes too long, an estimate begins later, and says so. It also begins later if
+there are too many sightings: a detector that sees things everywhere has thousands in an hour.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="Hashable")
 _Part: TypeAlias = "list[SeenStretch[Session]]"
 _Odometry: TypeAlias = "tuple[str, Session | None]"
-"""A frame, and the session in which its coordinates hold; None of the map, where they always do."""
+"""A frame, and the session in which its coordinates hold; None for the map: they always hold."""
 
 _MOST_SPOTS: Final = 150_000
 """Spots that one estimate compares: a home robot has 50,000 in a week."""

@@ -14,9 +14,9 @@ place. They end in the same word, lie within the scatter of each other, alternat
 and are not in one message there. Names that the owner declares apart stay apart, and one that is
 used in turn with both of them is joined with neither.
 
-When localisation was poor (`poorly_localised`): then a detection is not where it seems to be. That
-is while the localiser's covariance is large, and for some seconds before the map jumps under
-odometry, which shows that it had been off.
+When localisation was poor (`poorly_localised`): then a detection is not where it seems to be.
+Localisation is poor while the localiser's covariance is large, and for some seconds before the map
+jumps under odometry, which shows that it had been off.
 """
 
 from __future__ import annotations
@@ -412,7 +412,7 @@ _LEAST_SHARE: Final = 0.05
 _SAME_MM: Final = 100.0
 """The means of two labels in a visit are at one place if they are this near to each other."""
 _SCATTERS: Final = 2.0
-"""Or if they are within so many root mean square distances of the looks."""
+"""Or if they are within two root mean square distances of the looks."""
 
 
 def with_synonyms(

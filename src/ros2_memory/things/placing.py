@@ -59,7 +59,7 @@ _AHEAD_NS: Final[Ns] = 3 * _FIX_NS
 """Fixes go on after the last detection: a jump soon after it shows that localisation was off."""
 _MOST_FIXES: Final = 2_000
 _SAID_NS: Final[Ns] = NS_PER_S // 2
-"""Of a localiser's messages one in each half of a second is read."""
+"""One message of a localiser is read in each half of a second."""
 _SAME_M: Final = 0.1
 """Fixes with smaller changes are left out."""
 _COVARIANCE: Final = 36

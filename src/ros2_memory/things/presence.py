@@ -335,8 +335,8 @@ def evidence_at(
     np.minimum(hits_of, cells.n[_number(hit_looks)], out=hits_of)
     hit_cells, cell_of = np.unique(cells.cells_of(hit_looks), return_inverse=True)
     sees = _seeing_cells(cells, hit_cells, cell_of, _number(hit_looks), hits_of)
-    # All looks from cells that see the place; from others those in slices with hits. From a dock,
-    # ten thousands of looks are at each place of which it once had a false detection.
+    # All looks from cells that see the place, and from other cells the looks in slices with hits: a
+    # robot in its dock has ten thousands of looks at each place with one false detection.
     hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
     beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
     cell, has_hits = places_among(cells.cells_of(beside), hit_cells)

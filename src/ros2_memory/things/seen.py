@@ -206,10 +206,10 @@ class SightReader:
     def newest_first(
         self, until: Ns = MAX_NS, most: float = math.inf
     ) -> Iterator[list[SeenStretch[Session]]]:
-        """Yields the sights of all sessions stretch by stretch, of those that begin before a time.
+        """Yields the sights of all sessions, stretch by stretch, up to a log time (ns).
 
-        Stretches without sights are left out. Those of one `STRETCH_NS` come at once, except in the
-        newest, and except where that would lead to `most` spots or more.
+        A stretch without sights is left out. The stretches of one `STRETCH_NS` come at once, except
+        the newest, and except where that would lead to `most` spots or more.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -230,8 +230,8 @@ class SightReader:
     def make_sights(self, window: TimeWindow, *, is_joined: bool = False) -> Iterator[Ns]:
         """Makes and stores the sights of a window that follow from parts of the store alone.
 
-        With `is_joined` it makes the sights of whole `STRETCH_NS`, from those of their stretches.
-        Yields where each stretch begins (log time, ns), the newest first.
+        With `is_joined` it joins the stored sights of each whole `STRETCH_NS`. Yields where each
+        stretch begins (log time, ns), the newest first.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -304,6 +304,9 @@ class SightReader:
         """Yields each bag with its sights in each stretch, and the frame of their places.
 
         Only messages that count are seen. The sights do not have the robot's poses.
+
+        Raises:
+            QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         files = {bag.file for bag in bags}
         spans = np.array([(bag.start, bag.end) for bag in bags], np.int64).reshape(-1, 2).T
@@ -345,9 +348,9 @@ class SightReader:
     def _lendings(
         self, session: Session, bag: BagFile, window: TimeWindow, *, is_alone: bool
     ) -> Iterator[_Lending]:
-        """Yields which sessions lend transforms to one. `bag` is a bag of it.
+        """Yields a session with each session that lends it transforms in a window.
 
-        `is_alone`: no other session is in the window.
+        `bag` is any bag of the session. `is_alone`: the window has no other session.
         """
         if is_alone or self._sessions.has_all_kinds(session):
             yield _Lending(session, self._lender_to(session, bag, window))
@@ -366,7 +369,7 @@ class SightReader:
         return self._sessions.lending_to(bag.recording, max(bag.start, window.start))
 
     def _joined_sights(self, stretches: Sequence[TimeWindow]) -> list[SeenStretch[Session]] | None:
-        """Returns the sights in all stretches of a `STRETCH_NS` as those of one stretch.
+        """Returns the sights in all stretches of a `STRETCH_NS`, joined as if of one stretch.
 
         None if that time is not over, or if the sights follow from more than whole parts.
         """

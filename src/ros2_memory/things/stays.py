@@ -298,7 +298,7 @@ class _HostSearch:
     def _candidates(self, numbers: Ints) -> tuple[Ints, Ints]:
         """Returns pairs of a stay and a possible host, by the stay, the likeliest host first.
 
-        The stay's detections must be few beside those of the host at that time.
+        The stay must have few detections in comparison with the host at that time.
         """
         stay, host, away_mm = self._pairs_near(numbers)
         begin = np.searchsorted(self._slices, host * self._width + self._first_slice[stay])

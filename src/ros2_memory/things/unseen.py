@@ -70,7 +70,7 @@ class ThingsQuestion(NamedTuple):
         labels: the labels by key; empty for all things.
         found: the keys of the things that were found.
         vague: the labels of found things that were last seen while localisation was poor.
-        bounds: how a sentence names the window and the region.
+        is_bounded: whether the window was asked for; `has_region` whether a region was.
         min_score: how a sentence names the least score, and the setting it is from.
         undecoded: topics with messages that cannot be decoded; see `note_undecoded`.
     """
@@ -79,9 +79,20 @@ class ThingsQuestion(NamedTuple):
     found: Collection[str]
     vague: Collection[str]
     window: TimeWindow
-    bounds: str
+    is_bounded: bool
+    has_region: bool
     min_score: str
     undecoded: Collection[str]
+
+    @property
+    def bounds(self) -> str:
+        """The window and the region that were asked for, as the end of a sentence."""
+        names = []
+        if self.is_bounded:
+            names.append("window")
+        if self.has_region:
+            names.append("region")
+        return f" in this {' and '.join(names)}" if names else ""
 
 
 class _LabelDetections(NamedTuple):
@@ -242,7 +253,8 @@ def vague_notes(
 ) -> Iterator[str]:
     """Yields which labels were last detected while localisation was poor.
 
-    They are `vague`, and those that this is found of in a window: of some keys, or of all.
+    They are the labels in `vague`, and those with one of the keys, or any, whose newest spot in a
+    window is poor.
     """
     estimate, spots = known.estimate, known.estimate.spots
     labels = {*vague}
