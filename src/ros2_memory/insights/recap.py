@@ -164,22 +164,15 @@ def recap(
     things = _things_in_view(
         view, window, events_of_topics, region_stays, min_score=least, most=most_events
     )
-    stops = drive.stops(end - start)
-    if region_stays is not None:
-        stops = tuple(
-            stop
-            for stop in stops
-            if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
-        )
-    longest = nsmallest(most_events, stops, key=lambda stop: -stop.length)
+    stops = _stops_inside(drive.stops(end - start), region_stays)
+    goals = goals_in(view, window, events_of_topics)
     events = [
-        *_stop_events(longest, places),
+        *_stop_events(nsmallest(most_events, stops, key=lambda stop: -stop.length), places),
         *reported,
         *things.events,
         *_recording_events(view, window, drive),
+        *(_goal_event(goal, start, drive.elapsed) for goal in goals),
     ]
-    goals = goals_in(view, window, events_of_topics)
-    events += [_goal_event(goal, start, drive.elapsed) for goal in goals]
     if region_stays is not None:
         events = [event for event in events if region_stays.contains(event)]
     note_unread(view, window)
@@ -446,6 +439,15 @@ def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted"
 
 
+def _stops_inside(stops: Sequence[Stop], region_stays: _RegionStays | None) -> Sequence[Stop]:
+    """Returns the stops that overlap a stay in the region; all without a region."""
+    if region_stays is None:
+        return stops
+    return [
+        stop for stop in stops if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
+    ]
+
+
 def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[Event]:
     """Yields stops with the point where the robot stood, in the frame of places if it is known."""
     for stop in stops:
@@ -552,11 +554,13 @@ def _counts_shown(changes_of_events: Mapping[Event, Sequence[PastChange]]) -> di
     for is_last, nth in product((False, True), range(_MOST_CHANGES)):
         for event, past in changes_of_events.items():
             # An event whose nearer change had no room shows no farther one.
-            if is_routine_event[event] is is_last and len(past) > nth == counts_shown[event]:
-                size = len(past[nth].text) + _CHANGE_CHARS
-                if size <= chars_left:
-                    chars_left -= size
-                    counts_shown[event] += 1
+            has_next = len(past) > nth == counts_shown[event]
+            if is_routine_event[event] is not is_last or not has_next:
+                continue
+            size = len(past[nth].text) + _CHANGE_CHARS
+            if size <= chars_left:
+                chars_left -= size
+                counts_shown[event] += 1
     return counts_shown
 
 

@@ -79,8 +79,9 @@ def find_things(
     lowest = limits.min_score if min_score is None else min_score
     view, now, asked_window = open_search(memory, call, TimeRange(start_s, end_s))
     searched = asked_window
+    begin, _ = asked_window.asked()
     ahead_from = view.snapshot.dating.ahead_from
-    if end_s is None and asked_window.asked()[0] < ahead_from:
+    if end_s is None and begin < ahead_from:
         # A wrong clock dated the rest.
         searched = TimeWindow(asked_window.start, ahead_from)
     require_recorded(view, searched)

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.things.known import KnownThings
 
@@ -126,20 +127,26 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
     failures: list[UndecodableError] = []
     for topic in topics_with_detections(view.timeline):
         with suppress(NotInLakeError):
-            newest = view.stream.newest(topic, window)
-            if newest is None:
-                continue
-            first = view.stream.first([topic], window)
-            for stored in filter(None, (newest, first)):
-                at = TimeWindow(stored.time, stored.time + 1)
-                rows_then = [*scan(view, topic, at, copies=True)]
-                # Decoding compiles the type, which takes long: columns show what was decoded.
-                if not rows_then or any("" in rows.table.left_out for rows in rows_then):
-                    view.bags.decode(stored, failures)
+            for stored in _messages_to_try(view, topic, window):
+                view.bags.decode(stored, failures)
     reasons = {failure.topic: failure.reason for failure in failures}
     for topic, reason in reasons.items():
         view.notes.add_lack(Note(_UNDECODED, topic, reason))
     return frozenset(reasons)
+
+
+def _messages_to_try(view: View, topic: str, window: TimeWindow) -> Iterator[StoredMessage]:
+    """Yields the newest and the first message of a topic, unless columns show that they decode.
+
+    Decoding compiles the type, which takes long.
+    """
+    newest = view.stream.newest(topic, window)
+    first = None if newest is None else view.stream.first([topic], window)
+    for stored in filter(None, (newest, first)):
+        at = TimeWindow(stored.time, stored.time + 1)
+        rows_then = [*scan(view, topic, at, copies=True)]
+        if not rows_then or any("" in rows.table.left_out for rows in rows_then):
+            yield stored
 
 
 def describe_hung(view: View, window: TimeWindow) -> Iterator[str]:
