@@ -68,7 +68,7 @@ from ros2_memory.things.places import LEAST_MM
 from ros2_memory.things.unseen import describe_hung, note_undecoded, unplaced_notes, vague_notes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
@@ -435,26 +435,34 @@ def _compare_paths(
         return _PathDifferences()
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
-    tracks = [known_track(view, frame, window).track for window in windows]
+    first, second = (known_track(view, frame, window).track for window in windows)
     stands = []
-    for track, drive in zip(tracks, drives, strict=True):
+    for track, drive in zip((first, second), drives, strict=True):
         spans = ((stop.standstill.start, stop.standstill.end) for stop in drive.standstills)
         stands.append([*placed_standstills(track, spans, region)])
-    differences: list[tuple[float, StandstillPlace]] = []
-    for at in stood_at(*stands):
-        this_s, other_s = (seconds or 0.0 for seconds in at.seconds)
-        if differ(this_s, other_s, _LEAST["stood_s"]):
-            named = at._replace(inside=places_at(places, frame, *at.place))
-            differences.append((abs(this_s - other_s), named))
-    differences.sort(key=lambda difference: -difference[0])
+    stood = [
+        at._replace(inside=places_at(places, frame, *at.place))
+        for at in _standstill_differences(stood_at(*stands))
+    ]
     farthest: list[FarFromOther | None] = []
-    for point in farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region):
+    for point in farthest_apart((first, windows[0]), (second, windows[1]), region):
         if point is None or point.away_m < _LEAST_APART_M:
             farthest.append(None)
         else:
             farthest.append(point._replace(inside=places_at(places, frame, *point.place)))
     this, other = farthest
-    return _PathDifferences(frame, tuple(at for _, at in differences), (this, other))
+    return _PathDifferences(frame, tuple(stood), (this, other))
+
+
+def _standstill_differences(places: Iterable[StandstillPlace]) -> list[StandstillPlace]:
+    """Returns the places where the robot stood longer in one window, the largest first."""
+    differences: list[tuple[float, StandstillPlace]] = []
+    for at in places:
+        this_s, other_s = (seconds or 0.0 for seconds in at.seconds)
+        if differ(this_s, other_s, _LEAST["stood_s"]):
+            differences.append((abs(this_s - other_s), at))
+    differences.sort(key=lambda difference: -difference[0])
+    return [at for _, at in differences]
 
 
 def _minutes_in_places(

@@ -73,7 +73,7 @@ def list_moments(memory: Memory, call: Call) -> MomentList:
     """Returns the saved moments, newest first.
 
     Raises:
-        RefusedError: they cannot be read.
+        RefusedError: the moments cannot be read.
     """
     return newest_moments(memory, _now(memory, call), MAX_LISTED)
 
@@ -98,7 +98,7 @@ def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
     """Returns the newest saved moments, newest first. `now` (ns) is what "ago" counts from.
 
     Raises:
-        RefusedError: they cannot be read.
+        RefusedError: the moments cannot be read.
     """
     with _refuse_unreadable():
         stored = _moments_of(memory)

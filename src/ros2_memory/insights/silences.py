@@ -47,14 +47,14 @@ def silences_of(
 
 
 def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
-    """Returns the silences in bags, and in thinned bags before they were thinned."""
+    """Returns the silences in bags, and the recorded silences of deleted bags."""
     silences = [*snapshot.silences]
     spans_by_topic: defaultdict[str, Spans] = defaultdict(list)
     for silence in silences:
         spans_by_topic[silence.topic].append((silence.start, silence.end))
     for columns in read_thinned(bag_dir).silences:
         silence = snapshot.prolonged(Silence._make(columns))
-        # Until the original bags are deleted, they show the same silence.
+        # Until its bags are deleted, they show the same silence.
         if not overlaps_any(spans_by_topic[silence.topic], silence.start, silence.end - 1):
             silences.append(silence)
     return silences
