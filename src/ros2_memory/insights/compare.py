@@ -438,7 +438,7 @@ def _compare_paths(
     first, second = (known_track(view, frame, window).track for window in windows)
     stands = []
     for track, drive in zip((first, second), drives, strict=True):
-        spans = ((stop.standstill.start, stop.standstill.end) for stop in drive.standstills)
+        spans = (stop.span for stop in drive.standstills)
         stands.append([*placed_standstills(track, spans, region)])
     stood = [
         at._replace(inside=places_at(places, frame, *at.place))

@@ -33,6 +33,7 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     START_SLACK_NS,
     Ns,
+    Span,
     ns_from_unix,
     unix_from_ns,
 )
@@ -71,6 +72,11 @@ class Stop(NamedTuple):
     def length(self) -> Ns:
         """How long the part in the window lasts (ns)."""
         return self.standstill.end - self.standstill.start
+
+    @property
+    def span(self) -> Span:
+        """The first and the last time (ns) of the part."""
+        return self.standstill.start, self.standstill.end
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +121,7 @@ class Drive:
         - Poses are missing for much of the recorded time: some robots have none while they stand.
         - The robot neither moved nor stood for most of the time: noise hides where it stood.
         """
-        stood = self.elapsed.among(
-            (stop.standstill.start, stop.standstill.end) for stop in self.standstills
-        )
+        stood = self.elapsed.among(stop.span for stop in self.standstills)
         trajectory = self.valid_trajectory
         if trajectory is None:
             return stood or None

@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.robot_tracks import Stay
 
@@ -249,15 +250,16 @@ class _RegionStays:
         is_inside = any(stay.start <= start and end <= stay.stop for stay in self.stays)
         return not is_inside and self.overlaps(start, end)
 
-    def standing_time(self, standstills: Iterable[Stop]) -> Ns:
+    def standing_time(self, stops: Iterable[Stop]) -> Ns:
         """Returns how long (ns) the robot stood during the stays."""
-        spans = []
-        for stop in standstills:
-            for stay in self.stays:
-                start = max(stop.standstill.start, stay.start)
-                end = min(stop.standstill.end, stay.stop)
-                if start < end:
-                    spans.append((start, end))
+        spans: Spans = []
+        for stop in stops:
+            start, end = stop.span
+            spans += [
+                (max(start, stay.start), min(end, stay.stop))
+                for stay in self.stays
+                if start < stay.stop and stay.start < end
+            ]
         return self._elapsed.among(spans)
 
 
@@ -443,9 +445,7 @@ def _stops_inside(stops: Sequence[Stop], region_stays: _RegionStays | None) -> S
     """Returns the stops that overlap a stay in the region; all without a region."""
     if region_stays is None:
         return stops
-    return [
-        stop for stop in stops if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
-    ]
+    return [stop for stop in stops if region_stays.overlaps(*stop.span)]
 
 
 def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[Event]:

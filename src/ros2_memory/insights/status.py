@@ -237,7 +237,6 @@ def missing_data(view: View) -> Iterator[str]:
     snapshot = view.snapshot
     if snapshot.problem is None and not snapshot.bags:
         yield nothing_here(snapshot)
-    at, details = "data_time_range", "data_time_range has the details"
     undecided = [bag for bag in snapshot.active if not bag.growing and bag.reason != HELD_BACK]
     if undecided:
         files = counted(len(undecided), "file has", "files have")
@@ -248,18 +247,18 @@ def missing_data(view: View) -> Iterator[str]:
         yield f"{bags} left open by a crash: unwritten messages are lost"
     if snapshot.unread:
         files = counted(len(snapshot.unread), "file is", "files are")
-        yield f"{files} not read; {at} says why"
+        yield f"{files} not read; data_time_range says why"
     contradictory = bags_with_remarks(snapshot)
     if contradictory:
         bags = counted(len(contradictory), "bag is", "bags are")
-        yield f"{bags} incomplete or contradictory; {details}"
+        yield f"{bags} incomplete or contradictory; data_time_range has the details"
     broken = view.memory.scanner.damaged_parts(snapshot.bags)
     if broken:
         bags = counted(len(broken), "bag", "bags")
-        yield f"{bags} could not be read whole; {at} names what is damaged"
+        yield f"{bags} could not be read whole; data_time_range names what is damaged"
     if snapshot.dating.misdated:
         bags = counted(len(snapshot.dating.misdated), "bag is", "bags are")
-        yield f"{bags} dated by a wrong clock; {details}"
+        yield f"{bags} dated by a wrong clock; data_time_range has the details"
     yield from describe_absent(view.memory.absent_splits(snapshot))
     alone = [topic for topic in view.timeline.topics() if _has_times_alone(view, topic)]
     if alone:

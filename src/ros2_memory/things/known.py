@@ -129,16 +129,16 @@ def known_things(view: View, min_score: float, window: TimeWindow) -> KnownThing
     until = -(-window.stop // SIGHTS_NS) * SIGHTS_NS
     ahead = view.snapshot.dating.ahead_from
     by_all = _Loader(view, min_score, ahead if window.stop <= ahead else MAX_NS)
-    known = by_all.known() if by_all.reaches(window.start) else None
+    known = by_all.load() if by_all.reaches(window.start) else None
     is_past = latest is None or until <= latest
     is_out_of_time = known is not None and known.since is not None and not known.crowded
     if is_past and not is_out_of_time:
-        then = _Loader(view, min_score, MAX_NS, until).known()
+        then = _Loader(view, min_score, MAX_NS, until).load()
         if known is not None and known.reaches_back(window):
             return replace(then, later=known) if then.reaches_back(window) else known
         known = then
     elif known is None:
-        known = by_all.known()
+        known = by_all.load()
     if known.crowded or known.until < MAX_NS:
         view.notes.complete &= known.reaches_back(window)
         others = "other" if known.until < MAX_NS else "older"
@@ -197,7 +197,7 @@ class _Loader:
         """Returns whether the sightings after a moment are few enough to compare.
 
         Raises:
-            QueryTimeoutError: as in `known`.
+            QueryTimeoutError: as in `load`.
         """
         cached = self._cached
         if cached is not None:
@@ -208,7 +208,7 @@ class _Loader:
             self._put(since)
         return since <= moment
 
-    def known(self) -> KnownThings:
+    def load(self) -> KnownThings:
         """Returns the things in all sights that could be read, and compared, in time.
 
         Raises:

@@ -261,18 +261,19 @@ class _HostSearch:
         self._keys, self._key_of_label = numbered(keys)
         self._key = _column(self._keys.index(group.key) for group, _ in stays)
         self._epoch = _column(group.epoch for group, _ in stays)
-        self._count = _column(stay.count for _, stay in stays)
-        self._first = _column(stay.first for _, stay in stays)
-        self._last = _column(stay.last for _, stay in stays)
-        self._is_weak = _column(stay.weak for _, stay in stays) > 0
-        self._first_slice = _column(stay.stay.first_slice for _, stay in stays)
-        self._last_slice = _column(stay.stay.last_slice for _, stay in stays)
-        places = np.array([(stay.x, stay.y, stay.z) for _, stay in stays], np.float64)
+        placed = [stay for _, stay in stays]
+        self._count = _column(stay.count for stay in placed)
+        self._first = _column(stay.first for stay in placed)
+        self._last = _column(stay.last for stay in placed)
+        self._is_weak = _column(stay.weak for stay in placed) > 0
+        self._first_slice = _column(stay.stay.first_slice for stay in placed)
+        self._last_slice = _column(stay.stay.last_slice for stay in placed)
+        places = np.array([(stay.x, stay.y, stay.z) for stay in placed], np.float64)
         self._places = places.reshape(-1, 3).T
         self._by_x = np.argsort(self._places[0], kind="stable")
         # Each spot's stay and slice as one number, in order; and how many detections are before it.
-        sizes = [len(stay.spots) for _, stay in stays]
-        self._rows = np.concatenate([np.zeros(0, np.int64), *(stay.spots for _, stay in stays)])
+        sizes = [len(stay.spots) for stay in placed]
+        self._rows = np.concatenate([np.zeros(0, np.int64), *(stay.spots for stay in placed)])
         self._stay_of = np.repeat(np.arange(len(stays)), sizes)
         spots = observed.sights.spots[self._rows]
         self._width = len(observed.sights.epochs) + 1
