@@ -323,22 +323,23 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
     """Returns the times of all runs of matches; a value lasts until a message says otherwise."""
     searched_runs = _find_runs_early(view, search, scope, enough=None)
     spans, topics = searched_runs.spans, search.topics
+    firsts, lasts, are_begun = spans.T  # views: what is set in them is set in `spans`
     # Without a scope the oldest may have begun before what there was time to search.
-    spans[:, 2] |= not scope.is_bounded
+    are_begun |= not scope.is_bounded
     is_log = np.array([*map(view.timeline.is_log, topics)], np.bool_)
     states = np.flatnonzero(~is_log[searched_runs.table[:, 0]])
     known = 0
     try:
         for known, run in zip(states.tolist(), searched_runs.runs(states), strict=True):
-            spans[known, 1] = _lasted_until(view, run, scope)
+            lasts[known] = _lasted_until(view, run, scope)
     except QueryTimeoutError:
         # The runs of several topics overlap: since when all are known cannot be said.
         if not known or len(topics) > 1:
             raise
         view.bags.finish_within(_LEFT_TO_SAY_S)
-        return SightingSpans(spans[:known], int(spans[known - 1, 0]))
+        return SightingSpans(spans[:known], int(firsts[known - 1]))
     if searched_runs.is_over:
-        return SightingSpans(spans, int(spans[-1, 0]))
+        return SightingSpans(spans, int(firsts[-1]))
     start, end = scope.window.asked()
     earlier = [
         (first, last, False)
