@@ -153,15 +153,16 @@ app = typer.Typer(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line (`sys.argv` unless given) and returns the exit code.
+    """Runs the command line (`sys.argv` by default) and returns the exit code.
 
     0: done, and the answer is yes; 1: an answer was wrong or missing, or something was left undone;
     2: it could not run, and stderr says why; 130: interrupted before it finished.
     """
     # Signals end it as Ctrl-C does, so that files are closed.
-    before = {number: signal.signal(number, signal.default_int_handler) for number in _SIGNALS}
-    if isinstance(sys.stdout, TextIOWrapper):  # names and texts that its encoding has not
-        with suppress(OSError):  # of a pipe that was a file before
+    handlers = {number: signal.signal(number, signal.default_int_handler) for number in _SIGNALS}
+    if isinstance(sys.stdout, TextIOWrapper):
+        with suppress(OSError):  # where a pipe has taken the place of a file
+            # Recorded names may have letters that the terminal's encoding lacks.
             sys.stdout.reconfigure(errors="backslashreplace")
     try:
         # An application with a callback is a group.
@@ -174,7 +175,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
     return 0
 
@@ -200,20 +201,20 @@ class LazyCommand(TyperCommand):
 
     def _load(self) -> "Command":
         module, _, attribute = COMMANDS[self._name].path.rpartition(".")
-        loaded: object = getattr(import_module(f"{__package__}.{module}"), attribute)
+        command: object = getattr(import_module(f"{__package__}.{module}"), attribute)
         parent = typer.Typer(add_completion=False, rich_markup_mode=None)
-        if isinstance(loaded, typer.Typer):
-            parent.add_typer(loaded, name=self._name, epilog=epilog(self._name))
-        elif callable(loaded):
+        if isinstance(command, typer.Typer):
+            parent.add_typer(command, name=self._name, epilog=epilog(self._name))
+        elif callable(command):
             # Imported here, as the command is, since it imports much itself.
             from ros2_memory.cli.options import as_command  # noqa: PLC0415
 
-            parent.command(self._name, epilog=epilog(self._name))(as_command(self._name)(loaded))
+            parent.command(self._name, epilog=epilog(self._name))(as_command(self._name)(command))
         return get_group(parent).commands[self._name]
 
 
 def epilog(command: str) -> str:
-    """Returns the last lines of a command's help: what its exit codes mean."""
+    """Returns the last line of a command's help: its exit codes and their meanings."""
     negative = COMMANDS[command].negative
     failed = f"1: {negative}; " if negative else ""
     return f"Exit code: 0: done; {failed}{COMMON_EXIT_CODES}."

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Annotated, Final
 
@@ -27,7 +27,7 @@ from ros2_memory.cli.options import (
     present_time,
     with_date,
 )
-from ros2_memory.cli.output import print_line, print_reply, spinner, with_shorter_lists
+from ros2_memory.cli.output import cut_lists, print_line, print_reply, spinner
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -51,7 +51,7 @@ NEVER: Final = "never: no recorded message meets the condition"
 
 
 def complete(incomplete: str) -> list[str]:
-    """Returns the tools whose names begin so, for the shell's completion."""
+    """Returns the tools whose names begin with `incomplete`, for the shell's completion."""
     names = (tool.name for tool in build_tools(QuerySettings(), writing=True))
     return [name for name in names if name.startswith(incomplete)]
 
@@ -89,42 +89,34 @@ def ask(
     if tool is not None and tool_help:
         _print_help(tool)
         return False
-    words = [word for word in (tool, *(given or ())) if word is not None]
-    of_settings = [
-        word
-        for word in words
-        if _SETTING.fullmatch(word)
-        or (is_folder(word) and not (word == tool and word in complete(word)))
-    ]
-    asked = [word for word in words if word not in of_settings]
-    loaded, _ = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
+    question, looking = [], [*(settings or ())]
+    for word in [tool, *(given or ())]:
+        if word is None:
+            continue
+        # Where a folder has the name of a tool, the first word is the tool.
+        is_bags = is_folder(word) and not (word == tool and word in complete(word))
+        if is_bags or _SETTING.fullmatch(word):
+            looking.append(word)
+        else:
+            question.append(word)
+    loaded, _ = load_to_look(bag_dir, looking, recording)
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
-    if not asked:
-        rows: list[JsonValue] = []
-        for tool_listed in dispatcher.tools:
-            description = tool_listed.description.removeprefix("Blocking. ")
-            purpose = re.split(r"\. |;", description)[0].rstrip(".")
-            taken = ", ".join(argument for argument, _ in _arguments(tool_listed))
-            rows.append({"tool": tool_listed.name, "purpose": purpose, "arguments": taken})
-        if as_json:
-            print_line(json.dumps(rows))
-        else:
-            print_reply(rows)
-            print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
+    if not question:
+        _print_tools(dispatcher.tools, as_json=as_json)
         return False
-    # A folder that is not there may stand before the tool.
+    # A folder that does not exist may stand before the tool.
     tools = {tool.name: tool.arguments for tool in dispatcher.tools}
-    name = next((word for word in asked if word in tools), asked[0])
-    rest = [word for word in asked if word and word != name]
+    name = next((word for word in question if word in tools), question[0])
+    arguments = [word for word in question if word and word != name]
     with spinner(f"asking {name}"):
         if fleet is not None:
-            with suppress(InvalidArgumentsError):  # the tool refuses them
-                robot = parse_arguments(rest, tools.get(name, {})).get("robot")
+            with suppress(InvalidArgumentsError):  # the tool refuses such arguments itself
+                robot = parse_arguments(arguments, tools.get(name, {})).get("robot")
                 call = Call(Deadline.after(loaded.server.call_timeout_s))
                 memory = fleet.newest(robot, call) or memory
-        reply = answer_to(dispatcher, memory, name, rest)
+        reply = answer_to(dispatcher, memory, name, arguments)
     answer: JsonValue = json.loads(reply.text)
     if as_json:
         print_line(reply.text)
@@ -132,16 +124,31 @@ def ask(
         print_line(NEVER)
     else:
         if isinstance(answer, dict):
-            answer = with_shorter_lists(answer, ["waypoints"])
+            answer = cut_lists(answer, ["waypoints"])
         print_reply(answer, unix_from_ns(present_time(memory)))
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 
-def answer_to(dispatcher: Dispatcher, memory: Memory, name: str, words: Sequence[str]) -> Reply:
-    """Returns the reply of a tool to the words of the command line; `called` says what it ends.
+def _print_tools(tools: Iterable[Tool], *, as_json: bool) -> None:
+    """Prints each tool with the first sentence of its description, and its arguments."""
+    rows: list[JsonValue] = []
+    for tool in tools:
+        description = tool.description.removeprefix("Blocking. ")
+        purpose = re.split(r"\. |;", description)[0].rstrip(".")
+        arguments = ", ".join(_argument_names(tool))
+        rows.append({"tool": tool.name, "purpose": purpose, "arguments": arguments})
+    if as_json:
+        print_line(json.dumps(rows))
+    else:
+        print_reply(rows)
+        print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
 
-    Times and durations may be as people write them. A `recap` without a time is that of the newest
-    day.
+
+def answer_to(dispatcher: Dispatcher, memory: Memory, name: str, words: Sequence[str]) -> Reply:
+    """Returns the reply of a tool, asked with words of the command line, and stops the dispatcher.
+
+    Times and durations may be written as people write them. A `recap` without a time is that of
+    the newest day.
 
     Raises:
         InvalidArgumentsError: a word is no argument, or a text is no time.
@@ -156,32 +163,33 @@ def answer_to(dispatcher: Dispatcher, memory: Memory, name: str, words: Sequence
     if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
         first, last = newest_day(memory).asked()
         arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
-    return called(dispatcher, name, arguments)
+    return call_once(dispatcher, name, arguments)
 
 
-def called(dispatcher: Dispatcher, tool: str, arguments: Mapping[str, object]) -> Reply:
-    """Returns the reply of a tool; the dispatcher takes no further call."""
+def call_once(dispatcher: Dispatcher, tool: str, arguments: Mapping[str, object]) -> Reply:
+    """Calls a tool, returns its reply, and stops the dispatcher."""
     try:
         return anyio.run(dispatcher.answer, tool, arguments)
     finally:
         dispatcher.stop()
 
 
-def parse_arguments(given: Sequence[str], schemas: Mapping[str, JsonObject]) -> dict[str, object]:
-    """Parses the arguments of a tool: one JSON object, or `key=value` each.
+def parse_arguments(words: Sequence[str], schemas: Mapping[str, JsonObject]) -> dict[str, object]:
+    """Parses the arguments of a tool: either one JSON object, or `key=value` words.
 
-    What `schemas`, the JSON schemas of the tool's arguments, take as text is not parsed.
+    `schemas` are the JSON schemas of the arguments by name. A value is read as JSON if it is JSON,
+    unless its schema says that it is a string.
 
     Raises:
-        InvalidArgumentsError: a word is neither.
+        InvalidArgumentsError: a word has neither form.
     """
-    if len(given) == 1 and given[0].lstrip().startswith("{"):
-        value = _from_json(given[0], None)
+    if len(words) == 1 and words[0].lstrip().startswith("{"):
+        value = _json_or(words[0], None)
         if not isinstance(value, dict):
-            raise InvalidArgumentsError(f"{given[0]} is not a JSON object")
+            raise InvalidArgumentsError(f"{words[0]} is not a JSON object")
         return {**value}
     arguments: dict[str, object] = {}
-    for word in given:
+    for word in words:
         key, equals, text = word.partition("=")
         if not equals or not key:
             raise InvalidArgumentsError(
@@ -189,33 +197,39 @@ def parse_arguments(given: Sequence[str], schemas: Mapping[str, JsonObject]) -> 
                 "key=value, such as seconds_ago=10, or one JSON object, or name a bag or a folder "
                 "of bags"
             )
-        # A list in place of one text is read from its JSON by the argument itself.
         is_text = schemas.get(key, {}).get("type") == "string"
-        arguments[key] = text if is_text else _from_json(text, text)
+        arguments[key] = text if is_text else _json_or(text, text)
     return arguments
 
 
 def _with_parsed_times(value: object, schema: object, now: float) -> object:
-    """Returns an argument with the times and durations in it parsed, as its schema has them."""
+    """Converts the texts of an argument that its JSON schema wants as times or durations.
+
+    Durations become seconds, times Unix seconds; a time in ISO 8601 stays a text, since the tool
+    knows how long it lasts: a day, a minute, a second. `now` (Unix s) is what "ago" counts from.
+    """
     schema = schema if isinstance(schema, dict) else {}
     kind, items = schema.get("type"), schema.get("items")
     if isinstance(value, list):
         return [_with_parsed_times(inner, items, now) for inner in value]
-    if isinstance(value, str) and kind == "array":
+    if not isinstance(value, str):
+        return value
+    if kind == "array":
         return _with_parsed_times(value, items, now)
-    if isinstance(value, str) and kind == "number":
+    if kind == "number":
         seconds = parse_duration(value)
         return value if seconds is None else seconds
-    if isinstance(value, str) and kind == [*TIME_KINDS]:
+    if kind == [*TIME_KINDS]:
         value = with_date(value, now)
         try:
-            unix_from_text(value)  # the tool knows how long it lasts: a day, a minute, a second
+            unix_from_text(value)
         except ValueError:
             return parse_time(value, now)
     return value
 
 
-def _from_json(text: str, otherwise: str | None) -> JsonValue:
+def _json_or(text: str, otherwise: str | None) -> JsonValue:
+    """Returns the value of a JSON text; `otherwise` if the text is not JSON."""
     try:
         value: JsonValue = json.loads(text)
     except (ValueError, RecursionError):
@@ -223,12 +237,11 @@ def _from_json(text: str, otherwise: str | None) -> JsonValue:
     return value
 
 
-def _arguments(tool: Tool) -> Iterator[tuple[str, JsonObject]]:
-    """Yields each argument with its schema; the name of one that may be left out ends in `?`."""
+def _argument_names(tool: Tool) -> list[str]:
+    """Returns the names of a tool's arguments; optional ones end in `?`."""
     required = tool.schema.get("required")
-    needed = required if isinstance(required, list) else []
-    for name, schema in tool.arguments.items():
-        yield name if name in needed else f"{name}?", schema
+    names = required if isinstance(required, list) else []
+    return [name if name in names else f"{name}?" for name in tool.arguments]
 
 
 def _print_help(name: str) -> None:
@@ -242,5 +255,5 @@ def _print_help(name: str) -> None:
         raise InvalidArgumentsError(f"there is no tool {name}; the tools are: {', '.join(tools)}")
     tool = tools[name]
     print_line(f"ros2-memory ask {name} key=value ... [PATH]\n\n{tool.description}\n")
-    for argument, schema in _arguments(tool):
+    for argument, schema in zip(_argument_names(tool), tool.arguments.values(), strict=True):
         print_line(f"  {argument:<20} {schema.get('description', '')}".rstrip())

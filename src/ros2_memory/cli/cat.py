@@ -18,7 +18,7 @@ from ros2_memory.cli.output import (
     print_notes,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import JsonValue
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
@@ -65,12 +65,15 @@ def cat(
     view = View(memory, Call())
     name = resolve_topic(view, topic)
     window = times.window(memory)
-    messages = view.stream.messages([name], window, newest_first=tail is not None)
-    chosen = islice(messages, limit if tail is None else tail)
-    exact = as_csv or as_json
-    rows = extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
+    messages: Iterator[StoredMessage]
+    if tail is None:
+        messages = islice(view.stream.messages([name], window), limit)
+    else:
+        newest = islice(view.stream.messages([name], window, newest_first=True), tail)
+        messages = reversed([*newest])
+    rows = extract_values(view, messages, field or (), exact=as_csv or as_json)
     if as_csv:
-        lines = _csv(rows)
+        lines = _csv_lines(rows)
     elif as_json:
         lines = (
             to_json_text({"time": unix_from_ns(time), "time_ns": time, "value": value})
@@ -84,38 +87,49 @@ def cat(
     note_unread(view, window)
     print_notes(view.notes.sentences())
     if not count:
-        first, last = (format_time(unix_from_ns(at)) for at in window.asked())
-        since = f" from {first}" if window.start > MIN_NS else ""
-        until = f" until {last}" if window.stop < MAX_NS else ""
-        when = f"{since}{until}" or " at any time"
-        advice = "`ros2-memory topics` says when there are some"
-        print(f"no message of {name} to show{when}; {advice}", file=sys.stderr)
+        print(_describe_nothing(name, window), file=sys.stderr)
     return not count or not view.notes.complete
 
 
-def extracted(
-    view: View, messages: Iterable[StoredMessage], fields: Sequence[str], exact: bool
+def _describe_nothing(topic: str, window: TimeWindow) -> str:
+    first, last = (format_time(unix_from_ns(at)) for at in window.asked())
+    since = f" from {first}" if window.start > MIN_NS else ""
+    until = f" until {last}" if window.stop < MAX_NS else ""
+    when = f"{since}{until}" or " at any time"
+    advice = "`ros2-memory topics` says when there are some"
+    return f"no message of {topic} to show{when}; {advice}"
+
+
+def extract_values(
+    view: View, messages: Iterable[StoredMessage], fields: Sequence[str], *, exact: bool
 ) -> Iterator[Row]:
-    """Yields the values of messages; those that cannot be decoded are counted in a note.
+    """Yields the values of messages: the fields at these dot-paths, or those that replies show.
+
+    `exact`: numbers are not rounded, and arrays are whole. Messages that cannot be decoded are
+    counted in a note.
 
     Raises:
-        InvalidArgumentsError: the first message that has another value has no such field.
+        InvalidArgumentsError: the first message has no such field.
     """
     extractor, left_out = view.extractor, 0
-    is_checked = False
+    is_first = True
     for stored in messages:
-        message, type_name = view.bags.decode(stored), stored.type
+        message = view.bags.decode(stored)
         if message is None:
             left_out += 1
             continue
-        if not is_checked or not exact:  # `exact_at` does not report which fields there are
-            shown = extractor.shown(message, type_name, fields).value
-            is_checked = True
-        value = with_level_names(shown, type_name)
-        if exact and fields:
-            value = {path: extractor.exact_at(message, type_name, path) for path in fields}
-        elif exact:
-            value = extractor.exact(message, type_name)
+        if not exact:
+            shown = extractor.shown(message, stored.type, fields).value
+            yield stored.time, with_level_names(shown, stored.type)
+            continue
+        if is_first:  # `exact_at` does not refuse fields that the type lacks
+            extractor.shown(message, stored.type, fields)
+            is_first = False
+        value: JsonValue
+        if fields:
+            value = {path: extractor.exact_at(message, stored.type, path) for path in fields}
+        else:
+            value = extractor.exact(message, stored.type)
         yield stored.time, value
     if left_out:
         view.notes.complete = False
@@ -123,24 +137,25 @@ def extracted(
         view.notes.add(f"{what} left out that cannot be decoded: `ros2-memory info` shows why")
 
 
-def _csv(rows: Iterable[Row]) -> Iterator[str]:
-    """Yields a header and a line for each row; the columns are those of the first row.
+def _csv_lines(rows: Iterable[Row]) -> Iterator[str]:
+    """Yields a header and a line for each row, with the fields of the first row as columns.
 
-    An object's are under names with dots, a list is JSON.
+    Fields of nested messages have dot-paths; a cell with a list has JSON. Fields that only later
+    rows have are named in a note at the end.
     """
     columns: list[str] | None = None
-    beside: set[str] = set()
+    without_column: set[str] = set()
     for time, value in rows:
         cells: dict[str, object] = {}
-        for name, inner in leaves(value):
-            text = to_json_text(inner) if isinstance(inner, list) else json.dumps(inner)
-            cells[name or "value"] = inner if isinstance(inner, str | None) else text
+        for path, inner in leaves(value):
+            cell = to_json_text(inner) if isinstance(inner, list) else json.dumps(inner)
+            cells[path or "value"] = inner if isinstance(inner, str | None) else cell
         if columns is None:
             columns = [*cells]
             yield csv_line(["time", *columns])
-        beside.update(cells.keys() - columns)
+        without_column.update(cells.keys() - columns)
         seconds, nanoseconds = divmod(time, NS_PER_S)
         yield csv_line([f"{seconds}.{nanoseconds:09d}", *map(cells.get, columns)])
-    if beside:
-        names = listed(sorted(beside))
+    if without_column:
+        names = listed(sorted(without_column))
         print_notes([f"no column, as the first message has no such field: {names}"])

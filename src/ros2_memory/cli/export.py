@@ -10,7 +10,7 @@ from typing import Annotated
 
 from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.options import AsJson, Bags, Times
-from ros2_memory.cli.output import made_whole, print_json, print_line, print_notes, spinner
+from ros2_memory.cli.output import atomic_file, print_json, print_line, print_notes, spinner
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -206,7 +206,7 @@ def write_mcap(path: Path, messages: Iterator[StoredMessage]) -> int:
             written += 1
             yield stored.record
 
-    with made_whole(path) as temporary:
+    with atomic_file(path) as temporary:
         McapWriter().write(temporary, records())
     return written
 

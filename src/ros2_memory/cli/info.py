@@ -9,9 +9,10 @@ from typing import Final
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.cli.ask import called
+from ros2_memory.cli.ask import call_once
 from ros2_memory.cli.options import MB, AsJson, Bags, open_robot
 from ros2_memory.cli.output import (
+    cut_lists,
     format_size,
     format_value,
     print_json,
@@ -19,7 +20,6 @@ from ros2_memory.cli.output import (
     print_notes,
     print_reply,
     stdout_console,
-    with_shorter_lists,
 )
 from ros2_memory.config import Settings
 from ros2_memory.core.model import BagFile
@@ -106,7 +106,7 @@ def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
     """Returns what is recorded in one bag directory: replies of two tools, and how much it is."""
     report = {"held": _amount_recorded(memory.index.snapshot())}
     for tool in ("memory_status", "data_time_range"):
-        report[tool] = json.loads(called(build_dispatcher(settings, memory), tool, {}).text)
+        report[tool] = json.loads(call_once(build_dispatcher(settings, memory), tool, {}).text)
     return report
 
 
@@ -124,7 +124,7 @@ def _show(memory: Memory, report: Mapping[str, JsonObject]) -> None:
     if snapshot.silent_topics:
         topics = sorted(snapshot.silent_topics)
         shown["topics_without_messages"] = listed(topics, at_most=_MOST_SILENT)
-    print_reply(with_shorter_lists(shown, shown))
+    print_reply(cut_lists(shown, shown))
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:

@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from datetime import datetime, time, timedelta
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -63,7 +63,8 @@ _AGO: Final = re.compile(
 )
 _SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _LARGEST_UNIX_S: Final = 1e11
-"""A larger number is in milliseconds or nanoseconds."""
+_LARGEST_UNIX_MS: Final = 1e15
+"""A larger number than the first is in milliseconds, than the second in nanoseconds."""
 _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
@@ -90,91 +91,95 @@ Sets = Annotated[
 Verbose = Annotated[bool, "--verbose", "-v", "Show the log on stderr, at logging.level."]
 Command: TypeAlias = Callable[..., int | None]  # type: ignore[explicit-any]  # each its own options
 LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
-"""Settings for bags of others: any kind is read, "ago" counts from the newest data."""
+"""Settings to read bags of other programs: of any kind, and "ago" counts from the newest data."""
 
 AsJson = Annotated[bool, "--json", "Print JSON."]
 
 
-def _seconds(text: str) -> float:
-    """Returns the seconds of a number or a duration; an error of usage where it is neither."""
+def _parse_seconds(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        length = parse_duration(text)
-    if length is None:
+        seconds = parse_duration(text)
+    if seconds is None:
         raise typer.BadParameter(f"{text!r} is neither seconds nor a duration such as 90s, 10m, 2h")
-    return length
+    return seconds
 
 
 Last = Annotated[
     float | None,
     typer.Option(
         metavar="S",
-        parser=_seconds,
+        parser=_parse_seconds,
         help="The last S seconds, or 10m, 2h, 3d; instead of --start and --end.",
     ),
 ]
 
 
 def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> tuple[Settings, Sources]:
-    """Loads the configuration as the server does, and who set each key; `--bag-dir` wins.
+    """Loads the configuration as the server does, and who set each key.
 
-    It is about one robot, so there is no fleet then.
+    `bag_dir` wins over `recording.bag_dir`. It is the directory of one robot, so no fleet is
+    configured then.
 
     Raises:
         ConfigError: the configuration is refused.
     """
-    chosen = [] if bag_dir is None else [f"recording.bag_dir={quoted(str(bag_dir.absolute()))}"]
-    settings, sources = load_explained([*(overrides or ()), *chosen])
-    if bag_dir is not None:
-        settings = replace(settings, fleet=replace(settings.fleet, robots={}, tokens={}))
-    return settings, sources
+    words = [*(overrides or ())]
+    if bag_dir is None:
+        return load_explained(words)
+    words.append(f"recording.bag_dir={quoted(str(bag_dir.absolute()))}")
+    settings, sources = load_explained(words)
+    return replace(settings, fleet=replace(settings.fleet, robots={}, tokens={})), sources
 
 
 def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> tuple[Settings, Sources]:
-    """Loads the configuration as the server does, or where a PATH is given as `load_to_look`."""
-    load = load_to_look if any(map(_is_path, words or ())) else load_for
-    return load(bag_dir, words)
+    """Loads the configuration by `load_to_look` if a word is a path, else by `load_for`."""
+    if any(map(_is_path, words or ())):
+        return load_to_look(bag_dir, words)
+    return load_for(bag_dir, words)
 
 
 def load_to_look(
     bag_dir: Path | None, words: Sequence[str] | None, recording: str | None = None
 ) -> tuple[Settings, Sources]:
-    """Loads the configuration for a command that only looks; a PATH among its words wins.
+    """Loads the configuration for a command that only reads bags; a PATH among its words wins.
 
-    Bags that this deployment does not record are read whatever kind they are, and no recorder is
-    expected there, unless the words choose a recorder, a storage or a deployment.
+    Bags that this deployment does not record are read with the settings `LOOKING`, unless the words
+    choose a recorder, a storage or a deployment.
 
     Raises:
         ConfigError: the configuration is refused.
-        InvalidArgumentsError: there is no such file or folder, or more than one is named.
+        InvalidArgumentsError: a PATH does not exist, or two are given.
     """
-    named, given = settings_to_look(bag_dir, words, recording)
-    loaded = load_for(named, given)
-    folder = loaded[0].recording.bag_dir
-    if named is not None or is_deployment_chosen(given) or has_recorded(folder):
-        return loaded
-    has_bags = folder.is_dir() and next(folders_with_bags(folder), None) is not None
-    return load_for(None, [*LOOKING, *given]) if has_bags else loaded
+    named, settings_words = settings_to_look(bag_dir, words, recording)
+    settings, sources = load_for(named, settings_words)
+    folder = settings.recording.bag_dir
+    if named is None and not is_deployment_chosen(settings_words) and not has_recorded(folder):
+        has_bags = folder.is_dir() and next(folders_with_bags(folder), None) is not None
+        if has_bags:
+            return load_for(None, [*LOOKING, *settings_words])
+    return settings, sources
 
 
 def settings_to_look(
     bag_dir: Path | None, words: Sequence[str] | None, recording: str | None = None
 ) -> tuple[Path | None, list[str]]:
-    """Returns the folder that the words or an option name, and the settings for it.
+    """Returns the folder of bags that the words or --bag-dir name, and the settings to read it.
 
-    They are those for bags of others, unless a recorder is at work there, or somebody chose a
-    recorder, a storage or a deployment: among the words, or elsewhere for this folder.
+    `LOOKING` is among the settings, unless a recorder is at work in the folder, or a recorder, a
+    storage or a deployment was chosen: by the words, or by the environment for this very folder.
 
     Raises:
         ConfigError: a variable or a setting is refused.
-        InvalidArgumentsError: there is no such file or folder, or more than one is named.
+        InvalidArgumentsError: a PATH does not exist, or two are given.
     """
     paths = [word for word in words or () if _is_path(word)]
-    given = [word for word in words or () if word not in paths]
+    settings = [word for word in words or () if word not in paths]
     if len(paths) > 1:
         raise InvalidArgumentsError(f"one file or folder at a time: {' and '.join(paths)}")
-    for path in map(Path, paths):
+    if paths:
+        path = Path(paths[0])
         if not path.exists():
             raise InvalidArgumentsError(
                 f"{path}: there is no such file or folder; name a bag or a folder of bags, or "
@@ -185,40 +190,43 @@ def settings_to_look(
         bag_dir = path
         if path.is_file():
             bag_dir, recording = _folder_of(path, recording)
-    heartbeat = None if bag_dir is None else read_heartbeat(bag_dir.absolute()).heartbeat
-    is_recorded_now = heartbeat is not None and heartbeat.is_live(WallClock().now())
-    if bag_dir is not None and not is_recorded_now:
-        is_chosen = is_deployment_chosen(given)
-        if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in given):
-            deployed, _ = load_for(None, given)
+    if bag_dir is not None and not _is_recorded_now(bag_dir):
+        is_chosen = is_deployment_chosen(settings)
+        if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in settings):
+            deployed, _ = load_for(None, settings)
             is_chosen = bag_dir.absolute() == deployed.recording.bag_dir.absolute()
         if not is_chosen:
-            given = [*LOOKING, *given]
+            settings = [*LOOKING, *settings]
     if recording is not None:
-        given.append(f"data.recording={quoted(recording)}")
-    return bag_dir, given
+        settings.append(f"data.recording={quoted(recording)}")
+    return bag_dir, settings
+
+
+def _is_recorded_now(bag_dir: Path) -> bool:
+    heartbeat = read_heartbeat(bag_dir.absolute()).heartbeat
+    return heartbeat is not None and heartbeat.is_live(WallClock().now())
 
 
 def _is_path(word: str) -> bool:
-    """Returns whether a word is a path: no setting has a slash in its name."""
+    """Returns whether a word is a path, not a setting: `key=value` without a slash in the key."""
     key, equals, _ = word.partition("=")
     return not equals or "/" in key or _exists(word)
 
 
 def is_folder(word: str) -> bool:
-    """Returns whether a word is a bag or a folder: a path that is there, and no JSON."""
+    """Returns whether a word is the path of a bag or a folder that exists, and not JSON."""
     return "=" not in word and _exists(word)
 
 
 def _exists(word: str) -> bool:
     try:
         return Path(word).exists()
-    except (OSError, ValueError):  # a long setting
+    except (OSError, ValueError):  # a setting that is too long for a path
         return False
 
 
 def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
-    """Returns the folder of a file, and the recording to look at there: the file itself."""
+    """Returns the folder of a file, and the recording to read: a bag, or all for metadata.yaml."""
     if file.name == METADATA_FILE:
         return file.parent, recording
     if bag_kind(file.name) is None:
@@ -231,11 +239,11 @@ def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
 
 
 def require_recorder(settings: Settings) -> None:
-    """Checks that this deployment records: only then may a command have bags deleted.
+    """Checks that this deployment records: only then may a command delete bags.
 
     Raises:
-        ConfigError: it does not, or `data.recording` limits it to one recording, and others may
-            contain the same messages.
+        ConfigError: it does not record; or `data.recording` limits it to one recording, though
+            others may contain the same messages.
     """
     if settings.data.recording is not None:
         raise ConfigError(
@@ -257,13 +265,15 @@ def open_memory(
     setting: str | None = None,
     cache_mb: int | None = None,
 ) -> "Memory":
-    """Returns the memory of the configured bags, with an index of the directory as it is now.
+    """Opens the memory of the configured bags, and indexes the directory as it is now.
 
-    Without an index where it `scans` not, because the robots of a fleet are asked.
-    `setting` is the one that names the bags, where it is another than `recording.bag_dir`,
-    `cache_mb` as in `shared_parts`.
-    `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
-    prints the count when the command ends.
+    Args:
+        settings: the configuration.
+        verbose: whether log events are shown on stderr. Otherwise warnings are counted, and
+            `reported_errors` prints the count when the command ends.
+        scans: False leaves out the index, for a command that asks the robots of a fleet.
+        setting: the setting that names the bags, if it is not `recording.bag_dir`.
+        cache_mb: as in `shared_parts`.
 
     Raises:
         ConfigError: an adapter cannot be built.
@@ -299,14 +309,16 @@ def open_memory(
 def open_robot(
     settings: Settings, name: str, *, verbose: bool, cache_mb: int | None = None
 ) -> "tuple[Settings, Memory]":
-    """Opens the memory of a robot of a fleet, or of the only one, which has no name.
+    """Opens the memory of a robot of the fleet; without a fleet the name is empty.
 
-    Returns its own settings, too.
+    Returns the settings of that robot, and its memory.
     """
+    if not name:
+        return settings, open_memory(settings, verbose=verbose, cache_mb=cache_mb)
     from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings  # noqa: PLC0415 - as above
 
-    own, setting = (robot_settings(settings, name), ROBOTS_SETTING) if name else (settings, None)
-    return own, open_memory(own, verbose=verbose, setting=setting, cache_mb=cache_mb)
+    own = robot_settings(settings, name)
+    return own, open_memory(own, verbose=verbose, setting=ROBOTS_SETTING, cache_mb=cache_mb)
 
 
 def present_time(memory: "Memory") -> Ns:
@@ -318,15 +330,18 @@ def present_time(memory: "Memory") -> Ns:
 
 
 def parse_duration(text: str) -> float | None:
-    """Returns the seconds of a duration as people write it (`90s`, `10m`, `2h`, `3d`) or None."""
+    """Returns the seconds of a text such as `90s`, `10m`, `2h` or `3d`; None of any other."""
     match = _AGO.fullmatch(text.strip().lower())
-    return None if match is None else float(match[1]) * _SECONDS_OF[match[2][0]]
+    if match is None:
+        return None
+    number, unit = match.groups()
+    return float(number) * _SECONDS_OF[unit[0]]
 
 
 def parse_time(text: str, now: float) -> float:
-    """Returns the Unix seconds of a time as people write it; see `TIMES`.
+    """Returns the Unix seconds of a time in one of the forms `TIMES`.
 
-    `now` is what "ago", "today" and a time of day count from, in Unix seconds.
+    `now` (Unix s) is what "ago", "today" and a time of day count from.
 
     Raises:
         InvalidArgumentsError: the text is no time.
@@ -334,56 +349,50 @@ def parse_time(text: str, now: float) -> float:
     words = text.strip().lower()
     if words == "now":
         return now
-    with suppress(ValueError):
+    try:
         number = float(words)
-        try:
-            require_no_date(number)
-        except ValueError as error:
-            raise InvalidArgumentsError(f"{text} {error}") from None
-        if abs(number) > _LARGEST_UNIX_S:
-            seconds = number / (1e9 if abs(number) > _LARGEST_UNIX_S * 1e4 else 1e3)
-            raise InvalidArgumentsError(
-                f"{text} is too large for Unix seconds; in seconds it is {seconds:.3f}"
-            )
-        return number
-    ago = parse_duration(words)
-    if ago is not None:
-        return now - ago
-    with suppress(ValueError, OverflowError, OSError):
-        return unix_from_text(with_date(text, now))
-    raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}")
-
-
-def parse_end(text: str, now: float, start: float) -> float:
-    """Returns the Unix seconds at which a window ends that starts at a time; see `window_end_s`.
-
-    Raises:
-        InvalidArgumentsError: the text is no time.
-    """
-    return window_end_s(with_date(text, now), parse_time(text, now), start)
+    except ValueError:
+        ago_s = parse_duration(words)
+        if ago_s is not None:
+            return now - ago_s
+        with suppress(ValueError, OverflowError, OSError):
+            return unix_from_text(with_date(text, now))
+        raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}") from None
+    try:
+        require_no_date(number)
+    except ValueError as error:
+        raise InvalidArgumentsError(f"{text} {error}") from None
+    if abs(number) > _LARGEST_UNIX_S:
+        seconds = number / (1e3 if abs(number) <= _LARGEST_UNIX_MS else 1e9)
+        raise InvalidArgumentsError(
+            f"{text} is too large for Unix seconds; in seconds it is {seconds:.3f}"
+        )
+    return number
 
 
 def with_date(text: str, now: float) -> str:
-    """Returns `today`, `yesterday`, or a time of day, as ISO 8601; any other text as it is.
+    """Returns `today`, `yesterday` or a time of day as ISO 8601, and any other text unchanged.
 
-    `now`, in Unix seconds, is what they count from.
+    `now` (Unix s) says which day is today.
     """
-    clock = _TIME_OF_DAY.fullmatch(text.strip().lower())
-    if clock is None:
+    match = _TIME_OF_DAY.fullmatch(text.strip().lower())
+    if match is None:
         return text
-    today = datetime.fromtimestamp(now).astimezone().date()
-    date = today - timedelta(days=clock[1] == "yesterday")
-    return f"{date}T{clock[2]}" if clock[2] else date.isoformat()
+    day, time_of_day = match.groups()
+    date = datetime.fromtimestamp(now).astimezone().date()
+    if day == "yesterday":
+        date -= timedelta(days=1)
+    return f"{date}T{time_of_day}" if time_of_day else date.isoformat()
 
 
 def newest_day(memory: "Memory") -> TimeWindow:
-    """Returns the newest day of data in this machine's calendar, from midnight to midnight."""
+    """Returns the local day of the newest data, from midnight to midnight."""
     newest = memory.index.snapshot().dating.latest
-    at = unix_from_ns(memory.clock.now() if newest is None else newest)
-    date = datetime.fromtimestamp(at).astimezone().date()
+    at_s = unix_from_ns(memory.clock.now() if newest is None else newest)
+    date = datetime.fromtimestamp(at_s).astimezone().date()
     days = (date, date + timedelta(days=1))
-    begin, end = (datetime.combine(day, time.min).timestamp() for day in days)
-    return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
+    begin_s, end_s = (datetime.combine(day, time.min).timestamp() for day in days)
+    return TimeWindow(ns_from_unix(begin_s), ns_from_unix(end_s))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -426,75 +435,80 @@ class Times:
         return self.window_at(unix_from_ns(present_time(memory)))
 
     def window_at(self, now: float) -> TimeWindow:
-        """Returns the window where "ago" counts from `now` (Unix s); raises likewise."""
-        if self.last is None:
-            first = unix_from_ns(MIN_NS) if self.start is None else parse_time(self.start, now)
-            until = unix_from_ns(MAX_NS)
-            if self.end is not None:
-                until = parse_end(self.end, now, first)
-            return TimeWindow.from_unix(first, until)
-        if self.start is not None or self.end is not None:
-            raise InvalidArgumentsError("give --last, or --start and --end, not both")
-        if not self.last > 0:
-            raise InvalidArgumentsError(f"--last is {self.last:g}; it must be more than 0 seconds")
-        return TimeWindow.from_unix(now - self.last, now)
+        """Returns the window if "ago" counts from `now` (Unix s).
+
+        Raises:
+            InvalidArgumentsError: as `window`.
+        """
+        if self.last is not None:
+            if self.start is not None or self.end is not None:
+                raise InvalidArgumentsError("give --last, or --start and --end, not both")
+            if not self.last > 0:
+                raise InvalidArgumentsError(
+                    f"--last is {self.last:g}; it must be more than 0 seconds"
+                )
+            return TimeWindow.from_unix(now - self.last, now)
+        start_s, end_s = unix_from_ns(MIN_NS), unix_from_ns(MAX_NS)
+        if self.start is not None:
+            start_s = parse_time(self.start, now)
+        if self.end is not None:
+            end_s = window_end_s(with_date(self.end, now), parse_time(self.end, now), start_s)
+        return TimeWindow.from_unix(start_s, end_s)
 
 
 def as_command(name: str) -> Callable[[Command], Command]:
-    """Returns what makes a function a command that reports its errors under a name.
+    """Returns a decorator that makes a function a command, which reports errors under `name`.
 
-    A parameter whose type is a dataclass, as `Bags` and `Times` are, becomes the options of that,
-    in its place. It returns its exit code, or whether something was left undone (`EXIT_NEGATIVE`).
+    The function returns its exit code, or whether something was left undone (`EXIT_NEGATIVE`).
 
-    An annotation such as `Annotated[float, "S", "Seconds between updates."]` declares an option, by
-    the names that it has besides that of the parameter, what its value is, and the line of help.
+    A parameter whose type is a dataclass (`Bags`, `Times`) stands for all options of that class. A
+    parameter such as `every: Annotated[float, "S", "Seconds between updates."]` is an option:
+    after the type stand its names, if they are not `--every`, the metavar, and the line of help.
     """
 
-    def made(command: Command) -> Command:
-        parameters = signature(command).parameters
-        groups = {
-            parameter.name: parameter.annotation
-            for parameter in parameters.values()
-            if hasattr(parameter.annotation, "__dataclass_fields__")
-        }
+    def decorate(command: Command) -> Command:
+        groups: dict[str, type] = {}
+        options: list[Parameter] = []
+        for parameter in signature(command).parameters.values():
+            group = parameter.annotation
+            if is_dataclass(group) and isinstance(group, type):
+                groups[parameter.name] = group
+                options += signature(group).parameters.values()
+            else:
+                options.append(parameter)
 
         @wraps(command)
         def run(**given: object) -> None:
-            for group, kind in groups.items():
-                own = {option: given.pop(option) for option in signature(kind).parameters}
-                given[group] = kind(**own)
+            for parameter_name, group in groups.items():
+                own = {option: given.pop(option) for option in signature(group).parameters}
+                given[parameter_name] = group(**own)
             with reported_errors(name):
                 raise typer.Exit(int(command(**given) or 0))
 
-        options = [
-            option.replace(kind=option.KEYWORD_ONLY, annotation=_declared(option))
-            for parameter in parameters.values()
-            for option in (
-                signature(groups[parameter.name]).parameters.values()
-                if parameter.name in groups
-                else [parameter]
-            )
+        declared = [
+            option.replace(kind=option.KEYWORD_ONLY, annotation=_typer_annotation(option))
+            for option in options
         ]
-        run.__signature__ = Signature(options)  # type: ignore[attr-defined]  # typer reads it
+        run.__signature__ = Signature(declared)  # type: ignore[attr-defined]  # typer reads it
         return run
 
-    return made
+    return decorate
 
 
-def _declared(option: Parameter) -> object:
-    """Returns the annotation of an option as Typer takes it; others as they are."""
-    kind, *more, line = get_args(option.annotation) or (None, None)
-    if not isinstance(line, str):
+def _typer_annotation(option: Parameter) -> object:
+    """Returns the annotation of an option in Typer's form; leaves one in that form as it is."""
+    kind, *more, help_line = get_args(option.annotation) or (None, None)
+    if not isinstance(help_line, str):
         return option.annotation
     names = [text for text in more if text.startswith("-")]
-    if kind is bool and not names:
-        names = [f"--{option.name.replace('_', '-')}"]
     metavar = next((text for text in more if text not in names), None)
-    return Annotated[kind, typer.Option(*names, metavar=metavar, help=line)]
+    if kind is bool and not names:  # else Typer adds a --no-... for each flag
+        names = [f"--{option.name.replace('_', '-')}"]
+    return Annotated[kind, typer.Option(*names, metavar=metavar, help=help_line)]
 
 
 def reason_of(error: Exception) -> str:
-    """Returns an error as a sentence; one of the system as its file and its reason."""
+    """Returns the text of an error; of an error of the system `FILE: REASON`."""
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
     return ": ".join(str(part) for part in (error.filename, error.strerror) if part)
@@ -504,7 +518,7 @@ def reason_of(error: Exception) -> str:
 def reported_errors(command: str) -> Iterator[None]:
     """Prints an error of the block as one line on stderr, and exits with code 2.
 
-    Also prints how many warnings were logged and not shown.
+    Then prints how many warnings were logged without being shown.
     """
     try:
         yield
@@ -528,12 +542,12 @@ def reported_errors(command: str) -> Iterator[None]:
 
 @contextmanager
 def lines_as_json(as_json: bool, *, is_answered: bool) -> Iterator[None]:
-    """Has a command with --json print its lines at its end, as one JSON object.
+    """With --json: collects the lines that the block prints, and prints them as one JSON object.
 
-    `stays` are those on what it left as it is, `lines` all others.
+    The lines on what the command left as it is are under `stays`, all others under `lines`.
 
     Raises:
-        InvalidArgumentsError: the command would have to ask.
+        InvalidArgumentsError: the command would have to ask for confirmation (not `is_answered`).
     """
     if not as_json:
         yield

@@ -1,7 +1,6 @@
-"""Prints replies for people: tables for lists, lines for the rest; and what it does meanwhile.
+"""What commands print and write: replies as tables and lines, notes, a spinner, whole files.
 
-And makes the files that a command writes. Recorded text comes from elsewhere: control characters in
-it never reach the terminal.
+Recorded text may contain control characters, which must never reach a terminal: `escape`.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.text import dotted
 from ros2_memory.core.timebase import NS_PER_US, local_time
 from ros2_memory.messages.levels import with_level_names
 
@@ -48,7 +48,7 @@ _NO_AGE_BELOW_S: Final = 0.05
 _MAX_FLATTENED_KEYS: Final = 8
 _MAX_COLUMNS: Final = 9
 _MOST_ROWS: Final = 10
-"""Of a list that is cut."""
+"""Rows of a list that people are shown; --json prints all."""
 _ENDLESS: Final = 10_000
 """Characters of a terminal that is wide enough for any table."""
 _TIME_OF_DAY_WIDTH: Final = 15
@@ -82,11 +82,11 @@ def print_json(value: object) -> None:
 
 
 def print_exactly(lines: Iterable[str]) -> int:
-    """Prints lines for programs, on a terminal without control characters; returns how many."""
-    count, is_screen = 0, sys.stdout.isatty()
+    """Prints lines for programs; returns their number. On a terminal escapes control characters."""
+    count, is_terminal = 0, sys.stdout.isatty()
     for line in lines:
         count += 1
-        print(escape(line) if is_screen else line)
+        print(escape(line) if is_terminal else line)
     sys.stdout.flush()
     return count
 
@@ -99,12 +99,12 @@ def csv_line(cells: Iterable[object]) -> str:
 
 
 @contextmanager
-def made_whole(path: Path) -> Iterator[Path]:
-    """Yields where to write a file, which takes its place at the end, or is gone where that fails.
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yields a temporary path, which is renamed to `path` after the block, or removed if it fails.
 
     Raises:
-        BagError: it cannot be written, under its own name.
-        OSError: likewise.
+        BagError: the block raised one; an error of the temporary file names `path` instead.
+        OSError: the block raised one, or the file cannot be renamed; the error names `path`.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     try:
@@ -112,8 +112,9 @@ def made_whole(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     except BagError as error:
-        own = error.path == str(temporary)
-        raise BagError(str(path) if own else error.path, error.reason) from error
+        if error.path != str(temporary):
+            raise
+        raise BagError(str(path), error.reason) from error
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
@@ -128,7 +129,7 @@ def print_notes(notes: Iterable[str]) -> None:
 
 
 def stdout_console() -> Console:
-    """Returns the console for answers; where it is no terminal, lines are not cut."""
+    """Returns the console for answers; in a pipe its lines are 160 characters wide."""
     console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _PIPE_WIDTH
@@ -137,7 +138,7 @@ def stdout_console() -> Console:
 
 @contextmanager
 def spinner(activity: str) -> Iterator[Callable[[str], None]]:
-    """Shows on a terminal, and nowhere else, what the block is doing; yields what changes that."""
+    """Shows on a terminal what the block is doing; yields a function that changes the text."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda _: None
@@ -147,38 +148,45 @@ def spinner(activity: str) -> Iterator[Callable[[str], None]]:
 
 
 def print_reply(value: JsonValue, now: float | None = None) -> None:
-    """Prints any reply. The ages of times count from `now` (Unix s), or from the reply's own."""
+    """Prints a reply for people.
+
+    Ages count from the reply's own `now`, else from the argument (Unix s); without both no age is
+    shown.
+    """
     value, console = with_level_names(value), stdout_console()
     if isinstance(value, dict):
-        stated = value.get("now")
-        _print_object(console, value, stated if isinstance(stated, float) else now)
+        reply_now = value.get("now")
+        _print_object(console, value, reply_now if isinstance(reply_now, float) else now)
     elif isinstance(value, list) and (rows := _objects(value)):
         _print_rows(console, rows)
     else:
         console.print(Text(format_value(value) if value else "none"))
 
 
-def with_shorter_lists(reply: JsonObject, names: Iterable[str]) -> JsonObject:
-    """Returns a reply whose lists of these names have the first rows alone; notes say so."""
-    long = {
-        name: rows
-        for name in names
-        if isinstance(rows := reply.get(name), list) and len(rows) > _MOST_ROWS
-    }
-    if not long:
+def cut_lists(reply: JsonObject, names: Iterable[str]) -> JsonObject:
+    """Returns a reply with the first ten rows of the named lists, and a note for each list cut."""
+    shorter: JsonObject = {}
+    notes: list[JsonValue] = []
+    for name in names:
+        rows = reply.get(name)
+        if isinstance(rows, list) and len(rows) > _MOST_ROWS:
+            shorter[name] = rows[:_MOST_ROWS]
+            notes.append(f"{len(rows) - _MOST_ROWS} more {name}: --json prints them")
+    if not shorter:
         return reply
-    notes = reply.get("notes")
-    more = [f"{len(long[name]) - _MOST_ROWS} more {name}: --json prints them" for name in long]
-    shorter: JsonObject = {name: rows[:_MOST_ROWS] for name, rows in long.items()}
-    return reply | shorter | {"notes": [*(notes if isinstance(notes, list) else ()), *more]}
+    own_notes = reply.get("notes")
+    return (
+        reply | shorter | {"notes": [*(own_notes if isinstance(own_notes, list) else ()), *notes]}
+    )
 
 
 def _print_object(console: Console, value: Mapping[str, JsonValue], now: float | None) -> None:
+    """Prints a line for each key, and then a table for each list of objects."""
     lists: dict[str, list[JsonObject]] = {}
     lines = Table.grid(padding=(0, 2))
     lines.add_column(style="bold", no_wrap=True)
     lines.add_column(overflow="fold")
-    for key, inner in _flattened(_with_named_cells(value)).items():
+    for key, inner in _flattened(_rows_as_objects(value)).items():
         if isinstance(inner, list) and (rows := _objects(inner)):
             lists[key] = rows
         elif key == "notes" and isinstance(inner, list):
@@ -188,9 +196,9 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
             lines.add_row(key, Text(with_local_times(inner)))
         else:
             line = _format_line(key, inner, now)
-            lines.add_row(
-                Text(escape(key)), Text(with_commands(line) if key in _WITH_TOOLS else line)
-            )
+            if key in _WITH_TOOLS:
+                line = with_commands(line)
+            lines.add_row(Text(escape(key)), Text(line))
     if lines.row_count:
         console.print(lines)
     for key, rows in lists.items():
@@ -199,119 +207,118 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
 
 
 def _objects(values: Sequence[JsonValue]) -> list[JsonObject]:
-    """Returns the values where all are objects; else none."""
+    """Returns the values if all of them are objects; else an empty list."""
     rows = [row for row in values if isinstance(row, dict)]
     return rows if len(rows) == len(values) else []
 
 
 def with_local_times(sentence: str) -> str:
-    """Returns a sentence for a terminal, with times in this machine's zone, and commands."""
-    local = _TIME_IN_NOTE.sub(lambda time: format_time(float(time[0])), sentence)
+    """Prepares a sentence for a terminal: local times, commands instead of tools, escapes."""
+    local = _TIME_IN_NOTE.sub(lambda match: format_time(float(match[0])), sentence)
     return escape(with_commands(local))
 
 
 def with_commands(sentence: str) -> str:
-    """Returns a sentence with commands for the tools that it names, where there is one."""
+    """Replaces the names of tools by commands that show the same, except in a list of all tools."""
     if _LISTS_TOOLS in sentence:
         return sentence
-    return _TOOL_IN_NOTE.sub(lambda tool: _COMMANDS[tool[0]], sentence)
+    return _TOOL_IN_NOTE.sub(lambda match: _COMMANDS[match[0]], sentence)
 
 
-def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
-    """Returns a reply with an object for each row of its table, if it has one.
+def _rows_as_objects(reply: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
+    """Returns a reply whose table (names of columns, rows of cells) is a list of objects.
 
-    Where a row has a time in two columns, only the exact one is shown.
+    A time with a column `x_unix` beside `x` is shown once, by its exact value.
     """
-    shown = {**value}
-    names = "columns" if "columns" in shown else "fields"
-    fields, rows = shown.pop(names, None), shown.pop("rows", None)
-    if not isinstance(fields, list) or not isinstance(rows, list):
-        return value
-    if isinstance(totals := shown.get(_ALL), list):  # a row of its own, without its name
-        del shown[_ALL]
+    rest = {**reply}
+    columns = rest.pop("columns" if "columns" in rest else "fields", None)
+    rows = rest.pop("rows", None)
+    if not isinstance(columns, list) or not isinstance(rows, list):
+        return reply
+    totals = rest.get(_ALL)
+    if isinstance(totals, list):
+        del rest[_ALL]
         rows = [*rows, [_ALL, *totals]]
-    named = [
-        dict(zip(map(str, fields), row, strict=False)) for row in rows if isinstance(row, list)
-    ]
-    for row in named:
-        for name in [name for name in row if name.endswith("_unix")]:
-            row[name.removesuffix("_unix")] = row.pop(name)
-    return shown | {"rows": [*named]}
+    objects: list[JsonValue] = []
+    for row in rows:
+        if not isinstance(row, list):
+            continue
+        cells: JsonObject = dict(zip(map(str, columns), row, strict=False))
+        for name in [name for name in cells if name.endswith("_unix")]:
+            cells[name.removesuffix("_unix")] = cells.pop(name)
+        objects.append(cells)
+    return rest | {"rows": objects}
 
 
 def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:
-    """Prints a table, or one object after the other where it is wider than the terminal."""
+    """Prints the widest table that fits the terminal; else one object after the other."""
     flattened = [_flattened(row) for row in rows]
     if len(_all_keys(flattened)) > _MAX_COLUMNS:
         flattened = [{**row} for row in rows]
     endless = console.options.update_width(_ENDLESS)
-    for breaks_times in (False, True):
-        table = _table(flattened, breaks_times=breaks_times)
-        needed = Measurement.get(console, endless, table)
-        if (needed.minimum if breaks_times else needed.maximum) <= console.width:
-            console.print(table)
-            return
+    table = _table(flattened, breaks_times=False)
+    if Measurement.get(console, endless, table).maximum <= console.width:
+        console.print(table)
+        return
+    table = _table(flattened, breaks_times=True)
+    if Measurement.get(console, endless, table).minimum <= console.width:
+        console.print(table)
+        return
     for row in rows:
         console.print()
         _print_object(console, row, None)
 
 
 def _format_line(key: str, value: JsonValue, now: float | None) -> str:
-    """Formats the value of a key; a time with its age."""
+    """Formats the value of a key; behind a time stands its age (`12 min ago`, `in 4.2 s`)."""
     if value is None or value == []:
         return "none"
     text = _format_for_key(key, value)
     if now is None or not isinstance(value, float) or not _is_time(value):
         return text
-    age = now - value
-    if abs(age) < _NO_AGE_BELOW_S:
+    age_s = now - value
+    if abs(age_s) < _NO_AGE_BELOW_S:
         return text
-    return f"{text} ({f'{format_duration(age)} ago' if age > 0 else f'in {format_duration(-age)}'})"
+    age = f"{format_duration(age_s)} ago" if age_s > 0 else f"in {format_duration(-age_s)}"
+    return f"{text} ({age})"
 
 
 def _format_for_key(key: str, value: JsonValue) -> str:
-    """Formats a value; of seconds, as under `duration_s`, long ones in minutes, hours or days.
+    """Formats a value; long durations (keys in `_s`) in minutes, hours or days.
 
-    A time of a clock that was never set gets its unit.
+    A time near 1970 is of a clock that was never set, and is shown in seconds.
     """
-    if key in _KEYS_OF_TIMES and isinstance(value, int | float) and not _is_time(value):
-        return f"{format_value(round(value, 3))} s after 1970"
-    if (
-        isinstance(value, int | float)
-        and key.endswith("_s")
-        and not key.endswith(_RATES)
-        and abs(value) >= _MINUTES_FROM_S
-        and not _is_time(value)
-    ):
-        return format_duration(value)
+    if isinstance(value, int | float) and not _is_time(value):
+        if key in _KEYS_OF_TIMES:
+            return f"{format_value(round(value, 3))} s after 1970"
+        is_duration = key.endswith("_s") and not key.endswith(_RATES)
+        if is_duration and abs(value) >= _MINUTES_FROM_S:
+            return format_duration(value)
     return format_value(value)
 
 
 def _table(rows: Sequence[Mapping[str, JsonValue]], *, breaks_times: bool) -> Table:
-    """Returns objects as rows; their keys, in order of appearance, are the columns.
+    """Returns a table with a row for each object, and a column for each key.
 
-    A time may break between its date and its time of day.
+    Columns are in the order in which their keys first appear. With `breaks_times` a time takes two
+    lines: its date, and its time of day.
     """
     table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     columns = []
     for key in _all_keys(rows):
         values = [row.get(key) for row in rows]
         has_times = any(map(_is_time, values))
-        is_numeric = not has_times and all(
-            isinstance(value, int | float) and not isinstance(value, bool)
-            for value in values
-            if value is not None
-        )
+        is_numeric = not has_times and all(map(_is_number_or_none, values))
         cells = [_format_for_key(key, value) for value in values]
         if has_times and breaks_times:
             cells = [cell.replace("T", "\n") for cell in cells]
-        width = max(map(len, (key, *chain(*map(str.split, cells)))))
+        longest_word = max(map(len, (key, *chain(*map(str.split, cells)))))
         table.add_column(
             Text(escape(key)),
             justify="right" if is_numeric else "left",
             overflow="fold",
             no_wrap=is_numeric,
-            min_width=_TIME_OF_DAY_WIDTH if has_times else min(width, _MIN_TEXT_WIDTH),
+            min_width=_TIME_OF_DAY_WIDTH if has_times else min(longest_word, _MIN_TEXT_WIDTH),
         )
         columns.append(map(Text, cells))
     for row in zip(*columns, strict=True):
@@ -319,34 +326,35 @@ def _table(rows: Sequence[Mapping[str, JsonValue]], *, breaks_times: bool) -> Ta
     return table
 
 
+def _is_number_or_none(value: JsonValue) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
 def _all_keys(rows: Sequence[Mapping[str, JsonValue]]) -> list[str]:
     return list(dict.fromkeys(key for row in rows for key in row))
 
 
 def _flattened(value: Mapping[str, JsonValue]) -> JsonObject:
-    """Returns an object whose small objects are keys with dots; positions stay objects."""
+    """Returns an object with the keys of its small objects as dot-paths; positions stay objects."""
     flat: JsonObject = {}
     for key, inner in value.items():
-        if (
-            not isinstance(inner, dict)
-            or not 0 < len(inner) <= _MAX_FLATTENED_KEYS
-            or _is_vector(inner)
-        ):
+        is_small = isinstance(inner, dict) and 0 < len(inner) <= _MAX_FLATTENED_KEYS
+        if not isinstance(inner, dict) or not is_small or _is_vector(inner):
             flat[key] = inner
-        elif inner.keys() == {"value"}:  # a message that has this one field
+        elif inner.keys() == {"value"}:  # a message with this one field
             flat[key] = inner["value"]
         else:
             flat.update((f"{key}.{name}", item) for name, item in _flattened(inner).items())
     return flat
 
 
-def leaves(value: JsonValue, name: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Yields what an object holds, however deep, by dot-paths; of any other value itself."""
+def leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Yields the values inside nested objects, each with its dot-path; a list is one value."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from leaves(inner, f"{name}.{key}" if name else key)
+            yield from leaves(inner, dotted(path, key))
     else:
-        yield name, value
+        yield path, value
 
 
 def _is_vector(value: Mapping[str, JsonValue]) -> bool:
@@ -355,7 +363,7 @@ def _is_vector(value: Mapping[str, JsonValue]) -> bool:
 
 
 def format_value(value: JsonValue) -> str:
-    """Formats one value as text; a time as local time, an absent or empty one as `-`."""
+    """Formats a value in one line: a time as local time; null and empty lists as `-`."""
     if value is None:
         return "-"
     if isinstance(value, int):
@@ -372,34 +380,32 @@ def format_value(value: JsonValue) -> str:
 
 def _format_object(value: Mapping[str, JsonValue]) -> str:
     """Formats an object: `x 1.5, y 2, yaw_deg 90 (map)`, `label: cup; score: 0.9`."""
-    if _is_vector(value):
-        text = ", ".join(
-            f"{key} {format_value(inner)}" for key, inner in value.items() if key != "frame_id"
-        )
-        frame = value.get("frame_id")
-        return text if frame is None else f"{text} ({format_value(frame)})"
     if value.keys() == {"value"}:
         return format_value(value["value"])
-    return "; ".join(
-        f"{escape(key)} ({format_value(inner)})"
-        if isinstance(inner, dict)
-        else f"{escape(key)}: {format_value(inner)}"
-        for key, inner in value.items()
-    )
+    if _is_vector(value):
+        axes = [f"{key} {format_value(value[key])}" for key in value if key != "frame_id"]
+        frame = value.get("frame_id")
+        return ", ".join(axes) + ("" if frame is None else f" ({format_value(frame)})")
+    parts = []
+    for key, inner in value.items():
+        text = format_value(inner)
+        parts.append(
+            f"{escape(key)} ({text})" if isinstance(inner, dict) else f"{escape(key)}: {text}"
+        )
+    return "; ".join(parts)
 
 
 def _is_time(value: JsonValue) -> bool:
-    """Returns whether a number of a reply is a time (Unix s)."""
     return isinstance(value, float) and _EARLIEST_TIME < value < _LATEST_TIME
 
 
 def format_time(unix_s: float) -> str:
-    """Formats a time in this machine's zone, to the microsecond.
+    """Formats a time in this machine's zone, to the microsecond: `2026-11-20T08:30:00.000000`.
 
-    Every option that takes a time reads it, and it is one word for a shell. Where clocks were set
-    back, and the time occurs twice, it has its offset.
+    Every option that takes a time reads this form; it is one word for a shell. A local time that
+    occurs twice, because clocks were set back, has its offset.
     """
-    fraction, whole = math.modf(unix_s)  # the product of the whole would be rounded twice
+    fraction, whole = math.modf(unix_s)  # `unix_s * 1e6` would round twice
     microseconds = int(whole) * 1_000_000 + round(fraction * 1e6)
     return local_time(microseconds * NS_PER_US).isoformat(timespec="microseconds")
 
@@ -411,7 +417,9 @@ def format_duration(seconds: float) -> str:
         return f"{seconds:.1f} s"
     if amount < _HOURS_FROM_S:
         return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h" if amount < _DAYS_FROM_S else f"{seconds / 86_400:.0f} days"
+    if amount < _DAYS_FROM_S:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 86_400:.0f} days"
 
 
 def format_size(size_bytes: float) -> str:

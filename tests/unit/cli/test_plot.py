@@ -89,8 +89,8 @@ def test_metres_east_and_north_lead_back_to_the_fix(
     assert math.dist(found, metres) <= 0.007 * math.hypot(*metres) + 1e-3
 
 
-def asked_in(bags: Path) -> plot.Asked:
-    return plot.asked_in(memory_of(bags), TimeWindow.everything())
+def whole_memory(bags: Path) -> plot.PlotWindow:
+    return plot.recorded_part(memory_of(bags), TimeWindow.everything())
 
 
 @pytest.mark.parametrize("kind", ["path", "signal /battery_state", "timeline", "recap"])
@@ -104,23 +104,23 @@ def test_each_is_a_picture_of_the_asked_kind(
 
 
 def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> None:
-    signals, _ = plot.signals_of(asked_in(bags), "/battery_state", ["percentage"])
+    signals, _ = plot.read_signals(whole_memory(bags), "/battery_state", ["percentage"])
     _, charge = signals["percentage"]
     assert (len(charge), charge[0], charge[-1]) == (30, 80.0, 51.0)
-    signals, notes = plot.signals_of(asked_in(bags), "/odom", [])
+    signals, notes = plot.read_signals(whole_memory(bags), "/odom", [])
     assert [*signals] == ["position.x", "position.y"]  # nothing else changes
     assert sum(map(math.isnan, signals["position.x"][1])) == 1
     assert notes == []
 
 
 def test_lanes_show_what_was_recorded_and_what_was_not(bags: Path) -> None:
-    asked = asked_in(bags)
-    rows = plot.event_rows(asked, asked.recap())
+    shown = whole_memory(bags)
+    rows = plot.event_rows(shown, shown.recap())
     start = 1_700_000_000.0
     assert rows["recorded"] == [(start, start + 29.8), (start + 60, start + 69.8)]
     assert rows["gap"] == [(start + 29.8, start + 60)]
     assert "stop" in rows
-    topics = plot.topic_rows(asked)
+    topics = plot.topic_rows(shown)
     assert topics["/battery_state"] == [(start, start + 29)]
     assert len(topics["/odom"]) == 2
 

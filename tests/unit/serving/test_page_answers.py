@@ -16,7 +16,7 @@ from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
 from ros2_memory.analysis.motion.robot_track import cut, track_of
-from ros2_memory.cli.plot import asked_in
+from ros2_memory.cli.plot import recorded_part
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -118,7 +118,7 @@ def test_a_span_asked_for_again_keeps_its_ends_and_what_it_holds(tmp_path: Path)
     memory = memory_of(tmp_path)
     first = shown(memory, "last=1000")
     again = shown(memory, f"start={first['start']:.3f}&end={first['end']:.3f}")
-    picture = asked_in(memory, TimeWindow.everything()).recap()
+    picture = recorded_part(memory, TimeWindow.everything()).recap()
     assert picture is not None
     for each in (first, again):
         assert each["distance_m"] == picture.distance_m == 3.5
