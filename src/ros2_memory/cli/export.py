@@ -1,12 +1,11 @@
 """`ros2-memory export`: a time window as an MCAP file, or as rows of Parquet."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from itertools import chain, islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.options import AsJson, Bags, Times
@@ -65,7 +64,7 @@ def export(
     memory = bags.memory()
     view = View(memory, Call())
     window = times.window(memory)
-    topics = _topics(view, topic or ())
+    topics = _matching_topics(view, topic or ())
     note_unread(view, window)
     with_latched = mcap is not None if latched is None else latched
     earlier = _latched_before(view, topics, window.start) if with_latched else []
@@ -80,29 +79,37 @@ def export(
         view.notes.add(
             f"{copied} copied from before the window, with the original time: {begins}{none}"
         )
-    messages, files, lacking = chain(earlier, first, within), 1, ""
+    messages = chain(earlier, first, within)
     with spinner("exporting"):
         if mcap is not None:
-            undefined: list[str] = []
-            count = write_mcap(mcap, with_definitions(messages, memory.reader, undefined))
-            lacking, where = describe_undefined(undefined), f"in {mcap}"
+            done = _export_to_mcap(mcap, messages, memory.reader)
         elif parquet is not None:
-            count, files, lacking = _write_parquet(parquet, messages, memory, robot)
-            where = f"in {counted(files, 'file')} below {parquet}"
-    if lacking:
-        view.notes.add(lacking)
+            done = _export_to_parquet(parquet, messages, memory, robot)
+    if done.fault:
+        view.notes.add(done.fault)
     notes = view.notes.sentences()
     if as_json:
         path = str(mcap or parquet)
-        print_json({"path": path, "messages": count, "files": files, "notes": [*notes]})
+        print_json(
+            {"path": path, "messages": done.messages, "files": done.files, "notes": [*notes]}
+        )
     else:
-        print_line(f"{counted(count, 'message')} {where}")
+        print_line(f"{counted(done.messages, 'message')} in {done.where}")
     print_notes(notes)
-    return bool(lacking or not view.notes.complete or lost_in(view.snapshot, window))
+    return bool(done.fault or not view.notes.complete or lost_in(view.snapshot, window))
 
 
-def _topics(view: View, globs: Sequence[str]) -> list[str]:
-    """Returns the recorded topics that match one of the globs; all without any.
+class Exported(NamedTuple):
+    """What was written, and a sentence on types that the copy does not let anyone decode, or ''."""
+
+    where: str
+    messages: int
+    files: int
+    fault: str
+
+
+def _matching_topics(view: View, globs: Sequence[str]) -> list[str]:
+    """Returns the recorded topics that match one of the globs; all topics if there are no globs.
 
     Raises:
         NoDataError: nothing is recorded, or no topic matches.
@@ -116,79 +123,94 @@ def _topics(view: View, globs: Sequence[str]) -> list[str]:
     return sorted(chosen)
 
 
-def _static_transforms(
-    view: View, topic: str, window: TimeWindow
-) -> Iterator[tuple[str, StoredMessage]]:
-    """Yields the child frames of a topic of transforms, each with its message, by log time."""
-    for stored in view.stream.messages([topic], window):
-        with suppress(UndecodableError):
-            message = view.memory.reader.decode(stored.record)
-            for edge in view.extractor.transforms(message, stored.time, static=True):
-                yield edge.child, stored
-
-
 def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[StoredMessage]:
     """Returns the latched messages that are valid when a window starts, by log time.
 
-    These are the newest of each topic; of transforms the newest for each child frame, since every
-    broadcaster publishes only its own.
+    That is the newest message of each topic. Of transforms it is the newest message for each child
+    frame, since every broadcaster publishes only its own frames.
     """
     before, snapshot = TimeWindow(MIN_NS, start), view.snapshot
     latching = view.limits.latching
-    valid: dict[tuple[str, str], StoredMessage] = {}
+    valid: list[StoredMessage] = []
     for topic in topics:
         if not latching.may_hold(snapshot, topic):
             continue
         if any(name.endswith("/TFMessage") for name in snapshot.timeline.types_of(topic)):
             if latching.is_latched(snapshot, topic):
-                for child, stored in _static_transforms(view, topic, before):
-                    valid[topic, child] = stored
+                valid += _newest_static_transforms(view, topic, before)
         elif (newest := view.stream.newest(topic, before)) and latching.holds(snapshot, newest):
-            valid[topic, ""] = newest
-    # A message is valid for several frames, and is exported once.
-    once = {id(stored): stored for stored in valid.values()}
-    return sorted(once.values(), key=lambda stored: stored.time)
+            valid.append(newest)
+    return sorted(valid, key=lambda stored: stored.time)
 
 
-def with_definitions(
-    messages: Iterator[StoredMessage], reader: BagReader, undefined: list[str]
-) -> Iterator[StoredMessage]:
-    """Yields the messages with the definitions that their bags lack; collects unknown types."""
+def _newest_static_transforms(view: View, topic: str, window: TimeWindow) -> list[StoredMessage]:
+    """Returns the messages that are the newest of a window for one child frame or several."""
+    newest: dict[str, StoredMessage] = {}
+    for stored in view.stream.messages([topic], window):
+        with suppress(UndecodableError):
+            message = view.memory.reader.decode(stored.record)
+            for edge in view.extractor.transforms(message, stored.time, static=True):
+                newest[edge.child] = stored
+    return [*{id(stored): stored for stored in newest.values()}.values()]
 
-    @cache
-    def defined(channel: Channel) -> Channel:
+
+class Definitions:
+    """Gives messages the definitions that their bags lack.
+
+    Attributes:
+        undefined: the types that no bag, configured folder or standard type defines.
+    """
+
+    def __init__(self, reader: BagReader) -> None:
+        self.undefined: list[str] = []
+        self._reader = reader
+        self._channels: dict[Channel, Channel] = {}
+
+    def add_to(self, messages: Iterable[StoredMessage]) -> Iterator[StoredMessage]:
+        """Yields the messages, each with the definition of its type if there is one."""
+        for stored in messages:
+            record = stored.record
+            if record.channel not in self._channels:
+                self._channels[record.channel] = self._with_definition(record.channel)
+            channel = self._channels[record.channel]
+            yield stored._replace(record=record._replace(channel=channel))
+
+    def _with_definition(self, channel: Channel) -> Channel:
         schema = channel.schema
         if channel.encoding != "cdr" or schema.text.strip():
             return channel
-        definition = reader.definition(channel)
+        definition = self._reader.definition(channel)
         if definition is None:
-            undefined.extend({schema.name} - {*undefined})
+            if schema.name not in self.undefined:
+                self.undefined.append(schema.name)
             return channel
         text = definition.text().encode()
         return replace(channel, schema=replace(schema, encoding="ros2msg", text=text))
 
-    for stored in messages:
-        record = stored.record
-        yield stored._replace(record=record._replace(channel=defined(record.channel)))
+    def describe_undefined(self) -> str:
+        """Returns a sentence on the undefined types; empty if there are none."""
+        if not self.undefined:
+            return ""
+        have = "has" if len(self.undefined) == 1 else "have"
+        return (
+            f"{', '.join(self.undefined)} {have} no definition in the bags, in "
+            "reader.custom_msg_paths or among the standard types, and none in the file: other "
+            "programs cannot read such messages"
+        )
 
 
-def describe_undefined(types: Sequence[str]) -> str:
-    """Returns the sentence on types that an MCAP file has no definition of; empty without any."""
-    if not types:
-        return ""
-    return (
-        f"{', '.join(types)} {'has' if len(types) == 1 else 'have'} no definition in the bags, in "
-        "reader.custom_msg_paths or among the standard types, and none in the file: other programs "
-        "cannot read such messages"
-    )
+def _export_to_mcap(path: Path, messages: Iterable[StoredMessage], reader: BagReader) -> Exported:
+    definitions = Definitions(reader)
+    count = write_mcap(path, definitions.add_to(messages))
+    return Exported(str(path), count, 1, definitions.describe_undefined())
 
 
 def write_mcap(path: Path, messages: Iterator[StoredMessage]) -> int:
     """Writes an MCAP file, which appears when it is complete; returns the number of messages.
 
     Raises:
-        BagError: it cannot be written.
-        InvalidArgumentsError: the file exists.
+        BagError: the file cannot be written.
+        InvalidArgumentsError: the file exists, or its folder does not.
         NoDataError: there are no messages.
     """
     if path.exists():
@@ -211,21 +233,24 @@ def write_mcap(path: Path, messages: Iterator[StoredMessage]) -> int:
     return written
 
 
-def _write_parquet(
-    path: Path, messages: Iterator[StoredMessage], memory: Memory, robot: str | None
-) -> tuple[int, int, str]:
+def _export_to_parquet(
+    folder: Path, messages: Iterable[StoredMessage], memory: Memory, robot: str | None
+) -> Exported:
     """Writes rows of Parquet.
 
-    Returns the numbers of rows and of files, and a sentence on types of which rows have no value.
-
     Raises:
-        ConfigError: the optional dependency is missing.
+        ConfigError: pyarrow is not installed.
     """
     require_extra("export --parquet", "parquet", "pyarrow")
     from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
 
-    dataset = Dataset(path, memory.reader, memory.extractor, robot)
+    dataset = Dataset(folder, memory.reader, memory.extractor, robot)
     dataset.write(messages)
-    types = ", ".join(sorted(dataset.undecoded))
-    lacking = f"messages of {types} cannot be decoded: their rows have no value, and "
-    return dataset.rows, dataset.files, f"{lacking}`undecodable` says why" if types else ""
+    fault = ""
+    if dataset.undecoded:
+        fault = (
+            f"messages of {', '.join(sorted(dataset.undecoded))} cannot be decoded: their rows "
+            "have no value, and `undecodable` says why"
+        )
+    where = f"{counted(dataset.files, 'file')} below {folder}"
+    return Exported(where, dataset.rows, dataset.files, fault)

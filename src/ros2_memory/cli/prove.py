@@ -4,21 +4,20 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Final, TypeAlias, cast
+from typing import Annotated, Final, NamedTuple, TypeVar, cast
 
 import typer
 
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import answer_to
-from ros2_memory.cli.export import describe_undefined, with_definitions, write_mcap
+from ros2_memory.cli.export import Definitions, write_mcap
 from ros2_memory.cli.options import LOOKING, AsJson, Bags, is_folder, load_to_look, open_memory
-from ros2_memory.cli.output import print_line, print_notes, spinner
+from ros2_memory.cli.output import print_json, print_line, print_notes, spinner
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
@@ -33,12 +32,14 @@ from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Batch, Record
 
-_BESIDE: Final = frozenset(
+Read = TypeVar("Read", Record, Batch)
+
+_KEYS_ON_FILES: Final = frozenset(
     {"notes", "bags", "incomplete", "damaged", "unread", "silences", "doubts", "budget"}
 )
-"""Keys that say how things lie in the files, which other files need not have."""
+"""Keys on how messages lie in files, which a copy of them need not share."""
 _NEVER: Final[JsonObject] = {"timestamp": None, "value": None}
-"""What a reply of null says where it has notes."""
+"""The long form of the reply null, which a tool uses if it has notes."""
 
 
 def prove(
@@ -66,194 +67,237 @@ def prove(
     """
     if output.exists() or not output.parent.is_dir():
         raise InvalidArgumentsError(f"{output} must be new, in a folder that is there")
-    words, looking = _words(question), (*LOOKING, "server.call_timeout_s=600")  # without a store
-    others = [word for word in bags.words or () if not is_folder(word)]
-    loaded = bags.settings(*looking)
-    memory = open_memory(loaded, verbose=bags.verbose)
-    reads = _Reads(memory.reader)
+    words = _split_question(question)
+    looking = (*LOOKING, "server.call_timeout_s=600")  # without columns an answer takes long
+    settings = bags.settings(*looking)
+    memory = open_memory(settings, verbose=bags.verbose)
+    log = _ReadLog(memory.reader)
     with spinner("asking"):
-        expected = _answer(loaded, replace(memory, reader=cast("BagReader", reads)), words)
+        expected = _answer(settings, replace(memory, reader=cast("BagReader", log)), words)
     view = View(memory, Call())
     require_bags(view)
-    parts = _parts(view)
-    read = reads.spans()
+    read = log.spans()
+    parts = _parts_without_gaps(view)
+    own_settings = [word for word in bags.words or () if not is_folder(word)]
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
-        for nth, spans in enumerate(_more_and_more(view, read, parts)):
-            path = Path(folder) / str(nth) / output.name
+        for attempt, spans in enumerate(_ever_more_spans(view, read, parts)):
+            path = Path(folder) / str(attempt) / output.name
             path.parent.mkdir()
-            undefined: list[str] = []
-            count = _write(path, view, spans, parts, undefined)
-            settings, _ = load_to_look(None, [str(path), *looking, *others])
-            repeated = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
-            beside, differing = _differing(expected, repeated)
-            if not differing:
+            definitions = Definitions(memory.reader)
+            count = _write_copy(path, view, spans, parts, definitions)
+            copied, _ = load_to_look(None, [str(path), *looking, *own_settings])
+            repeated = _answer(copied, open_memory(copied, verbose=bags.verbose), words)
+            differing = _differing_keys(expected, repeated)
+            if not differing.of_answer:
                 break
         path.replace(output)
-    done = {"path": str(output), "messages": count, "same": not differing}
-    written = json.dumps({**done, "differing": differing, "beside": beside})
-    print_line(written if as_json else f"{counted(count, 'message')} in {output}")
-    if beside:
-        print_notes([f"only the bags themselves give the same {listed(beside)}"])
+    if as_json:
+        keys = {"differing": differing.of_answer, "beside": differing.of_files}
+        same = not differing.of_answer
+        print_json({"path": str(output), "messages": count, "same": same, **keys})
+    else:
+        print_line(f"{counted(count, 'message')} in {output}")
+    if differing.of_files:
+        print_notes([f"only the bags themselves give the same {listed(differing.of_files)}"])
     verdict = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
-    if differing:
-        verdict = f"over {output} the answer differs in {listed(differing)}"
+    if differing.of_answer:
+        verdict = f"over {output} the answer differs in {listed(differing.of_answer)}"
         if len(parts) > 1 and output.suffix == ".mcap":
             verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
     print(verdict, file=sys.stderr)
-    lacking = describe_undefined(undefined)
-    print_notes([lacking] if lacking else [])
-    rests_on = {name for topic in read for name in view.timeline.types_of(topic)}
-    return bool(differing or not rests_on.isdisjoint(undefined))
+    if definitions.undefined:
+        print_notes([definitions.describe_undefined()])
+    types = {name for topic in read for name in view.timeline.types_of(topic)}
+    return bool(differing.of_answer or not types.isdisjoint(definitions.undefined))
 
 
-# What a reader has of one message, or of several.
-_Read: TypeAlias = Callable[..., Record | Iterable[Record | Batch] | None]  # type: ignore[explicit-any]
-
-
-class _Reads:
-    """A reader that notes the times of the messages that are read, by topic."""
+class _ReadLog:
+    """A `BagReader` that logs from when to when messages of each topic are read."""
 
     def __init__(self, reader: BagReader) -> None:
         self._reader = reader
         self._calls: list[dict[str, Span]] = []
 
     def __getattr__(self, name: str) -> object:
-        read = getattr(self._reader, name)
-        return partial(self._noting, read) if name in {"records", "newest", "batches"} else read
+        return getattr(self._reader, name)
+
+    def records(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
+    ) -> Iterator[Record]:
+        """Yields and logs what the reader yields."""
+        records = self._reader.records(path, topics, window, newest_first=newest_first)
+        # `map` goes on after an error of the reader, as the reader does; a generator would end.
+        return map(self._logger(), records)
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """Returns and logs what the reader returns."""
+        record = self._reader.newest(path, topic, window)
+        return None if record is None else self._logger()(record)
+
+    def batches(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
+    ) -> Iterator[Batch]:
+        """Yields and logs what the reader yields."""
+        return map(self._logger(), self._reader.batches(path, topics, window, bare=bare))
 
     def spans(self) -> dict[str, Spans]:
-        """Returns from when to when messages were read, by topic."""
-        topics = {topic for call in self._calls for topic in call}
-        return {
-            topic: united(call[topic] for call in self._calls if topic in call) for topic in topics
-        }
+        """Returns the spans that were read of each topic: one for each call, united."""
+        spans: dict[str, list[Span]] = {}
+        for call in self._calls:
+            for topic, span in call.items():
+                spans.setdefault(topic, []).append(span)
+        return {topic: united(of_topic) for topic, of_topic in spans.items()}
 
-    def _noting(self, read: _Read, *given: object, **options: object) -> object:
-        """Returns what the reader returns, a message or several, noted when it is their turn."""
+    def _logger(self) -> Callable[[Read], Read]:
+        """Returns a function that logs messages of one call, and returns them."""
         call: dict[str, Span] = {}
         self._calls.append(call)
 
-        def noted(part: Record | Batch) -> Record | Batch:
-            times = [part.log_time] if isinstance(part, Record) else part.log_times.tolist()
-            if not times:
-                return part
-            start, stop = call.get(part.channel.topic, (MAX_NS, MIN_NS))
-            first, last = min(times), max(times)
-            call[part.channel.topic] = min(start, first), max(stop, last + 1)
-            return part
+        def log(messages: Read) -> Read:
+            if isinstance(messages, Record):
+                times = [messages.log_time]
+            else:
+                times = messages.log_times.tolist()
+            if times:
+                topic = messages.channel.topic
+                start, stop = call.get(topic, (MAX_NS, MIN_NS))
+                first, last = min(times), max(times)
+                call[topic] = min(start, first), max(stop, last + 1)
+            return messages
 
-        messages = read(*given, **options)
-        if messages is None:
-            return None
-        if isinstance(messages, Record):
-            return noted(messages)
-        # Mapped: it goes on behind what cannot be read.
-        return map(noted, messages)
+        return log
 
 
-def _parts(view: View) -> list[tuple[Path, TimeWindow]]:
-    """Returns the recordings, each from when to when there is no gap."""
-    reach: dict[Path, Span] = {}
+class _Part(NamedTuple):
+    """A part of a recording without a gap."""
+
+    recording: Path
+    window: TimeWindow
+
+
+def _parts_without_gaps(view: View) -> list[_Part]:
+    """Returns all recordings, each divided at the gaps of the memory."""
+    spans: dict[Path, Span] = {}
     for bag in view.timeline.recorded:
-        start, stop = reach.get(bag.recording, (MAX_NS, MIN_NS))
-        reach[bag.recording] = min(start, bag.start), max(stop, bag.end + 1)
+        start, stop = spans.get(bag.recording, (MAX_NS, MIN_NS))
+        spans[bag.recording] = min(start, bag.start), max(stop, bag.end + 1)
     gaps = [(before + 1, after) for before, after in view.snapshot.gaps]
     return [
-        (recording, TimeWindow(*span))
-        for recording, whole in reach.items()
-        for span in without([whole], gaps)
+        _Part(recording, TimeWindow(start, stop))
+        for recording, span in spans.items()
+        for start, stop in without([span], gaps)
     ]
 
 
-def _more_and_more(
-    view: View, read: Mapping[str, Spans], parts: Sequence[tuple[Path, TimeWindow]]
+def _ever_more_spans(
+    view: View, read: Mapping[str, Spans], parts: Sequence[_Part]
 ) -> Iterator[dict[str, Spans]]:
-    """Yields what an answer may rest on: what was read, then more where that is not all.
+    """Yields the times of each topic to copy: those that were read, then more and more, then all.
 
-    That is the topics that were read as a whole, and everything. The first and the last message of
-    all say when "now" is, those of each part what was recorded.
+    All topics are copied at some ends: the first and the last message of all say when "now" is,
+    those of each part say from when to when something was recorded.
     """
-    times = sorted(at for _, window in parts for at in (window.start, window.stop - 1))
-    whole, ends = ([(at, at + 1) for at in moments] for moments in ((times[0], times[-1]), times))
+    ends = [(at, at + 1) for part in parts for at in (part.window.start, part.window.stop - 1)]
+    ends.sort()
+    outermost, ever = [ends[0], ends[-1]], [(MIN_NS, MAX_NS)]
     topics = view.timeline.topics()
-    yield {topic: united([*read.get(topic, ()), *whole]) for topic in topics}
-    ever = [(MIN_NS, MAX_NS)]
-    for spans_of in (read, dict.fromkeys(read, ever), dict.fromkeys(topics, ever)):
-        yield {topic: united([*spans_of.get(topic, ()), *ends]) for topic in topics}
+    attempts: list[tuple[Mapping[str, Spans], Spans]] = [
+        (read, outermost),
+        (read, ends),
+        (dict.fromkeys(read, ever), ends),
+        (dict.fromkeys(topics, ever), ends),
+    ]
+    for spans, ends_of_all in attempts:
+        yield {topic: united([*spans.get(topic, ()), *ends_of_all]) for topic in topics}
 
 
-def _write(
+def _write_copy(
     path: Path,
     view: View,
     spans: Mapping[str, Spans],
-    parts: Sequence[tuple[Path, TimeWindow]],
-    undefined: list[str],
+    parts: Sequence[_Part],
+    definitions: Definitions,
 ) -> int:
-    """Writes the messages of these times by topic: a file, or one for each part in a folder.
+    """Copies the messages in the spans of their topics, and returns their number.
 
-    Returns how many; collects types without a definition.
+    A path that ends in `.mcap` becomes one file, any other one a folder with a file for each part.
     """
+    if path.suffix == ".mcap":
+        messages = _messages_in(view, spans, TimeWindow.everything())
+        with suppress(NoDataError):
+            return write_mcap(path, definitions.add_to(messages))
+        return 0
     count = 0
-    whole = [(None, TimeWindow.everything())]
-    for nth, (recording, window) in enumerate(whole if path.suffix == ".mcap" else parts):
-        file = path
-        if recording is not None:
-            folder = path / recording.relative_to(view.bag_dir)
-            folder.mkdir(parents=True, exist_ok=True)
-            file = folder / f"{recording.name}_{nth}.mcap"
-        stored_messages = (
+    for number, part in enumerate(parts):
+        folder = path / part.recording.relative_to(view.bag_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        messages = (
             stored
-            for stored in _messages(view, spans, window)
-            if recording in (None, stored.bag.recording)
+            for stored in _messages_in(view, spans, part.window)
+            if stored.bag.recording == part.recording
         )
-        with suppress(NoDataError):  # all that it has, another recording has too
-            defined = with_definitions(stored_messages, view.memory.reader, undefined)
-            count += write_mcap(file, defined)
+        with suppress(NoDataError):  # all messages of the part are copies of another recording's
+            file = folder / f"{part.recording.name}_{number}.mcap"
+            count += write_mcap(file, definitions.add_to(messages))
     return count
 
 
-def _messages(
-    view: View, spans: Mapping[str, Spans], within: TimeWindow
+def _messages_in(
+    view: View, spans: Mapping[str, Spans], window: TimeWindow
 ) -> Iterator[StoredMessage]:
     """Yields the messages of a window that lie in the spans of their topics."""
-    for start, stop in united(span for topic_spans in spans.values() for span in topic_spans):
-        window = within.intersect(TimeWindow(start, stop))
+    for start, stop in united(span for of_topic in spans.values() for span in of_topic):
+        part = window.intersect(TimeWindow(start, stop))
         topics = [
             topic
-            for topic, topic_spans in spans.items()
-            if overlaps_any(topic_spans, window.start, window.stop - 1)
+            for topic, of_topic in spans.items()
+            if overlaps_any(of_topic, part.start, part.stop - 1)
         ]
-        for stored in view.stream.messages(topics, window) if topics else ():
+        for stored in view.stream.messages(topics, part) if topics else ():
             if lies_inside(spans[stored.topic], stored.time):
                 yield stored
 
 
-def _words(question: str) -> list[str]:
-    """Returns the tool and its arguments: one JSON object, or `key=value` each."""
+def _split_question(question: str) -> list[str]:
+    """Returns the tool, and its arguments: one JSON object, or a word for each `key=value`.
+
+    A value may have spaces: it ends where the next `key=` begins.
+    """
     tool, _, rest = question.strip().partition(" ")
-    given = [rest] if rest.lstrip().startswith("{") else re.split(r"\s+(?=\w+=)", rest.strip())
-    return [tool, *filter(None, given)]
+    rest = rest.strip()
+    arguments = [rest] if rest.startswith("{") else re.split(r"\s+(?=\w+=)", rest)
+    return [tool, *filter(None, arguments)]
 
 
 def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonValue:
-    """Returns the reply to a question, from the bags themselves.
+    """Returns the reply to a question, read from the bags without stored columns.
 
     Raises:
         InvalidArgumentsError: the tool refuses the question, or cannot answer it in time.
     """
     memory = replace(memory, scanner=Scanner(None, memory.index.bag_dir))
-    tool, *given = words
-    reply = answer_to(build_dispatcher(settings, memory), memory, tool, given)
+    tool, *arguments = words
+    reply = answer_to(build_dispatcher(settings, memory), memory, tool, arguments)
     answer: JsonValue = json.loads(reply.text)
     if reply.is_error and isinstance(answer, dict):
         raise InvalidArgumentsError(str(answer["detail"]))
     return answer
 
 
-def _differing(one: JsonValue, other: JsonValue) -> tuple[list[str], list[str]]:
-    """Returns the keys in which two replies differ: those on files, and the others."""
-    one, other = (_NEVER if reply is None else reply for reply in (one, other))
+class _DifferingKeys(NamedTuple):
+    """The keys in which two replies differ: those on what lies in which file, and all others."""
+
+    of_files: list[str]
+    of_answer: list[str]
+
+
+def _differing_keys(expected: JsonValue, repeated: JsonValue) -> _DifferingKeys:
+    one = _NEVER if expected is None else expected
+    other = _NEVER if repeated is None else repeated
     if not isinstance(one, dict) or not isinstance(other, dict):
-        return [], ([] if one == other else ["all"])
-    keys = [key for key in dict.fromkeys((*one, *other)) if one.get(key) != other.get(key)]
-    return [key for key in keys if key in _BESIDE], [key for key in keys if key not in _BESIDE]
+        return _DifferingKeys([], [] if one == other else ["all"])
+    differing = _DifferingKeys([], [])
+    for key in dict.fromkeys((*one, *other)):
+        if one.get(key) != other.get(key):
+            (differing.of_files if key in _KEYS_ON_FILES else differing.of_answer).append(key)
+    return differing

@@ -61,6 +61,18 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert summary == outcome.summary()
 
 
+def test_a_file_that_is_finished_while_the_user_is_asked_is_whole(tmp_path: Path) -> None:
+    file = left_open(tmp_path / "a/a_0.mcap")
+
+    def finish(_folders: object) -> None:
+        write_mcap(file, MESSAGES)
+
+    outcome = recover_files(tmp_path, confirm=finish, clock=later(60))
+    assert outcome == RecoveryOutcome(whole=1)
+    assert file.exists()
+    assert not [line for line in outcome.lines if "removed" in line and line != outcome.summary()]
+
+
 def test_a_recording_is_own_by_whatever_path_it_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,8 +1,9 @@
 """`ros2-memory adopt`: lists recordings of other programs as the recorder's own."""
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 
@@ -11,7 +12,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
 from ros2_memory.cli.output import print_json, print_line
-from ros2_memory.core.directories import identity_of
+from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.retention.delete import size_of
@@ -35,38 +36,29 @@ def adopt(
     require_recorder(settings)
     root = settings.recording.bag_dir
     own = OwnRecordings(root)
-    given = [_below(root, directory) for directory in directories]
-    bags_by_name = {
-        name: [*filter(is_regular, bags_in(path))]
-        for directory in given
-        for path in folders_with_bags(directory)
-        if (name := own.name_of(path))
-    }
+    bags_by_name: dict[str, list[Path]] = {}
+    for directory in [_inside(root, directory) for directory in directories]:
+        for folder in folders_with_bags(directory):
+            if name := own.name_of(folder):
+                bags_by_name[name] = [*filter(is_regular, bags_in(folder))]
     if not own.exists():  # as the recorder does when it starts
         lock = BagDirLock.acquire(root, patience_s=0.0)
         try:
             own.claim()
         finally:
             lock.release()
-    new = {name: bags for name, bags in bags_by_name.items() if not all(map(own.owns_bag, bags))}
-    identities = {name: identity_of(root / name) for name in new}
-    for name, identity in identities.items():
-        if identity is None:
-            raise RecorderError(f"{root / name} is not there any more")
-    own.adopt({name: identity for name, identity in identities.items() if identity})
-    adopted = [(name, len(bags), sum(map(size_of, bags)) / MB) for name, bags in new.items()]
-    already = len(bags_by_name) - len(new)
+    adopted = _adopt_folders(root, own, bags_by_name)
+    already = len(bags_by_name) - len(adopted)
     if as_json:
-        keys = ("directory", "bags", "size_mb")
-        rows = [dict(zip(keys, row, strict=True)) for row in adopted]
-        print_json({"adopted": rows, "already": already})
+        print_json({"adopted": [row._asdict() for row in adopted], "already": already})
         return not bags_by_name
-    for name, files, size_mb in adopted:
-        print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size_mb:.1f} MB)")
+    for row in adopted:
+        files = counted(row.bags, "bag file")
+        print_line(f"adopted: {row.directory} ({files}, {row.size_mb:.1f} MB)")
     if already:
         folders = counted(already, "directory is", "directories are")
         print_line(f"{folders} the recorder's own already")
-    if not all(map(is_kept_apart, new)):
+    if not all(is_kept_apart(row.directory) for row in adopted):
         print_line("retention deletes them from now on, by its limits, oldest first")
     if not bags_by_name:
         print_line(
@@ -75,23 +67,52 @@ def adopt(
     return not bags_by_name
 
 
-def _below(root: Path, directory: Path) -> Path:
-    """Returns a directory, given by its path or its name in the bag directory, as a path below it.
+class _Adopted(NamedTuple):
+    directory: str
+    bags: int
+    size_mb: float
+
+
+def _adopt_folders(
+    root: Path, own: OwnRecordings, bags_by_name: Mapping[str, Sequence[Path]]
+) -> list[_Adopted]:
+    """Adopts the folders with bags that are not the recorder's own yet, and returns them.
 
     Raises:
-        InvalidArgumentsError: it is not a directory below the bag directory, or behind a link.
+        RecorderError: a folder is gone; none is adopted then.
+    """
+    identities: dict[str, Identity] = {}
+    adopted: list[_Adopted] = []
+    for name, bags in bags_by_name.items():
+        if all(map(own.owns_bag, bags)):
+            continue
+        identity = identity_of(root / name)
+        if identity is None:
+            raise RecorderError(f"{root / name} is not there any more")
+        identities[name] = identity
+        adopted.append(_Adopted(name, len(bags), sum(map(size_of, bags)) / MB))
+    own.adopt(identities)
+    return adopted
+
+
+def _inside(root: Path, directory: Path) -> Path:
+    """Returns the path of a directory inside the bag directory, without following links.
+
+    `directory` is a path, or a name in the bag directory.
+
+    Raises:
+        InvalidArgumentsError: it is not a directory inside the bag directory, or behind a link.
     """
     base = Path(os.path.abspath(root))  # noqa: PTH100 - `resolve` would follow links
     for given in (directory, root / directory):
         path = Path(os.path.abspath(given))  # noqa: PTH100 - as above
         if not path.is_dir() or not path.is_relative_to(base):
             continue
-        inside = root / path.relative_to(base)
-        # The bag directory itself may be a link.
-        parts = [part for part in (inside, *inside.parents) if part.is_relative_to(root)]
-        link = next((part for part in parts if part != root and part.is_symlink()), None)
-        if link is not None:
-            raise InvalidArgumentsError(f"{link} is a symbolic link, which is not followed")
+        inside = root
+        for name in path.relative_to(base).parts:  # the bag directory itself may be a link
+            inside /= name
+            if inside.is_symlink():
+                raise InvalidArgumentsError(f"{inside} is a symbolic link, which is not followed")
         return inside
     raise InvalidArgumentsError(
         f"{directory} is not a directory below {root}: move the bags there, then adopt them"

@@ -1,11 +1,10 @@
 """`ros2-memory forget`: deletes the bags of a time window, or some messages of them.
 
-Whole bags are deleted as retention deletes them. What is deleted and what is kept is decided first,
-without reading a bag. Then the bags are deleted, after the latched messages that later answers need
-were carried forward.
+Whole bags are deleted as retention deletes them: first it is decided which go and which stay, then
+latched messages that later answers need are carried forward, then the files are deleted.
 
-Messages of topics, or of the time in which the robot was in a place, are taken out of the bags that
-hold them (`retention.eraser`).
+Messages of some topics, or from when the robot was in a place, are taken out of their bags
+(`retention.eraser`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -70,7 +69,7 @@ from ros2_memory.retention.repair import metadata_corrected
 from ros2_memory.storage.mcap.writer import McapWriter
 
 PLACE_MARGIN_NS: Final[Ns] = NS_PER_S
-"""Messages so long before the robot entered a place, and after it left, go too."""
+"""Forgetting a place includes so long before the robot entered it, and after it left."""
 
 
 def forget(
@@ -113,7 +112,7 @@ def forget(
         work = _Forget(settings, memory, dry_run=dry_run)
         work.finish_erasure()
         if topic or where is not None:
-            work.erase(work.wanted(window, topic or (), where), asks=not yes)
+            work.erase(work.plan_erasure(window, topic or (), where), asks=not yes)
         else:
             work.delete_bags(window, asks=not yes)
         return work.leaves_some
@@ -132,18 +131,22 @@ class _Forget:
         self._memory = memory
         self._dry_run = dry_run
         self._bag_dir = settings.recording.bag_dir
-        self._reader = build_reader(settings)  # reads files as they are
-        self._recorder: str | None = None  # why one holds the bag directory
-        if (self._bag_dir / LOCK_FILE).exists():  # else none does, and nothing is written
+        self._reader = build_reader(settings)  # `memory.reader` hides messages that do not count
+        self._recorder: str | None = None  # a sentence, if a recorder holds the bag directory
+        if (self._bag_dir / LOCK_FILE).exists():  # locking would make the file
             with _recorder_locked_out(self._bag_dir) as self._recorder:
                 pass
-        self._unread: set[Path] = set()  # bags whose first messages are unknown
+        self._unreadable: set[Path] = set()
         snapshot = memory.index.snapshot()
-        self._written = {aside.path: self._may_hold(aside, snapshot) for aside in snapshot.active}
-        every = OwnRecordings(self._bag_dir)
-        self._own = every if settings.retention.foreign == "keep" else None
+        self._written = {
+            aside.path: self._span_written(aside, snapshot) for aside in snapshot.active
+        }
+        recordings = OwnRecordings(self._bag_dir)
+        self._own = recordings if settings.retention.foreign == "keep" else None
         static_topics = settings.data.tf_static_topics
-        self._carrier = Carrier(self._bag_dir, memory.reader, McapWriter(), static_topics, every)
+        self._carrier = Carrier(
+            self._bag_dir, memory.reader, McapWriter(), static_topics, recordings
+        )
         self._eraser = Eraser(
             self._bag_dir,
             self._reader,
@@ -163,56 +166,59 @@ class _Forget:
                 "delete the file, and forget again what was to go"
             ) from error
         if begun is not None:
-            ends = TimeWindow(begun.windows[0][0], begun.windows[-1][1]).asked()
-            topics, span = listed(begun.topics), _span(*ends)
-            print_line(f"an earlier forget was interrupted: {topics} {span}")
+            (first, _), (_, stop) = begun.windows[0], begun.windows[-1]
+            span = _describe_span(*TimeWindow(first, stop).asked())
+            print_line(f"an earlier forget was interrupted: {listed(begun.topics)} {span}")
             self.erase(begun, asks=False)
 
-    def wanted(self, window: TimeWindow, globs: Sequence[str], where: str | None) -> Erasure:
-        """Returns which messages are to go, and prints which of those asked for stay.
+    def plan_erasure(self, window: TimeWindow, globs: Sequence[str], place: str | None) -> Erasure:
+        """Decides which messages go, and prints which of those asked for stay.
 
         Raises:
             InvalidArgumentsError: no such place is named, or no topic matches.
         """
         windows, unknown = [window], list[str]()
-        if where is not None:
-            with spinner(f"looking when the robot was in {where}"):
-                view = open_view(self._memory, Call(), None)
-                place = parse_where(self._memory.limits, where)
-                stays = known_track_for(view, place, window).inside(place.region, window)
-            margin = PLACE_MARGIN_NS
-            around = [TimeWindow(stay.start - margin, stay.stop + margin + 1) for stay in stays]
-            windows = [time.intersect(window) for time in around]
-            unknown = [f"what is not known: {note}" for note in view.notes.sentences()]
+        if place is not None:
+            windows, unknown = self._windows_in(place, window)
         with spinner("looking which topics there are"):
-            known = self._eraser.topics()
-        latched = known.intersection(self._carrier.topics(self._memory.index.snapshot()))
-        topics = {name for glob in globs for name in match_topics(known, glob)}
-        if globs and not topics:
-            raise InvalidArgumentsError(f"no recorded topic is named {listed([*globs])}")
-        if not globs:
-            topics = {*known} - latched
+            recorded = self._eraser.topics()
+        latched = recorded.intersection(self._carrier.topics(self._memory.index.snapshot()))
+        if globs:
+            topics = {name for glob in globs for name in match_topics(recorded, glob)}
+            if not topics:
+                raise InvalidArgumentsError(f"no recorded topic is named {listed([*globs])}")
+        else:
+            topics = {*recorded} - latched
             if latched and windows:
                 print_line(
                     "latched messages stay, because they are valid later, too (name a topic to "
                     f"forget it): {listed(sorted(latched))}"
                 )
-        self._stays(unknown)
-        if self._recorder is not None and topics & latched:
-            line = (
-                f"{listed(sorted(topics & latched))}: latched messages, which the recorder carries "
-            )
-            self._stays([f"{line}on: {self._recorder}; stop the recorder, and forget again"])
-            topics -= latched
-        return Erasure.of(topics, windows, topics & latched)
+        self._print_kept(unknown)
+        latched &= topics
+        if self._recorder is not None and latched:
+            what = f"{listed(sorted(latched))}: latched messages, which the recorder carries on"
+            self._print_kept([f"{what}: {self._recorder}; stop the recorder, and forget again"])
+            topics, latched = topics - latched, frozenset()
+        return Erasure.of(topics, windows, latched)
+
+    def _windows_in(self, name: str, window: TimeWindow) -> tuple[list[TimeWindow], list[str]]:
+        """Returns when the robot was in a named place, and sentences on unknown times."""
+        with spinner(f"looking when the robot was in {name}"):
+            view = open_view(self._memory, Call(), None)
+            place = parse_where(self._memory.limits, name)
+            stays = known_track_for(view, place, window).inside(place.region, window)
+        around = (TimeWindow(stay.start, stay.stop + 1).widened(PLACE_MARGIN_NS) for stay in stays)
+        unknown = [f"what is not known: {note}" for note in view.notes.sentences()]
+        return [time.intersect(window) for time in around], unknown
 
     def erase(self, erasure: Erasure, *, asks: bool) -> None:
-        """Takes messages out of bags; `asks`: whether the user is asked before."""
+        """Takes messages out of bags, with `asks` after confirmation."""
         survey = Survey((), ())
         if erasure.topics and erasure.windows:
             with spinner("looking which bags hold some"):
                 survey = self._eraser.survey(erasure)
-        self._stays(survey.kept)
+        self._print_kept(survey.kept)
         if not survey.holders and not erasure.files:
             print_line("no such message is in the window")
             self._forget_derived(())
@@ -232,32 +238,36 @@ class _Forget:
             kept_by_lake = self._request_of_lake(
                 [Forgetting(*window, erasure.topics) for window in erasure.windows]
             )
-            result = self._eraser.erase(erasure, survey, self._refresh_and_forget)
+            result = self._eraser.erase(erasure, survey, self._forget_derived_of)
         is_all = not result.kept
         print_line(f"deleted: {counts.total()} messages" if is_all else "not all is deleted")
-        self._stays([*result.kept, *kept_by_lake])
+        self._print_kept([*result.kept, *kept_by_lake])
         for note in result.notes:
             print_line(note)
 
     def delete_bags(self, window: TimeWindow, *, asks: bool) -> None:
-        """Deletes the bags that lie inside a window; `asks` as above."""
-        going, kept = self._planned(window)
-        self._stays([*kept, *self._kept_elsewhere(going, window)])
-        if not going:
+        """Deletes the bags that lie inside a window, with `asks` after confirmation."""
+        bags, kept = self._plan_deletion(window)
+        self._print_kept([*kept, *self._copies_that_stay(bags, window)])
+        if not bags:
             why = "no closed bag has messages in the window"
             if kept:
                 why = "each bag with messages in the window stays, for the reason above"
             print_line(f"nothing to delete: {why}")
             self._forget_derived(())
             return
-        first, last = min(bag.start for bag in going), max(bag.end for bag in going)
-        size = sum(bag.size for bag in going)
-        what = f"{counted(len(going), 'bag')}, {format_size(size)}, {_span(first, last)}"
-        if self._confirmed(what, map(self._name, going) if self._dry_run else (), asks=asks):
-            self._delete(going)
+        first, last = min(bag.start for bag in bags), max(bag.end for bag in bags)
+        size = sum(bag.size for bag in bags)
+        what = f"{counted(len(bags), 'bag')}, {format_size(size)}, {_describe_span(first, last)}"
+        if self._confirmed(what, map(self._name, bags) if self._dry_run else (), asks=asks):
+            self._delete(bags)
 
     def _confirmed(self, what: str, rows: Iterable[str], *, asks: bool) -> bool:
-        """Prints what is to go, and returns whether it goes."""
+        """Prints what is to go, and returns whether it goes: not in a dry run.
+
+        Raises:
+            typer.Abort: the user answered no.
+        """
         print_line(f"{'would' if self._dry_run else 'to'} be deleted: {what}")
         for row in rows:
             print_line(f"  {row}")
@@ -265,35 +275,35 @@ class _Forget:
             typer.confirm("Delete them? This cannot be undone.", abort=True)
         return not self._dry_run
 
-    def _stays(self, lines: Iterable[str]) -> None:
+    def _print_kept(self, lines: Iterable[str]) -> None:
+        """Prints lines on what stays, and remembers that something does."""
         for line in lines:
             self.leaves_some = True
             print_line(f"{STAYS}{line}")
 
-    def _planned(self, window: TimeWindow) -> tuple[list[BagFile], list[str]]:
-        """Decides which bags of a window go, and gives a line with the reason for each other one.
+    def _plan_deletion(self, window: TimeWindow) -> tuple[list[BagFile], list[str]]:
+        """Returns the bags of a window that go, and a line with the reason for each that stays.
 
-        Only bags are read of which some messages do not count.
+        Reads only bags that have messages which do not count.
         """
-        going: list[BagFile] = []
+        bags: list[BagFile] = []
         kept: list[str] = []
         snapshot = self._memory.index.snapshot()
-        for bag in self._raw_bags(snapshot):
-            if bag.reaches_into(window):
-                if reason := self._reason_to_keep(bag, window):
-                    kept.append(f"{self._name(bag)}: {reason}")
-                else:
-                    going.append(bag)
-        deleted_too = {other_form(bag.file) for bag in going}
-        kept += (
-            f"{self._name(aside)}: {reason}"
-            for aside, reason in self._unread_in(window, snapshot)
-            if str(aside.path) not in deleted_too
-        )
-        return going, kept
+        for bag in self._bags_as_on_disk(snapshot):
+            if not bag.reaches_into(window):
+                continue
+            if reason := self._reason_to_keep(bag, window):
+                kept.append(f"{self._name(bag)}: {reason}")
+            else:
+                bags.append(bag)
+        deleted_too = {other_form(bag.file) for bag in bags}
+        for aside, reason in self._unread_in(window, snapshot):
+            if str(aside.path) not in deleted_too:
+                kept.append(f"{self._name(aside)}: {reason}")
+        return bags, kept
 
     def _unread_in(self, window: TimeWindow, snapshot: Snapshot) -> Iterator[tuple[SetAside, str]]:
-        """Yields the files that may have messages in a window and are not read, each with why."""
+        """Yields the files that are not read and may have messages in a window, each with why."""
         for aside, bounds in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
             span = self._written.get(aside.path, bounds)
             if span is None:
@@ -301,27 +311,28 @@ class _Forget:
             elif aside.until is None and span.overlaps(window.start, window.stop - 1):
                 yield aside, aside.reason
 
-    def _may_hold(self, aside: SetAside, snapshot: Snapshot) -> TimeWindow | None:
-        """Returns what a file may hold that is being written, from the first message in it."""
+    def _span_written(self, aside: SetAside, snapshot: Snapshot) -> TimeWindow | None:
+        """Returns the times that a file being written may hold: from its first message on."""
         with suppress(BagError):
             summary = self._reader.summarize(aside.path)
             if not summary.empty:
                 return TimeWindow(summary.start, MAX_NS)
         return snapshot.unread_bounds[aside]
 
-    def _raw_bags(self, snapshot: Snapshot) -> Iterator[BagFile]:
-        """Yields the bags with all messages in them, also those that do not count."""
+    def _bags_as_on_disk(self, snapshot: Snapshot) -> Iterator[BagFile]:
+        """Yields the bags with all messages in their files, also with those that do not count."""
         handover_of = cache(read_handover)
         for bag in (*snapshot.bags, *snapshot.copies):
-            if bag.sidecar_ns and handover_of(bag.recording).handover.rule(bag.path.name):
-                try:
-                    summary = self._reader.summarize(bag.path)
-                except BagError:
-                    self._unread.add(bag.path)
-                else:
-                    start, end = summary.start, summary.end
-                    bag = bag._replace(summary=summary, start=start, end=end)  # noqa: PLW2901
-            yield bag
+            if not bag.sidecar_ns or not handover_of(bag.recording).handover.rule(bag.path.name):
+                yield bag  # all of its messages count
+                continue
+            try:
+                summary = self._reader.summarize(bag.path)
+            except BagError:
+                self._unreadable.add(bag.path)
+                yield bag
+            else:
+                yield bag._replace(summary=summary, start=summary.start, end=summary.end)
         for path in snapshot.empty:
             with suppress(BagError, OSError):
                 summary, status = self._reader.summarize(path), path.lstat()
@@ -349,8 +360,8 @@ class _Forget:
             return "it belongs to a saved moment; delete the moment's folder to forget it"
         return None
 
-    def _kept_elsewhere(self, going: Sequence[BagFile], window: TimeWindow) -> Iterator[str]:
-        """Yields what of the window remains readable without the bags that are deleted."""
+    def _copies_that_stay(self, bags: Sequence[BagFile], window: TimeWindow) -> Iterator[str]:
+        """Yields where messages of the window remain readable after the bags are deleted."""
         with suppress(BagError):
             carried = [
                 topic.topic
@@ -360,7 +371,7 @@ class _Forget:
             if carried:
                 where = f"in {self._carrier.path}: {', '.join(carried)}"
                 yield f"latched messages that later answers need, {where}"
-        if linked := _with_other_links(going):
+        if linked := _with_other_links(bags):
             yield (
                 f"{counted(len(linked), 'bag')} of these, also in saved moments or "
                 "under other names: delete the moment's folder to forget it"
@@ -374,11 +385,11 @@ class _Forget:
         """
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             snapshot = self._memory.index.refresh()
-            present = {bag[:3] for bag in self._raw_bags(snapshot)}
+            present = {_stamp(bag) for bag in self._bags_as_on_disk(snapshot)}
             bags = [
                 bag
                 for bag in planned
-                if bag[:3] in present and (self._own is None or self._own.owns_bag(bag.path))
+                if _stamp(bag) in present and (self._own is None or self._own.owns_bag(bag.path))
             ]
             kept, carried, paths = list[str](), None, {bag.path for bag in bags}
             if recorder is None:
@@ -392,17 +403,11 @@ class _Forget:
                     for path in sorted(latched)
                 ]
             kept += self._ask_lake(bags)
-            self._note_deletions(bags, kept)
-            deleted, freed = self._delete_files(bags, kept)
-            open_recordings = {
-                self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings
-            }
+            kept += self._note_deletions(bags)
+            deleted, freed, failures = self._delete_files(bags)
+            kept += failures
             recordings = {bag.recording for bag in deleted}
-            for recording in recordings - open_recordings:
-                try:
-                    remove_emptied(self._bag_dir, recording)
-                except OSError as error:
-                    kept.append(f"{self._name(recording)}: {error.strerror or error}")
+            kept += self._remove_emptied(recordings)
             try:
                 self._forget_derived(map(self._name, deleted))
             except BagError as error:
@@ -413,53 +418,69 @@ class _Forget:
             messages = counted(carried, "latched message is", "latched messages are")
             also = f"; {messages} carried on"
         print_line(f"deleted: {counted(len(deleted), 'bag')}, {format_size(freed)}{also}")
-        self._stays(kept)
+        self._print_kept(kept)
         for note in notes:
             print_line(note)
 
     def _ask_lake(self, bags: Sequence[BagFile]) -> list[str]:
-        """Has a lake forget what it has of bags; returns a line on each thing that it keeps."""
-        known, kept, times = list[ForgottenBag](), list[str](), list[Ns]()
+        """Asks the lake to forget what it has of bags; returns a line on each thing that stays."""
+        requested, kept, times = list[ForgottenBag](), list[str](), list[Ns]()
         for bag in bags:
-            if bag.path in self._unread:
+            if bag.path in self._unreadable:
                 kept.append(f"what a lake has of {self._name(bag)}, which cannot be read")
                 continue
             start = bag.summary.start
-            known.append(ForgottenBag(bag.recording.name, bag.path.name, start))
+            requested.append(ForgottenBag(bag.recording.name, bag.path.name, start))
             times += (start, bag.start, bag.end + 1)
-        if known:
-            kept += self._request_of_lake([Forgetting(min(times), max(times), bags=tuple(known))])
+        if requested:
+            request = Forgetting(min(times), max(times), bags=tuple(requested))
+            kept += self._request_of_lake([request])
         return kept
 
-    def _note_deletions(self, bags: Sequence[BagFile], kept: list[str]) -> None:
-        """Writes down what is about to be deleted, so that answers do not call it unrecorded."""
+    def _note_deletions(self, bags: Sequence[BagFile]) -> list[str]:
+        """Writes down what is about to be deleted, so that answers do not call it unrecorded.
+
+        Returns a line if that fails.
+        """
         splits: dict[Path, list[tuple[str, Ns, Ns]]] = {}
         for bag in bags:
-            named = bare_name(bag.path.name), bag.start, bag.end
-            splits.setdefault(bag.recording, []).append(named)
+            split = bare_name(bag.path.name), bag.start, bag.end
+            splits.setdefault(bag.recording, []).append(split)
+        deleted = [deleted_of(self._name(path), of_path) for path, of_path in splits.items()]
         try:
-            append_deleted(
-                self._bag_dir, [deleted_of(self._name(path), of) for path, of in splits.items()]
-            )
+            append_deleted(self._bag_dir, deleted)
         except OSError as error:
-            kept.append(f"the list of deleted bags: {error.strerror or error}")
+            return [f"the list of deleted bags: {error.strerror or error}"]
+        return []
 
-    def _delete_files(self, bags: Sequence[BagFile], kept: list[str]) -> tuple[list[BagFile], int]:
-        """Deletes bags in every form, and adds faults to `kept`.
+    def _delete_files(self, bags: Sequence[BagFile]) -> tuple[list[BagFile], int, list[str]]:
+        """Deletes bags, plain and compressed.
 
-        Returns those of which the form that counted is gone, and the bytes of all that is.
+        Returns the bags that are gone, the bytes that were freed, and a line for each failure.
         """
-        staying, freed = set[Path](), 0
-        for path in (path for bag in bags for path in (bag.path, Path(other_form(bag.file)))):
+        staying, freed, failures = set[Path](), 0, list[str]()
+        for bag in bags:
+            for path in (bag.path, Path(other_form(bag.file))):
+                try:
+                    with suppress(FileNotFoundError):
+                        status = path.lstat()
+                        inode = status.st_dev, status.st_ino
+                        freed += remove_bag(self._bag_dir, path, inode)
+                except OSError as error:
+                    failures.append(f"{self._name(path)}: {error.strerror or error}")
+                    staying.add(path)
+        return [bag for bag in bags if bag.path not in staying], freed, failures
+
+    def _remove_emptied(self, recordings: Iterable[Path]) -> list[str]:
+        """Removes the folders of recordings without bags; returns a line for each failure."""
+        failures = []
+        open_recordings = read_heartbeat(self._bag_dir).recordings
+        for recording in {*recordings} - {self._bag_dir / name for name in open_recordings}:
             try:
-                with suppress(FileNotFoundError):
-                    status = path.lstat()
-                    inode = status.st_dev, status.st_ino
-                    freed += remove_bag(self._bag_dir, path, inode)
+                remove_emptied(self._bag_dir, recording)
             except OSError as error:
-                kept.append(f"{self._name(path)}: {error.strerror or error}")
-                staying.add(path)
-        return [bag for bag in bags if bag.path not in staying], freed
+                failures.append(f"{self._name(recording)}: {error.strerror or error}")
+        return failures
 
     def _request_of_lake(self, forgettings: Sequence[Forgetting]) -> list[str]:
         """Stores what a lake has to forget; returns a line on what the lake keeps if it cannot."""
@@ -468,26 +489,24 @@ class _Forget:
         try:
             FORGOTTEN.append(self._bag_dir, forgettings)
         except OSError as error:
-            first = min(forgetting.start for forgetting in forgettings) // NS_PER_S
-            last = -(-max(forgetting.stop for forgetting in forgettings) // NS_PER_S)
+            first_s = min(forgetting.start for forgetting in forgettings) // NS_PER_S
+            last_s = -(-max(forgetting.stop for forgetting in forgettings) // NS_PER_S)
             line = (
                 f"what a lake has of it: {self._bag_dir / FORGOTTEN_FILE} cannot be written "
                 f"({error.strerror or error}); if these bags are shipped, run `ros2-memory ship "
-                f"--forget ROBOT --start {first} --end {last}` where that is done"
+                f"--forget ROBOT --start {first_s} --end {last_s}` where that is done"
             )
             return [line]
         if (self._bag_dir / SHIPPED_FILE).exists():
             print_line("the next pass of ros2-memory ship deletes it from the lake, too")
         return []
 
-    def _refresh_and_forget(self, erasure: Erasure) -> None:
+    def _forget_derived_of(self, erasure: Erasure) -> None:
         self._memory.index.refresh()
         self._forget_derived(erasure.files)
 
     def _forget_derived(self, files: Iterable[str]) -> None:
-        """Deletes what is derived from bags, by their names, and from those deleted before.
-
-        Of bags that retention deleted, something may be left.
+        """Deletes what is derived from bags: those of these names, and those deleted earlier.
 
         Raises:
             BagError: some of it may still be there.
@@ -497,28 +516,36 @@ class _Forget:
             for path in column_paths(self._settings):
                 forget_columns(path, self._bag_dir, names)
 
-    def _name(self, of: BagFile | SetAside | Path) -> str:
-        """Returns a path as people know it: relative to the bag directory, if it is in there."""
-        path = of if isinstance(of, Path) else of.path
+    def _name(self, bag: BagFile | SetAside | Path) -> str:
+        """Returns a path relative to the bag directory; one outside of it as it is."""
+        path = bag if isinstance(bag, Path) else bag.path
         return str(path).removeprefix(f"{self._bag_dir}/")
 
 
-def _span(first: Ns, last: Ns) -> str:
+def _stamp(bag: BagFile) -> tuple[str, int, Ns]:
+    return bag.file, bag.size, bag.mtime_ns
+
+
+def _describe_span(first: Ns, last: Ns) -> str:
     return f"from {format_time(unix_from_ns(first))} to {format_time(unix_from_ns(last))}"
 
 
 def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
     """Returns the bags that have further hard links, as saved moments have."""
-    linked = set()
-    for path in (bag.path for bag in bags):
+    linked = set[Path]()
+    for bag in bags:
         with suppress(OSError):
-            linked |= {path} if path.lstat().st_nlink > 1 else set()
+            if bag.path.lstat().st_nlink > 1:
+                linked.add(bag.path)
     return linked
 
 
 @contextmanager
 def _recorder_locked_out(bag_dir: Path) -> Iterator[str | None]:
-    """Keeps recorders from starting within the block; yields why one holds the lock, or None."""
+    """Keeps recorders from starting during the block.
+
+    Yields None; or, if a recorder holds the lock already, a sentence that says so.
+    """
     try:
         lock = BagDirLock.acquire(bag_dir, patience_s=0.0)
     except RecorderError as error:

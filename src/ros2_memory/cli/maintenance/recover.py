@@ -24,10 +24,10 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
 from ros2_memory.retention.delete import size_of
-from ros2_memory.retention.repair import Repairer, open_files
+from ros2_memory.retention.repair import Repaired, Repairer, open_files
 
 RECENT_NS: Final[Ns] = 30 * NS_PER_S
-"""A file that changed so lately may be being written by a program that is not known here."""
+"""An unknown program may still write a file that changed so lately."""
 
 _MCAP: Final = ".mcap"
 
@@ -52,11 +52,13 @@ def recover(
     """
 
     def confirm(folders: Sequence[Path]) -> None:
-        if others := [] if yes else [*filter(is_foreign, folders)]:
-            if as_json:
-                raise InvalidArgumentsError("--json asks nothing: give --yes, too")
-            why = "was not made by this recorder" if len(others) == 1 else "were not made by it"
-            typer.confirm(f"{listed([*map(str, others)])} {why}. Change this?", abort=True)
+        foreign = [str(folder) for folder in folders if is_foreign(folder)]
+        if yes or not foreign:
+            return
+        if as_json:
+            raise InvalidArgumentsError("--json asks nothing: give --yes, too")
+        why = "was not made by this recorder" if len(foreign) == 1 else "were not made by it"
+        typer.confirm(f"{listed(foreign)} {why}. Change this?", abort=True)
 
     outcome = recover_files(path, force=force, confirm=confirm)
     if as_json:
@@ -77,10 +79,29 @@ class RecoveryOutcome:
     messages: int = 0
     lines: list[str] = field(default_factory=list, compare=False)
 
-    def refuse(self, name: str, error: BagError) -> None:
+    def add_failure(self, name: str, error: BagError) -> None:
         """Counts a file that is not repaired."""
         self.failed += 1
         self.lines.append(f"{name}: NOT REPAIRED: {error.reason}")
+
+    def add_repair(self, name: str, repaired: Repaired | None) -> None:
+        """Counts a file by what became of it; None: it was finished before its turn came."""
+        if repaired is None:
+            self.whole += 1
+            return
+        rewritten = repaired.rewritten
+        if rewritten is None:
+            self.removed += 1
+            self.lines.append(f"{name}: empty, removed")
+            return
+        self.repaired += 1
+        self.messages += rewritten.messages
+        self.lines.append(
+            f"{name}: repaired: {counted(rewritten.messages, 'message')}, "
+            f"{rewritten.describe_loss()} "
+            f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now)"
+            f"{''.join(f'; {note}' for note in rewritten.notes)}"
+        )
 
     def summary(self) -> str:
         """Returns one line for people."""
@@ -100,72 +121,54 @@ def recover_files(
 ) -> RecoveryOutcome:
     """Repairs one file, or every MCAP file below a directory.
 
-    `force`: also what changed in the last half minute. `confirm` is shown the folders in which
-    files will change; it raises where they must not.
+    With `force` also files that changed in the last half minute. `confirm` is called with the
+    folders in which files will change, and raises if they must not.
 
     Raises:
         RecorderError: there is no such file or directory.
     """
     clock = clock or WallClock()
     files, others = _files_below(path, clock)
-    repairer, opened, done = build_repairer(), open_files(), RecoveryOutcome()
+    repairer, opened, outcome = build_repairer(), open_files(), RecoveryOutcome()
     names = {file: str(file if file == path else file.relative_to(path)) for file in files}
     unfinished: list[Path] = []
     for file in files:
         try:
             if repairer.is_whole(file):
-                done.whole += 1
+                outcome.whole += 1
             else:
                 _require_unused(file, clock.now(), opened, force=force)
                 unfinished.append(file)
         except BagError as error:
-            done.refuse(names[file], error)
+            outcome.add_failure(names[file], error)
     folders = sorted({file.parent for file in unfinished})
     confirm(folders)
     with spinner("repairing") as show:
-        for nth, file in enumerate(unfinished, start=1):
-            show(f"repairing {names[file]} ({nth} of {len(unfinished)})")
+        for number, file in enumerate(unfinished, start=1):
+            show(f"repairing {names[file]} ({number} of {len(unfinished)})")
             try:
-                done.lines.append(f"{names[file]}: {_repair(file, repairer, done)}")
+                outcome.add_repair(names[file], repairer.repair(file))
             except BagError as error:
-                done.refuse(names[file], error)
-    done.lines += filter(None, (_correct_metadata(folder, repairer) for folder in folders))
+                outcome.add_failure(names[file], error)
+    for folder in folders:
+        if line := _correct_metadata(folder, repairer):
+            outcome.lines.append(line)
     if others:
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
-        done.lines.append(f"{left} left alone: only MCAP files are repaired")
-    done.lines.append(done.summary())
-    return done
-
-
-def _repair(file: Path, repairer: Repairer, done: RecoveryOutcome) -> str:
-    """Repairs one file, and returns what was done.
-
-    Raises:
-        BagError: it cannot be repaired.
-    """
-    size, repaired = size_of(file), repairer.repair(file)
-    rewritten = None if repaired is None else repaired.rewritten
-    if rewritten is None:
-        done.removed += 1
-        return "empty, removed"
-    done.repaired += 1
-    done.messages += rewritten.messages
-    return (
-        f"repaired: {counted(rewritten.messages, 'message')}, {rewritten.describe_loss()} "
-        f"({size} bytes before, {size_of(file)} now)"
-        f"{''.join(f'; {note}' for note in rewritten.notes)}"
-    )
+        outcome.lines.append(f"{left} left alone: only MCAP files are repaired")
+    outcome.lines.append(outcome.summary())
+    return outcome
 
 
 def is_foreign(folder: Path) -> bool:
-    """Returns whether a folder is in no recorder's list of its recordings."""
+    """Returns whether no recorder has listed a recording as its own."""
     path = folder.resolve()
-    listing = next((root for root in path.parents if (root / LIST_FILE).exists()), None)
-    return listing is None or not OwnRecordings(listing).owns(path)
+    bag_dir = next((parent for parent in path.parents if (parent / LIST_FILE).exists()), None)
+    return bag_dir is None or not OwnRecordings(bag_dir).owns(path)
 
 
 def _correct_metadata(folder: Path, repairer: Repairer) -> str | None:
-    """Makes metadata.yaml describe the files of the recording; returns what was done."""
+    """Makes metadata.yaml describe the files of a recording; returns a line if something is new."""
     path = folder / METADATA_FILE
     existed = size_of(path) > 0
     try:
@@ -186,8 +189,10 @@ def _require_unused(
 ) -> None:
     """Checks that nothing writes a file, as far as that can be known.
 
+    `opened` has the device and inode of each file that a process has open.
+
     Raises:
-        BagError: something does or may write it, or its name is not that of an MCAP file.
+        BagError: a process writes it, or may; or it is empty and its name is not that of MCAP.
         BagVanishedError: it is gone.
     """
     for folder in file.absolute().parents:
@@ -213,7 +218,7 @@ def _require_unused(
 
 
 def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
-    """Returns the MCAP files to look at, and how many bags of other kinds are beside them.
+    """Returns the MCAP files at or below a path, and the number of bags of other kinds there.
 
     Raises:
         RecorderError: the path does not exist, is behind a symbolic link, or cannot be listed.
@@ -228,11 +233,11 @@ def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
         return [path], 0
     if not path.is_dir():
         raise RecorderError(f"{path}: there is no such file or directory")
-    walked = Tree(path).scan(clock.now(), ())
-    if walked.problem is not None:
-        raise RecorderError(f"{path} cannot be listed: {walked.problem}")
+    tree = Tree(path).scan(clock.now(), ())
+    if tree.problem is not None:
+        raise RecorderError(f"{path} cannot be listed: {tree.problem}")
     # A saved moment has hard links to bags, which were whole when it was saved.
     links = HardLinks(path)
-    bags = sorted(Path(name) for name in walked.stamps if not links.is_saved(name))
+    bags = sorted(Path(name) for name in tree.stamps if not links.is_saved(name))
     files = [bag for bag in bags if bag.suffix == _MCAP]
     return files, len(bags) - len(files)
