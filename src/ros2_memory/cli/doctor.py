@@ -6,7 +6,7 @@ One function for each concern; each yields findings, and changes nothing.
 import http.client
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from enum import IntEnum
 from functools import partial
@@ -33,7 +33,7 @@ from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.columns.store import relative
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
-from ros2_memory.core.model import BagState, SetAside
+from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -81,12 +81,12 @@ class Examined(NamedTuple):
 
     @property
     def records(self) -> bool:
-        """Whether bags are recorded there."""
+        """Whether a recorder is configured for the bag directory."""
         return not isinstance(self.settings.recorder, NullRecorderNode)
 
     @property
     def live(self) -> Heartbeat | None:
-        """The heartbeat of a recorder that is at work."""
+        """The heartbeat of a recorder at work; None without one."""
         heartbeat = read_heartbeat(self.settings.recording.bag_dir).heartbeat
         return heartbeat if heartbeat and heartbeat.is_live(self.now) else None
 
@@ -99,14 +99,13 @@ class Level(IntEnum):
     ERROR = 2
 
     def __str__(self) -> str:
-        """Returns it in small letters."""
         return self.name.lower()
 
 
 class Finding(NamedTuple):
-    """What was seen, and what to do about it; nothing where all is in order.
+    """What a check saw, and what to do about it; `do` is None if all is in order.
 
-    `about` is empty where it is the concern of the check.
+    `about` names a concern; if it is empty, the finding is about the concern of its check.
     """
 
     level: Level
@@ -133,16 +132,17 @@ def doctor(as_json: AsJson = False, *, bags: Bags) -> int:
         print_json({"status": str(worst), "findings": rows})
         return worst
     console = stdout_console()
-    for level, about, seen, do in findings:
-        styled = (f"{level!s:<8}", _STYLES[level]), (f"{about:<9}", "bold")
-        console.print(Text.assemble(*styled, escape(seen)), soft_wrap=True)
-        if do:
-            console.print(Text(f"{'':17}-> {escape(do)}"), soft_wrap=True)
+    for finding in findings:
+        level = f"{finding.level!s:<8}", _STYLES[finding.level]
+        about = f"{finding.about:<9}", "bold"
+        console.print(Text.assemble(level, about, escape(finding.seen)), soft_wrap=True)
+        if finding.do:
+            console.print(Text(f"{'':17}-> {escape(finding.do)}"), soft_wrap=True)
     return worst
 
 
 def _examine(bags: Bags) -> Iterator[Finding]:
-    """Yields all findings; one alone where the configuration is refused."""
+    """Yields all findings; a refused configuration is the only one."""
     try:
         settings = bags.settings()
         robots = settings.fleet.robots
@@ -156,48 +156,48 @@ def _examine(bags: Bags) -> Iterator[Finding]:
         yield Finding(Level.WARNING, "config", unused, do)
     if robots:
         for name in robots:
-            yield from _of_robot(name, settings, verbose=bags.verbose)
+            yield from _examine_robot(name, settings, verbose=bags.verbose)
         with spinner("asking the lake"):
-            yield from _findings_of({"lake": check_lake} | _OF_SETTINGS, settings)
+            yield from _run_checks({"lake": check_lake} | _OF_SETTINGS, settings)
         return
     with spinner("asking the disk, ros2, the recorder and the server"):
         robot = Examined(settings, memory, memory.index.snapshot(), memory.clock.now())
-        yield from _findings_of(_OF_BAGS, robot)
+        yield from _run_checks(_OF_BAGS, robot)
         if robot.records:
-            yield from _findings_of(_OF_RECORDER, robot)
+            yield from _run_checks(_OF_RECORDER, robot)
         else:
             yield Finding(Level.OK, "recorder", "recorder=none: nothing is recorded here")
-        yield from _findings_of(_OF_SETTINGS, settings)
+        yield from _run_checks(_OF_SETTINGS, settings)
 
 
-def _findings_of(
-    checks: Mapping[str, Callable[[T], Iterator[Finding]]], what: T
+def _run_checks(
+    checks: Mapping[str, Callable[[T], Iterator[Finding]]], subject: T
 ) -> Iterator[Finding]:
-    """Yields the findings of checks by their concerns."""
+    """Yields the findings of checks, which are given by their concerns."""
     for about, check in checks.items():
         try:
-            for finding in check(what):
+            for finding in check(subject):
                 yield finding._replace(about=finding.about or about)
         except OSError as problem:
             do = f"{_READ}; else look after the disk"
             yield Finding(Level.ERROR, about, reason_of(problem), do)
 
 
-def _of_robot(name: str, fleet: Settings, *, verbose: bool) -> Iterator[Finding]:
-    """Yields what is wrong with the places or bags of a robot of a fleet; else how many bags."""
+def _examine_robot(name: str, fleet: Settings, *, verbose: bool) -> Iterator[Finding]:
+    """Yields what is wrong with a robot of the fleet, and how many of its bags are readable."""
     try:
         own, memory = open_robot(fleet, name, verbose=verbose)
     except ConfigError as refused:
         yield Finding(Level.ERROR, "robot", f"{name}: {refused}", _CORRECT)
         return
     snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir
-    findings: Iterable[Finding]
     if snapshot.problem or not (snapshot.bags or snapshot.active):
+        seen = f"{name}: {bag_dir}: {snapshot.problem or nothing_here(snapshot)}"
         do = f"is the disk mounted? {ROBOTS_SETTING} names its directory"
-        findings = [warning(f"{bag_dir}: {snapshot.problem or nothing_here(snapshot)}", do)]
-    else:
-        findings = _findings_of(_OF_BAGS, Examined(own, memory, snapshot, memory.clock.now()))
-    for finding in findings:
+        yield Finding(Level.WARNING, "robot", seen, do)
+        return
+    robot = Examined(own, memory, snapshot, memory.clock.now())
+    for finding in _run_checks(_OF_BAGS, robot):
         if finding.level is not Level.OK or finding.about == "bags":
             yield finding._replace(about="robot", seen=f"{name}: {finding.seen}")
 
@@ -235,16 +235,16 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
     bag_dir, limits = robot.settings.recording.bag_dir.absolute(), robot.settings.retention
     existing = next(path for path in (bag_dir, *bag_dir.parents) if path.is_dir())
     mount = next(path for path in (existing, *existing.parents) if os.path.ismount(path))
-    free = shutil.disk_usage(existing).free / GB
+    free_gb = shutil.disk_usage(existing).free / GB
     budget = budget_of(robot.memory, robot.snapshot, robot.memory.index.heartbeat(), robot.now)
-    used = budget.used / GB
-    seen = f"{free:.1f} GB free on {mount}; used: {describe_budget(budget)}"
-    if free < limits.min_free_gb:
-        do = f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete "
-        yield error(seen, f"{do}other files on this disk")
-    elif free - limits.min_free_gb < limits.max_total_gb - used:
+    room_gb = free_gb - limits.min_free_gb + budget.used / GB
+    seen = f"{free_gb:.1f} GB free on {mount}; used: {describe_budget(budget)}"
+    if free_gb < limits.min_free_gb:
+        limit = f"retention.min_free_gb={limits.min_free_gb:g}"
+        yield error(seen, f"recording pauses below {limit}; delete other files on this disk")
+    elif room_gb < limits.max_total_gb:
         do = "the disk is full before the budget is: lower retention.max_total_gb to "
-        yield warning(seen, f"{do}{max(free - limits.min_free_gb + used, 0):.1f}, or make room")
+        yield warning(seen, f"{do}{max(room_gb, 0):.1f}, or make room")
     else:
         yield ok(seen)
     if leaving := describe_leaving(robot.memory.index.bag_dir):
@@ -271,7 +271,7 @@ def check_clock(robot: Examined) -> Iterator[Finding]:
 
 
 def check_bags(robot: Examined) -> Iterator[Finding]:
-    """Checks that all bags can be read, and all messages in them decoded; and what they hold."""
+    """Checks that all bags can be read, and all messages in them decoded."""
     memory, snapshot = robot.memory, robot.snapshot
     covered = data_time_range(memory, Call())
     if snapshot.problem:
@@ -283,11 +283,11 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
     else:
         do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
         yield warning(nothing_here(snapshot), do)
-    names_by_fault: dict[tuple[str, str, str], list[str]] = {}
-    for kind, wrong, do, name in _faults(memory, snapshot, covered, is_recording=bool(robot.live)):
-        names_by_fault.setdefault((kind, wrong, do), []).append(name)
-    for (kind, wrong, do), names in names_by_fault.items():
-        yield warning(f"{counted(len(names), kind)} {wrong}: {listed(names)}", do)
+    names_by_fault: dict[_Fault, list[str]] = {}
+    for fault, name in _faults(memory, snapshot, covered, is_recording=bool(robot.live)):
+        names_by_fault.setdefault(fault, []).append(name)
+    for fault, names in names_by_fault.items():
+        yield warning(f"{counted(len(names), fault.kind)} {fault.wrong}: {listed(names)}", fault.do)
     for sentence in describe_absent(memory.absent_splits(snapshot)):
         yield warning(sentence, "copy the missing data from its source")
     for sentence in describe_mixed(memory, Call()):
@@ -298,44 +298,53 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         yield warning(sentence.removesuffix(ADVICE), do)
 
 
+class _Fault(NamedTuple):
+    """What is wrong with files, bags or topics (`kind`), and what to do about it."""
+
+    kind: str
+    wrong: str
+    do: str
+
+
 def _faults(
     memory: Memory, snapshot: Snapshot, covered: DataTimeRange, *, is_recording: bool
-) -> Iterator[tuple[str, str, str, str]]:
-    """Yields what has a fault (a file, bag or topic), what it is, what to do, and a name."""
-    for bag in covered.unread:
-        yield "file", "not read", bag.reason, bag.path.name
-    for state, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):
-        for bag in files:
-            yield "file", state, _remedy(bag, memory), f"{bag.path.name} ({bag.reason})"
+) -> Iterator[tuple[_Fault, str]]:
+    """Yields each fault, with the name of the file, bag or topic that has it."""
+    for unread in covered.unread:
+        yield _Fault("file", "not read", unread.reason), unread.path.name
+    for wrong, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):
+        for file in files:
+            fault = _Fault("file", wrong, _remedy(file, memory))
+            yield fault, f"{file.path.name} ({file.reason})"
     for active in () if is_recording else snapshot.active:
-        yield "file", "without an end, and changed lately, so not read", _WAIT, active.path.name
-    for odd in bags_with_remarks(snapshot):
-        name = f"{odd.path.name} ({'; '.join(odd.summary.notes)})"
-        do = "nothing is missing: what it states of itself is wrong, not its messages"
-        if is_whole(odd):
-            yield "bag", "in contradiction with what is in it", do, name
-        else:
-            do = "answers use the readable part; copy the bags again for the rest"
-            yield "bag", "not whole", do, name
+        wrong = "without an end, and changed lately, so not read"
+        yield _Fault("file", wrong, _WAIT), active.path.name
+    for bag in bags_with_remarks(snapshot):
+        wrong = "not whole"
+        do = "answers use the readable part; copy the bags again for the rest"
+        if is_whole(bag):
+            wrong = "in contradiction with what is in it"
+            do = "nothing is missing: what it states of itself is wrong, not its messages"
+        yield _Fault("bag", wrong, do), f"{bag.path.name} ({'; '.join(bag.summary.notes)})"
     for topic in covered.undecodable:
         do = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
-        if _MSG_FOLDERS in topic.reason:  # where a configured folder would help
+        if _MSG_FOLDERS in topic.reason:  # a definition is missing
             do = f"name the folder with the .msg files in {_MSG_FOLDERS}"
-        yield "topic", "cannot be decoded", do, f"{topic.topic} ({topic.reason})"
+        yield _Fault("topic", "cannot be decoded", do), f"{topic.topic} ({topic.reason})"
 
 
-def _remedy(bag: SetAside, memory: Memory) -> str:
-    """Returns what to do about a file; `ros2-memory recover` repairs MCAP without an end."""
-    if not os.access(bag.path, os.R_OK):
+def _remedy(file: SetAside, memory: Memory) -> str:
+    """Returns what to do about a file that cannot be read to its end."""
+    if not os.access(file.path, os.R_OK):
         return _READ
     with suppress(BagError):
-        if bag.path.suffix == ".mcap" and memory.reader.closing(bag.path) is Closing.OPEN:
+        if file.path.suffix == ".mcap" and memory.reader.closing(file.path) is Closing.OPEN:
             return f"ros2-memory recover {memory.index.bag_dir}"
     return "copy them again from their source; what is so there, too, cannot be read"
 
 
 def check_columns(robot: Examined) -> Iterator[Finding]:
-    """Checks that columns can be stored, and names topics that are beyond their share."""
+    """Checks that columns can be stored, and names the topics that take more than their share."""
     store = robot.memory.scanner.store
     if store is None:
         return
@@ -372,98 +381,96 @@ def check_recorder(robot: Examined) -> Iterator[Finding]:
         yield error("it waits, and has recorded nothing", str(heartbeat.waiting_for))
     else:
         yield ok(f"{heartbeat.state}, {counted(len(heartbeat.subscribed), 'topic')} subscribed")
-        yield from _reported(heartbeat)
+        yield from _check_topics_of(heartbeat)
+        yield from _check_rules_and_files_of(heartbeat)
+        yield from _check_last_error_of(heartbeat)
 
 
-def _reported(beat: Heartbeat) -> Iterator[Finding]:
-    """Yields what a recorder that records reports of itself."""
-    for seen in required_missing(beat):
+def _check_topics_of(heartbeat: Heartbeat) -> Iterator[Finding]:
+    """Yields the topics that a running recorder does not receive."""
+    for seen in required_missing(heartbeat):
         yield error(seen, "are their publishers running? compare recording.required")
-    for seen in unrecorded(beat):
+    for seen in unrecorded(heartbeat):
         do = (
             "name the workspace of an unknown type in recorder.setup_files; compare the others "
             "with `ros2 topic echo`"
         )
         yield warning(seen, do)
-    silent = sorted({*beat.silent} - {*beat.unheard, *beat.fell_silent})
-    missing = f"in its list, and offered by no publisher: {listed(beat.missing)}"
-    failing = listed(beat.failing_rules) if beat.failing_rules else ""
-    for finding, reported, do in (
-        (
-            warning,
-            beat.missing and missing,
+    if heartbeat.missing:
+        yield warning(
+            f"in its list, and offered by no publisher: {listed(heartbeat.missing)}",
             "are their publishers running? compare with `ros2 topic list`",
-        ),
-        (
-            warning,
-            f"subscribed, but no messages from: {listed(silent)}" if silent else "",
-            (
-                "is their publisher running? If it runs as another user, the recorder receives it "
-                "only over the network: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in "
-                "the discovery range LOCALHOST that has no effect, see docs/how-to/systemd.md"
-            ),
-        ),
-        (
-            warning,
-            beat.age_held,
-            "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds",
-        ),
-        (
-            warning,
-            beat.unshipped,
-            "does ros2-memory ship run? raise retention.max_total_gb until it has caught up",
-        ),
-        (error, beat.list_refused, "correct the list of topics"),
-        (
-            error,
-            failing and (beat.held_back or failing),
-            (
-                "correct the rule in the file that recording.exclude_when names, and restart the "
-                "recorder: it then reads the splits that are held back; see docs/how-to/forget.md"
-            ),
-        ),
-        (
-            warning,
-            "" if failing else beat.held_back,
-            "free the disk, or repair the file; docs/how-to/forget.md says what becomes of it",
-        ),
-    ):
-        if reported:
-            yield finding(reported, do)
-    if beat.last_error:
-        when = "" if beat.last_error_at is None else f" ({iso_local(beat.last_error_at)})"
-        seen = f"its last error{when}: {beat.last_error}"
-        if beat.restarts:
-            times = counted(beat.restarts, "time")
-            seen = f"it restarted ros2 bag record {times}; {seen}"
-        if beat.recovered:
-            yield ok(f"recording goes on since; {seen}")
-        else:
-            yield warning(seen, "see its log")
+        )
+    silent = {*heartbeat.silent} - {*heartbeat.unheard, *heartbeat.fell_silent}
+    if silent:
+        do = (
+            "is their publisher running? If it runs as another user, the recorder receives it "
+            "only over the network: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in "
+            "the discovery range LOCALHOST that has no effect, see docs/how-to/systemd.md"
+        )
+        yield warning(f"subscribed, but no messages from: {listed(sorted(silent))}", do)
+
+
+def _check_rules_and_files_of(heartbeat: Heartbeat) -> Iterator[Finding]:
+    """Yields why a running recorder keeps, holds back or does not take what it should."""
+    if heartbeat.age_held:
+        do = "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds"
+        yield warning(heartbeat.age_held, do)
+    if heartbeat.unshipped:
+        do = "does ros2-memory ship run? raise retention.max_total_gb until it has caught up"
+        yield warning(heartbeat.unshipped, do)
+    if heartbeat.list_refused:
+        yield error(heartbeat.list_refused, "correct the list of topics")
+    if heartbeat.failing_rules:
+        do = (
+            "correct the rule in the file that recording.exclude_when names, and restart the "
+            "recorder: it then reads the splits that are held back; see docs/how-to/forget.md"
+        )
+        yield error(heartbeat.held_back or listed(heartbeat.failing_rules), do)
+    elif heartbeat.held_back:
+        do = "free the disk, or repair the file; docs/how-to/forget.md says what becomes of it"
+        yield warning(heartbeat.held_back, do)
+
+
+def _check_last_error_of(heartbeat: Heartbeat) -> Iterator[Finding]:
+    """Yields the last error of a running recorder."""
+    if not heartbeat.last_error:
+        return
+    at = heartbeat.last_error_at
+    seen = f"its last error{'' if at is None else f' ({iso_local(at)})'}: {heartbeat.last_error}"
+    if heartbeat.restarts:
+        times = counted(heartbeat.restarts, "time")
+        seen = f"it restarted ros2 bag record {times}; {seen}"
+    if heartbeat.recovered:
+        yield ok(f"recording goes on since; {seen}")
+    else:
+        yield warning(seen, "see its log")
 
 
 def check_shipping(robot: Examined) -> Iterator[Finding]:
-    """Checks, where age waits until bags are shipped, whether they are."""
-    settings, _, snapshot, now = robot
-    if not settings.retention.require_shipped:
+    """Checks that bags are shipped, if age deletes only shipped ones (`require_shipped`)."""
+    if not robot.settings.retention.require_shipped:
         return
-    bag_dir = settings.recording.bag_dir
+    bag_dir = robot.settings.recording.bag_dir
     receipts = read_receipts(bag_dir)
-    closed = [
-        (name, bag)
-        for bag in snapshot.bags
-        if bag.state is BagState.CLOSED and not is_carried(bag.path)
-        if not (name := relative(bag.file, str(bag_dir))).startswith(f"{MOMENTS_FOLDER}/")
-    ]
-    waiting = [bag for name, bag in closed if not is_shipped(receipts, name, bag.size)]
+    closed: list[BagFile] = []
+    waiting: list[BagFile] = []
+    for bag in robot.snapshot.bags:
+        name = relative(bag.file, str(bag_dir))
+        is_moment = name.startswith(f"{MOMENTS_FOLDER}/")
+        if bag.state is not BagState.CLOSED or is_carried(bag.path) or is_moment:
+            continue
+        closed.append(bag)
+        if not is_shipped(receipts, name, bag.size):
+            waiting.append(bag)
     newest = max((receipt.at for receipt in receipts.values()), default=None)
     seen = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
     if newest is None:
         seen += ", and there is no receipt: no bag is deleted for its age"
     else:
         seen += f"; the newest receipt is from {iso_local(newest)}"
-    latest = now - _LATE_NS
-    if min((bag.end for bag in waiting), default=now) < latest and (newest or 0) < latest:
+    late = robot.now - _LATE_NS
+    if any(bag.end < late for bag in waiting) and (newest or 0) < late:
         do = "does ros2-memory ship run, and may it write here? `doctor` there looks after it"
         yield warning(seen, do)
     else:
@@ -471,7 +478,7 @@ def check_shipping(robot: Examined) -> Iterator[Finding]:
 
 
 def check_lake(settings: Settings) -> Iterator[Finding]:
-    """Checks, where bags are shipped, whether that can work; and whether the lake is reached."""
+    """Checks that the lake is reached, and that receipts can be written on the robots."""
     if settings.lake.warehouse is None:
         return
     try:
@@ -486,16 +493,18 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         yield warning(f"{location.warehouse} has no bag yet", do)
     else:
         yield ok(f"{location.warehouse}; its newest commit is from {iso_local(committed)}")
-    for name, bag_dir in settings.fleet.robots.items() if settings.lake.engine is None else ():
-        where = bag_dir / SHIPPED_FILE, bag_dir / OWN_FOLDER, bag_dir
-        path = next((path for path in where if path.exists()), bag_dir)
+    if settings.lake.engine is not None:  # this server only asks the lake
+        return
+    for name, bag_dir in settings.fleet.robots.items():
+        candidates = bag_dir / SHIPPED_FILE, bag_dir / OWN_FOLDER, bag_dir
+        path = next((path for path in candidates if path.exists()), bag_dir)
         if has_recorded(bag_dir) and not os.access(path, os.W_OK):
             seen = (
                 f"{name}: {path} is read-only here: no receipts can be written, so "
                 "retention.require_shipped can never work on that robot"
             )
             do = "mount it writable for the user of ros2-memory ship, or do not require it"
-            yield warning(seen, do)._replace(about="robot")
+            yield Finding(Level.WARNING, "robot", seen, do)
 
 
 def check_ros(robot: Examined) -> Iterator[Finding]:
@@ -503,8 +512,7 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
     settings, recorder = robot.settings, robot.settings.recorder
     setup_files = () if isinstance(recorder, NullRecorderNode) else recorder.setup_files
     try:
-        # A check uses none of them.
-        unused = dict.fromkeys(("housekeeper", "own", "background"))
+        unused = dict.fromkeys(("housekeeper", "own", "background"))  # by `check`
         reader = robot.memory.reader
         build_recorder(settings, reader=reader, keep_open=(), excluding={}, **unused).check()
     except EpisodicError as problem:
@@ -524,7 +532,8 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
 
 def check_topics(robot: Examined) -> Iterator[Finding]:
     """Checks that each entry of `topics.yaml` has been recorded, or is received."""
-    file, live, recorded = _list_file(robot.settings), robot.live, robot.snapshot.timeline.topics()
+    file, live = _topics_file(robot.settings), robot.live
+    recorded = robot.snapshot.timeline.topics()
     try:
         selection = load_topics(file)
     except EpisodicError as problem:
@@ -559,8 +568,8 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
         yield warning(f"{entry} is in {file}, and was never recorded", f"{hint}{do}")
 
 
-def _list_file(settings: Settings) -> Path:
-    """Returns the list of topics that the recorder has: what `up` wrote, where none was chosen."""
+def _topics_file(settings: Settings) -> Path:
+    """Returns the list of topics in use: if none was chosen, the one that `up` wrote."""
     chosen = settings.recording.topics_file
     written = settings.recording.bag_dir / chosen.name
     is_shipped = chosen.absolute() == (config_dir(os.environ) / chosen.name).absolute()

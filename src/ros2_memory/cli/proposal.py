@@ -26,7 +26,7 @@ LISTED_BYTES: Final = 342
 
 
 class Choice(StrEnum):
-    """What becomes of a topic."""
+    """Whether a topic is recorded."""
 
     RECORD = "record"
     ASK = "tick?"  # it is left to a person
@@ -34,7 +34,7 @@ class Choice(StrEnum):
 
 
 class Verdict(NamedTuple):
-    """What is proposed of a topic, and why where it is not simply recorded."""
+    """What is proposed for a topic, and the reason if it is not simply recorded."""
 
     choice: Choice
     reason: str = ""
@@ -59,12 +59,12 @@ class Offered:
 
 @dataclass(frozen=True, slots=True)
 class Disk:
-    """What decides how much the recorded topics take on the disk.
+    """The settings and measurements that decide how much recorded topics take on the disk.
 
     Attributes:
         ratio: compressed bytes of a byte.
-        fixed_bytes: what a file of no message has: definitions, and metadata.
-        columns_share: what is stored beside the bags, as a part of them.
+        fixed_bytes: the size of a file without messages: definitions, and metadata.
+        columns_share: the bytes that are stored beside the bags, as a part of theirs.
         keep_days: after so many days bags are deleted in any case.
     """
 
@@ -77,36 +77,34 @@ class Disk:
     keep_days: float
 
     def bytes_per_day(self, topics: Iterable[Offered]) -> float:
-        """Estimates the bytes that the messages of these topics take in a day, without files."""
-        return sum(
-            self._rate(topic)
-            * ((topic.payload_bytes + MESSAGE_BYTES) * self.ratio + INDEX_BYTES)
-            * DAY_S
-            * (1 + self.columns_share)
-            for topic in topics
-        )
+        """Estimates the bytes of the messages of a day, without `file_bytes_per_day`."""
+        per_second = 0.0
+        for topic in topics:
+            # Each recording has the newest message of a latched topic.
+            is_state = topic.latched and topic.messages == 1
+            hz = 1 / self.session_s if is_state else topic.hz
+            message_bytes = (topic.payload_bytes + MESSAGE_BYTES) * self.ratio + INDEX_BYTES
+            per_second += hz * message_bytes
+        return per_second * DAY_S * (1 + self.columns_share)
 
     @property
     def file_bytes_per_day(self) -> float:
-        """The bytes that files take in a day which record all the time, whatever is in them."""
-        in_each = self.fixed_bytes + LISTED_BYTES * self.session_s / self.split_s / 2
-        return DAY_S / self.split_s * in_each * (1 + self.columns_share)
+        """The bytes of the files of a day, without their messages, if it records all the time."""
+        splits_listed = self.session_s / self.split_s / 2  # on average
+        file_bytes = self.fixed_bytes + LISTED_BYTES * splits_listed
+        return DAY_S / self.split_s * file_bytes * (1 + self.columns_share)
 
     def days(self, topics: Iterable[Offered]) -> float:
         """Estimates the days of recording that the budget holds."""
         return self.budget_bytes / (self.bytes_per_day(topics) + self.file_bytes_per_day)
 
-    def _rate(self, topic: Offered) -> float:
-        # Of a latched topic each recording has the newest message.
-        return 1 / self.session_s if topic.latched and topic.messages == 1 else topic.hz
-
 
 Proposal: TypeAlias = "dict[Offered, Verdict]"
-"""All topics, each with what is proposed of it."""
+"""The verdict on each topic."""
 
 
-def chosen(proposal: Proposal, choice: Choice) -> list[Offered]:
-    """Returns the topics of which this is proposed."""
+def select(proposal: Proposal, choice: Choice) -> list[Offered]:
+    """Returns the topics with this verdict."""
     return [topic for topic, verdict in proposal.items() if verdict.choice is choice]
 
 
@@ -144,7 +142,7 @@ _GRID: Final = "nav_msgs/msg/OccupancyGrid"
 
 
 def judge(topics: Collection[Offered]) -> Proposal:
-    """Returns what is proposed of each topic, whatever the budget is."""
+    """Returns the verdict on each topic by its type and name, whatever the budget is."""
     names = {topic.topic for topic in topics}
     return {topic: _verdict_on(topic, names) for topic in topics}
 
@@ -161,27 +159,29 @@ def _verdict_on(topic: Offered, names: Collection[str]) -> Verdict:
 
 
 def propose(topics: Collection[Offered], disk: Disk) -> Proposal:
-    """Returns what is proposed of each topic.
+    """Returns the verdict on each topic, within the budget.
 
-    Where the budget does not hold `disk.keep_days`, scans and other raw readings that take more
-    than `SCAN_SHARE` of the list are left out.
+    If the budget does not last `disk.keep_days`, scans and other raw readings that take more than
+    `SCAN_SHARE` of the recorded bytes are left out.
     """
     proposal = judge(topics)
-    recorded = chosen(proposal, Choice.RECORD)
-    days, in_all = disk.days(recorded), disk.bytes_per_day(recorded)
-    for topic in recorded if days < disk.keep_days else ():
-        share = disk.bytes_per_day([topic]) / (in_all or 1)
+    recorded = select(proposal, Choice.RECORD)
+    days, total = disk.days(recorded), disk.bytes_per_day(recorded)
+    if days >= disk.keep_days:
+        return proposal
+    for topic in recorded:
+        share = disk.bytes_per_day([topic]) / (total or 1)
         if _RAW.match(topic.type) and share > SCAN_SHARE:
             why = f"{share:.0%} of a list of which the budget would hold {days:.1f} days"
             proposal[topic] = Verdict(Choice.LEAVE, why)
     return proposal
 
 
-def topics_yaml(proposal: Proposal, head: str) -> str:
-    """Returns a `topics.yaml` with a comment on top; what a person has to tick is a comment."""
-    lines = [f"# Proposed by `ros2-memory up`, and yours to change: {head}", "topics:"]
+def topics_yaml(proposal: Proposal, estimate: str) -> str:
+    """Returns a `topics.yaml` with a comment on top; topics for a person to tick are comments."""
+    lines = [f"# Proposed by `ros2-memory up`, and yours to change: {estimate}", "topics:"]
     for choice, tick in ((Choice.RECORD, "- "), (Choice.ASK, "# - ")):
-        for topic in chosen(proposal, choice):
-            why = proposal[topic].reason
-            lines.append(f"  {tick}{topic.topic}  # {topic.type}{f': {why}' if why else ''}")
+        for topic in select(proposal, choice):
+            reason = proposal[topic].reason
+            lines.append(f"  {tick}{topic.topic}  # {topic.type}{f': {reason}' if reason else ''}")
     return "\n".join((*lines, ""))

@@ -38,9 +38,9 @@ from ros2_memory.cli.proposal import (
     Disk,
     Offered,
     Proposal,
-    chosen,
     judge,
     propose,
+    select,
     topics_yaml,
 )
 from ros2_memory.config import NullRecorderNode, config_dir, is_deployment_chosen
@@ -92,13 +92,13 @@ _LOGGING: Final = ("logging.level=warning", "logging.format=pretty")
 
 
 class Survey(NamedTuple):
-    """What was found.
+    """The topics that a robot offers, measured.
 
     Attributes:
-        topics: those that others offer, in the order of their names.
-        unknown_types: names of topics that cannot be recorded, for want of their definition.
+        topics: by name; without those that a recorder offers itself.
+        unknown_types: topics that cannot be recorded, because their type is not installed.
         ratio: compressed bytes of a byte, over all that was recorded.
-        fixed_bytes: what a file without a message has.
+        fixed_bytes: the size of a file without messages.
     """
 
     topics: Sequence[Offered]
@@ -108,7 +108,7 @@ class Survey(NamedTuple):
 
 
 class _Robot(NamedTuple):
-    """What was found on this machine; `words` are the settings for the recorder and the server."""
+    """ROS 2 and the files of this machine; `words` are settings for the recorder and the server."""
 
     ros: Installation
     bag_dir: Path
@@ -134,7 +134,9 @@ def up(
     A topics.yaml that is there is used, and never changed.
     """
     script = _install_script() if install else None
-    words = [*([] if is_deployment_chosen(words or []) else ["deployment=robot"]), *(words or [])]
+    words = [*(words or ())]
+    if not is_deployment_chosen(words):
+        words.insert(0, "deployment=robot")
     settings, sources = load_for(bag_dir, words)
     if isinstance(settings.recorder, NullRecorderNode) or settings.server.transport == "stdio":
         raise ConfigError(
@@ -150,10 +152,10 @@ def up(
     robot = _find_robot(settings.recorder.setup_files, bags, list_file, words)
     print_line(f"{robot.ros.ros2}, {robot.where}, bags in {robot.bag_dir}")
     with spinner("looking which topics there are, and measuring them"):
-        measured = survey(robot.ros, build_reader(settings), settings.recorder.chunk_bytes)
+        survey = survey_topics(robot.ros, build_reader(settings), settings.recorder.chunk_bytes)
     disk = Disk(
-        ratio=measured.ratio,
-        fixed_bytes=measured.fixed_bytes,
+        ratio=survey.ratio,
+        fixed_bytes=survey.fixed_bytes,
         split_s=settings.recording.split_duration_s,
         session_s=settings.recording.session_duration_s,
         columns_share=settings.store.max_share if settings.store.enabled else 0.0,
@@ -161,32 +163,32 @@ def up(
         keep_days=settings.retention.max_age_h / 24,
     )
     if robot.list_file.exists():
-        _show_list(robot, measured, disk)
+        _show_list(robot, survey, disk)
     else:
-        _require_messages(robot, measured)
-        _write_proposal(robot, measured, disk, yes=yes)
-    is_open = not settings.memory.keep and sources("memory.keep").startswith("in ")
-    if is_open and _may_keep_memory(bags, yes=yes):
+        _require_messages(robot, survey)
+        _write_proposal(robot, survey, disk, yes=yes)
+    is_undecided = not settings.memory.keep and sources("memory.keep").startswith("in ")
+    if is_undecided and _may_keep_memory(bags, yes=yes):
         robot.words.append("memory.keep=true")
         if script is None:  # else the folder would not be that of the service's user
             (bags / MEMORY_FOLDER).mkdir(exist_ok=True)
     if script is not None:
-        _hand_over(script, robot)
+        _become_installer(script, robot)
     return _run_programs(robot.words, robot.bag_dir)
 
 
 def _find_robot(
-    setup_files: Sequence[Path], bags: Path, list_file: Path, words: list[str]
+    setup_files: Sequence[Path], bags: Path, list_file: Path, words: Sequence[str]
 ) -> _Robot:
     """Finds ROS 2, and makes the folder of the bags.
 
     Raises:
         ConfigError: the environment is refused.
-        RecorderError: there is no ROS 2, or nothing can be recorded there.
+        RecorderError: ROS 2 is not found, or the folder cannot be written.
     """
     setup_files = setup_files_here(setup_files, os.environ)
     ros = find_installation(setup_files, bags / ROS_LOG_DIR)
-    given_variables(ros.env)  # A setup file may set ROS_DOMAIN_ID.
+    given_variables(ros.env)  # a setup file may set ROS_DOMAIN_ID
     make_bag_dir(bags)
     if not os.access(bags, os.W_OK | os.X_OK):
         raise RecorderError(
@@ -194,22 +196,22 @@ def _find_robot(
             "run as the user who owns it"
         )
     files = ",".join(quoted(str(file.absolute())) for file in setup_files)
-    more = [
+    own_words = [
         f"recording.bag_dir={quoted(str(bags))}",
         f"recording.topics_file={quoted(str(list_file))}",
         f"recorder.setup_files=[{files}]",
     ]
-    return _Robot(ros, bags, list_file, [*words, *more])
+    return _Robot(ros, bags, list_file, [*words, *own_words])
 
 
-def _require_messages(robot: _Robot, measured: Survey) -> None:
-    """Checks that there is something to propose, and that it can be received.
+def _require_messages(robot: _Robot, survey: Survey) -> None:
+    """Checks that topics are offered, and that their messages are received.
 
     Raises:
-        RecorderError: there is not; the sentence says what to do.
+        RecorderError: they are not; the sentence says what to do.
     """
-    light = chosen(judge(measured.topics), Choice.RECORD)
-    if not measured.topics and not measured.unknown_types:
+    light = select(judge(survey.topics), Choice.RECORD)
+    if not survey.topics and not survey.unknown_types:
         advice = advice_on_rmw(robot.ros.env)
         raise RecorderError(
             f"no topic is offered in {robot.where} (waited {LOOK_S:g} s); start the robot's nodes, "
@@ -224,15 +226,15 @@ def _require_messages(robot: _Robot, measured: Survey) -> None:
         )
 
 
-def _write_proposal(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -> None:
+def _write_proposal(robot: _Robot, survey: Survey, disk: Disk, *, yes: bool) -> None:
     """Shows the proposal, asks, and writes it.
 
     Raises:
         RecorderError: nothing is proposed, or the list cannot be written.
     """
-    proposal = propose(measured.topics, disk)
-    recorded = chosen(proposal, Choice.RECORD)
-    takes = _print_topics(proposal, disk, recorded, measured)
+    proposal = propose(survey.topics, disk)
+    recorded = select(proposal, Choice.RECORD)
+    _print_topics(proposal, disk, recorded, survey)
     if not recorded:
         raise RecorderError(
             "nothing of this is proposed; write a list of topics, and name it with "
@@ -242,7 +244,7 @@ def _write_proposal(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -
         question = f"Write {counted(len(recorded), 'topic')} to {robot.list_file}, and record?"
         typer.confirm(question, default=True, abort=True)
     try:
-        write_durably(robot.list_file, topics_yaml(proposal, takes))
+        write_durably(robot.list_file, topics_yaml(proposal, _describe_estimate(disk, recorded)))
     except OSError as error:
         raise RecorderError(
             f"{robot.list_file} cannot be written: {error.strerror or error}; name another file "
@@ -252,7 +254,7 @@ def _write_proposal(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -
 
 
 def _may_keep_memory(bags: Path, *, yes: bool) -> bool:
-    """Returns whether something of the bags is to outlive them: only a person says so, once."""
+    """Returns whether `memory.keep` may be set: if it was before, or a person now says so."""
     if (bags / MEMORY_FOLDER).is_dir():
         print_line(f"{bags / MEMORY_FOLDER} goes on: memory.keep=false would delete it")
         return True
@@ -264,54 +266,63 @@ def _may_keep_memory(bags: Path, *, yes: bool) -> bool:
     return False
 
 
-def _show_list(robot: _Robot, measured: Survey, disk: Disk) -> None:
-    """Shows what a list that is there selects, and what it lacks.
+def _show_list(robot: _Robot, survey: Survey, disk: Disk) -> None:
+    """Shows which topics an existing list selects, and which it lacks.
 
     Raises:
-        ConfigError: it is refused.
+        ConfigError: the list is refused.
     """
     selection = load_topics(robot.list_file)
-    proposal = propose(measured.topics, disk)
-    recorded = [topic for topic in measured.topics if selection.matches(topic.topic)]
-    _print_topics(proposal, disk, recorded, measured)
+    proposal = propose(survey.topics, disk)
+    recorded = [topic for topic in survey.topics if selection.matches(topic.topic)]
+    _print_topics(proposal, disk, recorded, survey)
     print_line(f"{robot.list_file} is used as it is")
-    missing = [topic.topic for topic in chosen(proposal, Choice.RECORD) if topic not in recorded]
+    missing = [topic.topic for topic in select(proposal, Choice.RECORD) if topic not in recorded]
     if missing:
         print_line(f"it lacks, of what would be proposed: {', '.join(missing)}")
 
 
-def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], measured: Survey) -> str:
-    """Prints a line for each topic, and returns the estimate, as a sentence, after printing it."""
+def _print_topics(
+    proposal: Proposal, disk: Disk, recorded: Sequence[Offered], survey: Survey
+) -> None:
+    """Prints a line for each topic, what the recorded ones take, and topics of unknown types."""
     width = max((len(topic.topic) for topic in proposal), default=0)
-    for topic, (choice, reason) in proposal.items():
-        sign = "record" if topic in recorded else choice.replace("record", "-")
-        rate = f"{topic.hz:8.3g} Hz {topic.payload_bytes:7.0f} B" if topic.messages else ""
-        daily = f"{format_size(disk.bytes_per_day([topic]))} a day" if topic.messages else ""
-        detail = f"{topic.type}{f': {reason}' if reason and topic not in recorded else ''}"
+    for topic, verdict in proposal.items():
+        sign, detail = "record", topic.type
+        if topic not in recorded:
+            sign = "-" if verdict.choice is Choice.RECORD else verdict.choice
+            detail += f": {verdict.reason}" if verdict.reason else ""
+        rate = daily = ""
+        if topic.messages:
+            rate = f"{topic.hz:8.3g} Hz {topic.payload_bytes:7.0f} B"
+            daily = f"{format_size(disk.bytes_per_day([topic]))} a day"
         print_line(escape(f"  {sign:<7}{topic.topic:<{width}}{rate:<21}{daily:>17}  {detail}"))
+    print_line(_describe_estimate(disk, recorded))
+    if survey.unknown_types:
+        print_line(
+            f"ros2 bag record does not know the types of {listed(survey.unknown_types)}; name "
+            "the setup.bash of their workspace, too: recorder.setup_files=[FILE,FILE]"
+        )
+
+
+def _describe_estimate(disk: Disk, recorded: Sequence[Offered]) -> str:
+    """Returns a sentence on the bytes that topics take a day, and how long the budget lasts."""
     files = disk.file_bytes_per_day
     silent = [topic.topic for topic in recorded if not topic.messages]
-    takes = (
+    return (
         f"about {format_size(disk.bytes_per_day(recorded) + files)} a day"
         f"{f' without {listed(silent)}' if silent else ''}, {format_size(files)} of it for files "
         f"of {disk.split_s:g} s: the budget of {format_size(disk.budget_bytes)} "
         f"(retention.max_total_gb) holds {disk.days(recorded):.3g} days; bags are deleted after "
         f"{disk.keep_days:g} days (retention.max_age_h)"
     )
-    print_line(takes)
-    if measured.unknown_types:
-        print_line(
-            f"ros2 bag record does not know the types of {listed(measured.unknown_types)}; name "
-            "the setup.bash of their workspace, too: recorder.setup_files=[FILE,FILE]"
-        )
-    return takes
 
 
 def _install_script() -> Path:
-    """Returns the path of deploy/install.sh.
+    """Returns the path of deploy/install.sh in this clone or the working directory.
 
     Raises:
-        ConfigError: it is not here.
+        ConfigError: neither has it.
     """
     for folder in (Path(__file__).resolve().parents[3], Path.cwd()):
         script = folder / "deploy/install.sh"
@@ -320,8 +331,8 @@ def _install_script() -> Path:
     raise ConfigError("deploy/install.sh is not here; run `up --install` in a clone of ros2-memory")
 
 
-def _hand_over(script: Path, robot: _Robot) -> None:
-    """Becomes deploy/install.sh, which installs the services with this list of topics."""
+def _become_installer(script: Path, robot: _Robot) -> None:
+    """Replaces this process by deploy/install.sh, which installs services for this list."""
     print_line(f"to be set in /etc/ros2-memory/environment: {robot.words[-1]}")
     program = "sudo" if os.geteuid() else "env"
     argv = [program, f"PYTHON={sys.executable}", str(script), "--topics", str(robot.list_file)]
@@ -330,20 +341,20 @@ def _hand_over(script: Path, robot: _Robot) -> None:
 
 
 def _run_programs(words: Sequence[str], bag_dir: Path) -> bool:
-    """Records and serves until Ctrl-C, and returns whether a program ended itself, or did not end.
+    """Records and serves until Ctrl-C; ends both programs, and waits for them, in any case.
 
-    Whatever happens, both are ended, and waited for.
+    Returns whether a program ended by itself, or could not be ended.
     """
     # A shell that starts this in the background has it ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     programs: dict[str, Child] = {}
     died = ""
-    modules = {"recorder": ["recorder"], "server": ["server", "--page", "print"]}
+    modules = {"recorder": [], "server": ["--page", "print"]}
     try:
-        for name, (module, *options) in modules.items():
-            argv = ["-P", "-m", f"ros2_memory.{module}", *options, *words, *_LOGGING]
+        for name, options in modules.items():
+            argv = ["-P", "-m", f"ros2_memory.{name}", *options, *words, *_LOGGING]
             programs[name] = Child.start([sys.executable, *argv], os.environ, patience=_PATIENCE)
-        died = _watch(programs, bag_dir)
+        died = _show_until_one_ends(programs, bag_dir)
     except KeyboardInterrupt:
         pass
     finally:
@@ -358,89 +369,110 @@ def _run_programs(words: Sequence[str], bag_dir: Path) -> bool:
     return bool(left or died)
 
 
-def _watch(programs: Mapping[str, Child], bag_dir: Path) -> str:
-    """Shows what comes in, until a program ends; returns which one, and its last words."""
-    before, due_s = "", 0.0
-    last = dict.fromkeys(programs, "it gave no reason")
+def _show_until_one_ends(programs: Mapping[str, Child], bag_dir: Path) -> str:
+    """Shows what is recorded until a program ends; returns which one, and its last line."""
+    shown, due_s = "", 0.0
+    last_line = dict.fromkeys(programs, "it gave no reason")
     while True:
         for name, child in programs.items():
             status = child.exit_status()
             for line in filter(None, map(escape, child.take_lines())):
                 if "http://" not in line:  # the address of the page is no reason
-                    last[name] = line
+                    last_line[name] = line
                 print_line(f"{name}: {line}")
             if status is not None:
-                return f"the {name} ended with status {status}: {last[name]}"
-        beat = read_heartbeat(bag_dir).heartbeat
-        if beat is not None and beat.pid == programs["recorder"].pid:
-            heard = len({*beat.subscribed} - {*beat.silent})
-            if before != (before := f"{beat.state} {heard}") or time.monotonic() >= due_s:
-                due_s = time.monotonic() + EVERY_S
-                print_line(escape(_line_of(beat, heard)))
+                return f"the {name} ended with status {status}: {last_line[name]}"
+        heartbeat = read_heartbeat(bag_dir).heartbeat
+        if heartbeat is not None and heartbeat.pid == programs["recorder"].pid:
+            topics = len({*heartbeat.subscribed} - {*heartbeat.silent})
+            state = f"{heartbeat.state} {topics}"
+            if state != shown or time.monotonic() >= due_s:
+                shown, due_s = state, time.monotonic() + EVERY_S
+                print_line(escape(_describe_recorder(heartbeat, topics)))
         time.sleep(_TICK_S)
 
 
-def _line_of(beat: Heartbeat, heard: int) -> str:
-    """Returns a line on what the recorder does, and on how many topics it has heard."""
-    for_s = unix_from_ns(WallClock().now() - beat.since)
-    line = f"recorder: {beat.state} for {format_duration(for_s)}, {counted(heard, 'topic')}"
-    why = beat.waiting_for or (None if beat.recovered else beat.last_error)
-    if beat.silent:
-        line += f", silent: {listed(beat.silent)}"
-    return f"{line}, {format_size(beat.bytes_written)}{f'; {why}' if why else ''}"
+def _describe_recorder(heartbeat: Heartbeat, topics: int) -> str:
+    """Returns a line on the recorder's state, and the number of topics that it receives."""
+    for_s = unix_from_ns(WallClock().now() - heartbeat.since)
+    line = f"recorder: {heartbeat.state} for {format_duration(for_s)}, {counted(topics, 'topic')}"
+    if heartbeat.silent:
+        line += f", silent: {listed(heartbeat.silent)}"
+    line += f", {format_size(heartbeat.bytes_written)}"
+    why = heartbeat.waiting_for or (None if heartbeat.recovered else heartbeat.last_error)
+    return f"{line}; {why}" if why else line
 
 
-def survey(ros: Installation, reader: BagReader, chunk_bytes: int) -> Survey:
+def survey_topics(ros: Installation, reader: BagReader, chunk_bytes: int) -> Survey:
     """Finds out which topics there are, and how much comes on each, by two short real recordings.
 
     The first is paused: it lists all topics with their types, and writes no message. The second
-    records those that are not left out by their type, for some seconds and a bounded number of
-    bytes. Must be called from the main thread, as every child is.
+    records those whose types are light, for some seconds and a bounded number of bytes. Must be
+    called from the main thread, as every child is.
 
     Raises:
-        BagError: what was recorded cannot be read.
+        BagError: a recording cannot be read.
         RecorderError: `ros2 bag record` fails; the sentence has its last words.
     """
     with TemporaryDirectory(prefix="ros2-memory-up-") as name:
         folder = Path(name)
         (folder / "qos.yaml").write_text(yaml.safe_dump({"/tf_static": ALL_MESSAGES}))
         (folder / "storage.yaml").write_text(storage_config(chunk_bytes))
-        unknown, empty = _record(
-            ros, folder / "look", _EVERYTHING, QUIET_S, options=("--start-paused",)
-        )
+        empty = _record(ros, folder / "look", _EVERYTHING, QUIET_S, options=("--start-paused",))
         offered = {
             channel.topic: Offered(
                 channel.topic, re.sub(r"[^\w/]", "?", channel.type), channel.latched
             )
-            for channel in reader.channels(empty)
+            for channel in reader.channels(empty.file)
             if not _OWN.match(channel.topic)
         }
         # Neither pixels nor what people say is recorded even now.
-        light = tuple(topic.topic for topic in chosen(judge(offered.values()), Choice.RECORD))
-        fixed, ratio = empty.stat().st_size, 1.0
+        light = tuple(topic.topic for topic in select(judge(offered.values()), Choice.RECORD))
+        fixed, ratio = empty.file.stat().st_size, 1.0
         if light:
-            _, bag = _record(ros, folder / "measure", TopicSelection(light), SECONDS, light)
-            ratio = _measure(reader, bag, offered, fixed)
-    return Survey([offered[topic] for topic in sorted(offered)], sorted(unknown), ratio, fixed)
+            bag = _record(ros, folder / "measure", TopicSelection(light), SECONDS, light).file
+            topics, ratio = _measure(reader, bag, offered, fixed)
+            offered |= topics
+    topics_by_name = [offered[topic] for topic in sorted(offered)]
+    return Survey(topics_by_name, sorted(empty.unknown_types), ratio, fixed)
 
 
-def _measure(reader: BagReader, bag: Path, offered: dict[str, Offered], fixed: int) -> float:
-    """Adds to the topics how they came in a bag; returns by how much the bag is compressed."""
+def _measure(
+    reader: BagReader, bag: Path, offered: Mapping[str, Offered], fixed_bytes: int
+) -> tuple[dict[str, Offered], float]:
+    """Returns the topics in a bag with their rates and sizes, and how much the bag is compressed.
+
+    That is the compressed bytes of a byte, from `LEAST_RATIO` to 1.
+    """
     sizes, times = defaultdict[str, list[int]](list), defaultdict[str, list[Ns]](list)
     for batch in reader.batches(bag, offered, TimeWindow.everything()):
         sizes[batch.channel.topic] += batch.sizes.tolist()
         times[batch.channel.topic] += batch.log_times.tolist()
     end = max(map(max, times.values()), default=0)
+    measured: dict[str, Offered] = {}
+    messages = payload_bytes = 0
     for topic, payloads in sizes.items():
         # A topic is heard from its first message on: others may have been subscribed to before.
         span_s = unix_from_ns(end - min(times[topic]))
         count, total = len(payloads), sum(payloads)
         hz = (count - 1) / span_s if count > 1 and span_s else 1 / max(span_s, 1.0)
-        offered[topic] = replace(offered[topic], messages=count, hz=hz, payload_bytes=total / count)
-    count = sum(map(len, sizes.values()))
-    payload = sum(map(sum, sizes.values())) + count * MESSAGE_BYTES
-    stored = bag.stat().st_size - fixed - INDEX_BYTES * count
-    return min(max(stored / payload, LEAST_RATIO), 1.0) if payload else 1.0
+        measured[topic] = replace(
+            offered[topic], messages=count, hz=hz, payload_bytes=total / count
+        )
+        messages += count
+        payload_bytes += total
+    if not messages:
+        return measured, 1.0
+    stored = bag.stat().st_size - fixed_bytes - INDEX_BYTES * messages
+    ratio = stored / (payload_bytes + MESSAGE_BYTES * messages)
+    return measured, min(max(ratio, LEAST_RATIO), 1.0)
+
+
+class _Recording(NamedTuple):
+    """A short recording: its file, and the topics whose types are not installed."""
+
+    file: Path
+    unknown_types: set[str]
 
 
 def _record(
@@ -451,16 +483,17 @@ def _record(
     expected: Collection[str] = (),
     *,
     options: Sequence[str] = (),
-) -> tuple[set[str], Path]:
-    """Records until all that is expected (else anything) came, and nothing new for `quiet_s`.
+) -> _Recording:
+    """Records until all expected topics (or any) are subscribed, and no further one for `quiet_s`.
 
-    Returns the topics of unknown types, and the file.
+    Raises:
+        RecorderError: `ros2 bag record` ended by itself, or wrote no file.
     """
     argv = record_argv(
         ros2=ros.ros2,
         directory=directory,
         topics=topics,
-        split_duration_s=3600,
+        split_duration_s=3600,  # longer than any of these recordings
         qos_file=directory.with_name("qos.yaml"),
         storage_file=directory.with_name("storage.yaml"),
         node_name="ros2_memory_up",
@@ -468,31 +501,31 @@ def _record(
         known_options=ros.options,
     )
     child = Child.start([*argv, *options], {**ros.env, "ROS_LOG_DIR": str(directory.parent)})
-    heard: dict[LineKind, set[str]] = {LineKind.SUBSCRIBED: set(), LineKind.UNKNOWN_TYPE: set()}
+    subscribed, unknown_types = set[str](), set[str]()
+    topics_by_kind = {LineKind.SUBSCRIBED: subscribed, LineKind.UNKNOWN_TYPE: unknown_types}
     lines: list[str] = []
     began = changed = time.monotonic()
     try:
         while child.exit_status() is None and time.monotonic() < began + LOOK_S + quiet_s:
             for line in map(parse_line, child.take_lines()):
                 lines.append(line.text)
-                if line.topic and line.kind in heard and not _OWN.match(line.topic):
-                    heard[line.kind].add(line.topic)
+                if line.topic and line.kind in topics_by_kind and not _OWN.match(line.topic):
+                    topics_by_kind[line.kind].add(line.topic)
                     changed = time.monotonic()
-            subscribed = heard[LineKind.SUBSCRIBED]
             has_all = subscribed and subscribed.issuperset(expected)
             if has_all and time.monotonic() > changed + quiet_s:
                 break
             if sum(file.stat().st_size for file in directory.glob("*")) > MAX_BYTES:
                 break
             time.sleep(_POLL_S)
-        failed = child.exit_status()
+        status = child.exit_status()
     finally:
         end_all([child])
     file = next(directory.glob("*.mcap"), None)
-    if failed is not None or file is None:
+    if status is not None or file is None:
         words = "; ".join([*lines, *child.take_lines()][-3:])
         raise RecorderError(
-            f"ros2 bag record ended by itself (status {failed}): {words}; `ros2-memory doctor` "
+            f"ros2 bag record ended by itself (status {status}): {words}; `ros2-memory doctor` "
             "checks the installation"
         )
-    return heard[LineKind.UNKNOWN_TYPE], file
+    return _Recording(file, unknown_types)

@@ -8,9 +8,9 @@ from ros2_memory.cli.proposal import (
     Choice,
     Disk,
     Offered,
-    chosen,
     judge,
     propose,
+    select,
 )
 
 DISK = Disk(
@@ -135,6 +135,6 @@ def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> Non
     large = replace(DISK, budget_bytes=100e9)
     assert propose([ODOM, SCAN], large)[SCAN].choice is Choice.RECORD
     left = propose([ODOM, SCAN], DISK)
-    assert chosen(left, Choice.RECORD) == [ODOM]
+    assert select(left, Choice.RECORD) == [ODOM]
     assert left[SCAN].choice is Choice.LEAVE
     assert left[SCAN].reason == "70% of a list of which the budget would hold 0.9 days"

@@ -40,9 +40,9 @@ NICENESS: Final = 15
 
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _BATCH: Final = 4096
-"""Bags stored before the program looks which others closed meanwhile, among all that wait."""
+"""Bags that are tried before it looks again which bags wait: others closed meanwhile."""
 _FOLLOWED: Final = 4
-"""Batches stored before what follows from them is made: of four hours it is still in the cache."""
+"""Batches that are stored before what derives from them: four hours are still in the cache."""
 _CACHE_MB: Final = 32
 _RARELY: Final = (50_000, 20, 100)
 """Thresholds of `gc`: columns make no cycles, and the index of a week has many objects."""
@@ -67,7 +67,7 @@ def index(
         _fill_for_server(settings, for_server)
         return
     robots = settings.fleet.robots
-    done: dict[str, dict[str, int]] = {}
+    rows: dict[str, dict[str, int]] = {}
     problems: list[str] = []
     for name in robots or ("",):
         try:
@@ -77,19 +77,27 @@ def index(
                 raise
             problems.append(f"{name}: {error}")
             continue
-        bags, stored, refused = progress.closed, progress.stored, progress.refused
-        done[name] = {"bags": bags, "stored": stored, "refused": refused}
+        rows[name] = {
+            "bags": progress.closed,
+            "stored": progress.stored,
+            "refused": progress.refused,
+        }
         if not as_json:
             of_robot = f" of {name}" if robots else ""
             print(f"{describe_progress(progress)}{of_robot}", file=sys.stderr)
     if as_json:
-        print_json(done if robots else done[""])
+        print_json(rows if robots else rows[""])
     if problems:
         raise RecorderError("; ".join(problems))
 
 
 def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progress:
-    """Fills the store of a robot of a fleet, or of the only one without a name."""
+    """Fills the store of a robot of the fleet; without a fleet the name is empty.
+
+    Raises:
+        ConfigError: no columns are stored, or nowhere can they be.
+        RecorderError: the bag directory cannot be read.
+    """
     settings, memory = open_robot(settings, robot, verbose=verbose, cache_mb=_cache_mb(settings))
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
@@ -102,7 +110,7 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
             "set XDG_CACHE_HOME to a writable folder"
         )
     with spinner("storing columns") as show:
-        return _filled(backfill, lambda progress: show(describe_progress(progress)))
+        return _fill_and_close(backfill, lambda progress: show(describe_progress(progress)))
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
@@ -114,15 +122,17 @@ def _fill_for_server(settings: Settings, server: int) -> None:
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
     shared = shared_parts(settings, cache_mb=_cache_mb(settings))
-    _filled(build_backfill(settings, build_memory(settings, shared)))
+    _fill_and_close(build_backfill(settings, build_memory(settings, shared)))
 
 
 def _cache_mb(settings: Settings) -> int:
-    """Returns what a cache may take, in MiB: of ten minutes at a time all is read together."""
+    """Returns the size of the cache in MiB: filling reads the columns of ten minutes together."""
     return min(_CACHE_MB, settings.store.cache_mb)
 
 
-def _filled(backfill: Backfill, show: Callable[[Progress], None] = lambda _: None) -> Progress:
+def _fill_and_close(
+    backfill: Backfill, show: Callable[[Progress], None] = lambda _: None
+) -> Progress:
     """Fills the store, and closes it, so that nothing stays in its write-ahead log."""
     try:
         return fill_store(backfill, show)
@@ -139,16 +149,16 @@ def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: 
     goes_on = True
     while goes_on:
         progress = backfill.progress()
-        done = tried = 0
-        for nth, batch in enumerate(backfill.batches(), start=1):
+        stored = tried = 0
+        for number, batch in enumerate(backfill.batches(), start=1):
             if tried >= _BATCH:
                 break
-            show(replace(progress, stored=min(progress.stored + done, progress.closed)))
+            show(replace(progress, stored=min(progress.stored + stored, progress.closed)))
             tried += len(batch.bags)
-            done += backfill.store(batch)
-            if nth % _FOLLOWED == 0:
+            stored += backfill.store(batch)
+            if number % _FOLLOWED == 0:
                 backfill.follow()
-        goes_on = backfill.follow() or done > 0
+        goes_on = backfill.follow() or stored > 0
     backfill.prune()
     backfill.precompute()
     return backfill.progress()

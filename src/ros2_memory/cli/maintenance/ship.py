@@ -53,31 +53,32 @@ def ship(
     ros2-memory[lake].
     """
     settings, _ = load_for(None, overrides)
-    window = _window_of(forget, times)
+    window = _window_to_forget(forget, times)
     share_one_arena()
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
     # The extra is there: `lake_location` has checked that.
     from ros2_memory.lake.warehouse import writing_alone  # noqa: PLC0415
 
-    shown = settings.logging.level if verbose or not (once or forget) else "warning"
-    configure_logging(shown, settings.logging.format)
+    goes_on = not once and forget is None
+    level = settings.logging.level if verbose or goes_on else "warning"
+    configure_logging(level, settings.logging.format)
     with writing_alone(location.state_dir):
-        shipping = _Shipping(settings, location, robots)
-        if forget is None and not once:
-            shipping.go_on(partial(_new_robots, overrides, shared))
+        service = _ShippingService(settings, location, robots)
+        if goes_on:
+            service.run(partial(_new_robots, overrides, shared))
         location.claim()
         if forget is not None and window is not None:
             return _forget(location, forget, window, robots, as_json=as_json)
-        with shipping.shipper() as shipper:
+        with service.open_shipper() as shipper:
             done = shipper.run()
-            shipper.keep_up(shipping.grace)
-    rows, bags = counted(done.rows, "row"), counted(done.bags, "bag")
-    waiting = f"; {counted(done.waiting, 'bag waits', 'bags wait')}" if done.waiting else ""
-    keys = ("bags", "rows", "forgotten", "waiting", "problems")
+            shipper.keep_up(service.grace)
     if as_json:
+        keys = ("bags", "rows", "forgotten", "waiting", "problems")
         print_json({key: getattr(done, key) for key in keys})
     else:
+        rows, bags = counted(done.rows, "row"), counted(done.bags, "bag")
+        waiting = f"; {counted(done.waiting, 'bag waits', 'bags wait')}" if done.waiting else ""
         print_line(f"shipped {bags} ({rows}){waiting}")
         if done.forgotten:
             print_line(f"forgotten as on the robot: {counted(done.forgotten, 'bag')}")
@@ -87,11 +88,11 @@ def ship(
     return bool(done.waiting or done.problems)
 
 
-def _window_of(robot: str | None, times: Times) -> TimeWindow | None:
-    """Returns the time to forget, if any.
+def _window_to_forget(robot: str | None, times: Times) -> TimeWindow | None:
+    """Returns the window to forget; None without --forget.
 
     Raises:
-        InvalidArgumentsError: a part of it is missing, or is no time.
+        InvalidArgumentsError: a robot or an end of the window is missing, or is no time.
     """
     if robot is None and times == Times():
         return None
@@ -108,7 +109,9 @@ def _forget(
     *,
     as_json: bool,
 ) -> bool:
-    """Forgets a time of a robot in the lake, and prints what is gone.
+    """Forgets a window of a robot in the lake, and prints what is gone.
+
+    Returns whether something of it stays.
 
     Raises:
         InvalidArgumentsError: neither the lake nor the settings know the robot; nothing is done.
@@ -124,8 +127,10 @@ def _forget(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
                 f"{listed(sorted(names))}"
             )
-        of_robot = (configured for configured in robots if configured.name == robot)
-        stored = [why for configured in of_robot for why in configured.forget([window])]
+        failures: list[str] = []
+        for configured in robots:
+            if configured.name == robot:
+                failures += configured.forget([window])
         append_tombstone(location.state_dir, tombstone, done=False)
         gone = forget_in_lake(lake, tombstone)
     kept_by = [*gone.kept_by]
@@ -135,13 +140,13 @@ def _forget(
         bags = counted(gone.bags, "bag")
         print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
         print_notes([f"a branch or tag keeps an older version: {name}" for name in kept_by])
-    print_notes(stored)
+    print_notes(failures)
     _note_versions(location)
-    return bool(kept_by or stored)
+    return bool(kept_by or failures)
 
 
 def _note_versions(location: "LakeLocation") -> None:
-    """Prints, after something was forgotten, what a bucket may still have of it."""
+    """Notes that a bucket may keep versions of objects that were deleted."""
     if not location.warehouse.startswith("file:"):
         print_notes(["where the bucket keeps versions of deleted objects, those are not erased"])
 
@@ -155,25 +160,30 @@ def _wait(seconds: float) -> None:
 
 
 @dataclass
-class _Shipping:
-    """What ships the bags of robots.
+class _ShippingService:
+    """Ships the bags of robots into a lake.
 
-    `committed_s` is when it last began a commit, by the monotonic clock.
+    Attributes:
+        committed_s: when it last began a commit, by the monotonic clock.
+        kept_up_s: when it last tidied the lake, by the monotonic clock.
+        reported: the problems of the last pass, which were logged.
     """
 
     settings: Settings
     location: "LakeLocation"
     robots: "Sequence[RobotBags]"
     committed_s: float = -math.inf
+    kept_up_s: float = -math.inf
+    reported: "Sequence[str]" = ()
 
     @property
     def grace(self) -> Ns:
-        """How long files that no table names stay."""
+        """How long files stay that no table names."""
         return ns_from_unix(self.settings.lake.grace_h * 3600)
 
     @contextmanager
-    def shipper(self) -> "Iterator[Shipper]":
-        """Yields what ships, after what was forgotten is gone."""
+    def open_shipper(self) -> "Iterator[Shipper]":
+        """Opens the lake, finishes what was begun to be forgotten, and yields a shipper."""
         from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415
         from ros2_memory.lake.upkeep import forget_in_lake, read_tombstones  # noqa: PLC0415
 
@@ -192,54 +202,61 @@ class _Shipping:
             )
 
     def _before_commit(self, is_full: bool) -> None:
-        """Waits until enough time has passed since the last commit, but with no full batch.
+        """Waits until `lake.commit_interval_s` has passed since the last commit.
 
-        More than a batch may come in that time: to wait with each would never keep up.
+        Not before the commit of a full batch: more than a batch may come in that time.
         """
         if not is_full:
             _wait(self.committed_s + self.settings.lake.commit_interval_s - time.monotonic())
         self.committed_s = time.monotonic()
         self.location.claim()
 
-    def go_on(self, new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]") -> NoReturn:
+    def run(self, new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]") -> NoReturn:
         """Ships until the process is stopped; a lake that fails is tried again.
 
-        `new_robots` returns those that are in the settings now, besides the ones that it is given.
+        `new_robots` returns the robots of the settings that are not among the given ones.
         """
         notify(READY)
         log.info("shipping", robots=len(self.robots), warehouse=self.location.warehouse)
-        reported: list[str] = []
-        kept_up_s = -math.inf
         while True:
             try:
                 self.location.claim()
-                with self.shipper() as shipper:
-                    new: Sequence[RobotBags] = ()
-                    while not new:
-                        problems = shipper.run().problems
-                        is_due = time.monotonic() - kept_up_s >= _UPKEEP_S
-                        if is_due:
-                            self.location.claim()
-                            shipper.keep_up(self.grace)
-                            kept_up_s = time.monotonic()
-                        for problem in problems:
-                            if problem not in reported:
-                                log.warning("not_shipped", reason=problem)
-                        reported = problems
-                        if is_due:
-                            new = new_robots(self.robots)
-                        if not new:
-                            _wait(self.settings.reader.index_refresh_s)
+                with self.open_shipper() as shipper:
+                    new = self._ship_until_new(shipper, new_robots)
                     self.robots = [*self.robots, *new]
             except LakeError as error:
                 log.warning("lake_failed", reason=str(error))
                 _wait(_RETRY_S)
 
+    def _ship_until_new(
+        self,
+        shipper: "Shipper",
+        new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]",
+    ) -> "Sequence[RobotBags]":
+        """Ships, and once an hour tidies the lake, until there are new robots; returns these."""
+        while True:
+            problems = shipper.run().problems
+            is_due = time.monotonic() - self.kept_up_s >= _UPKEEP_S
+            if is_due:
+                self.location.claim()
+                shipper.keep_up(self.grace)
+                self.kept_up_s = time.monotonic()
+            for problem in problems:
+                if problem not in self.reported:
+                    log.warning("not_shipped", reason=problem)
+            self.reported = problems
+            if is_due and (new := new_robots(self.robots)):
+                return new
+            _wait(self.settings.reader.index_refresh_s)
+
 
 def _new_robots(
     overrides: Overrides, shared: "SharedParts", robots: "Sequence[RobotBags]"
 ) -> "Sequence[RobotBags]":
-    """Returns the robots of the settings that were not there before: a pattern may match more."""
+    """Loads the settings again, and returns the robots that are not among `robots`.
+
+    `fleet.robots` may be a pattern, which matches more folders than before.
+    """
     try:
         settings, _ = load_for(None, overrides)
         names = {robot.name for robot in robots}
