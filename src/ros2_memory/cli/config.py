@@ -36,9 +36,10 @@ def config_show(
     """
     settings, source = load_given(bag_dir, words)
     values = dict(leaves(plain_values(settings)))
-    if as_json:
-        rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}
-        print_json(rows if sources else values)
+    if as_json and sources:
+        print_json({key: {"value": value, "set": source(key)} for key, value in values.items()})
+    elif as_json:
+        print_json(values)
     elif sources:
         _print_sources(values, source)
     else:
@@ -53,12 +54,16 @@ def config_show(
 
 
 def _print_sources(values: Mapping[str, JsonValue], source: Sources) -> None:
-    """Prints a row for each group's choice and for each key: its name, who set it, its value."""
+    """Prints the option of each group and the value of each key, with who set it."""
     print_line(f"# files are those of {source.folder}")
-    chosen = {group: source.choice(group) for group in GROUPS}
     rows: list[JsonValue] = []
-    for key, (value, who) in (chosen | {key: (values[key], source(key)) for key in values}).items():
-        set_by = who.replace(f"in {source.folder}/", "")
+
+    def add(key: str, value: JsonValue, set_by: str) -> None:
         text = value if isinstance(value, str) else json.dumps(value)
-        rows.append({"key": key, "set": set_by, "value": text})
+        rows.append({"key": key, "set": set_by.replace(f"in {source.folder}/", ""), "value": text})
+
+    for group in GROUPS:
+        add(group, *source.choice(group))
+    for key, value in values.items():
+        add(key, value, source(key))
     print_reply(rows)

@@ -55,16 +55,16 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
         print_json(rows)
     elif rows:
         print_reply([{key: row[key] for key in row if key != "notes"} for row in rows])
-        # What is wrong with one bag is noted on each topic in it.
-        notes = {note: row.topic for row in topic_rows for note in row.notes}
-        print_notes(f"{topic}: {note}" for note, topic in notes.items())
+        # A note on a bag is on each topic in the bag.
+        topic_by_note = {note: row.topic for row in topic_rows for note in row.notes}
+        print_notes(f"{topic}: {note}" for note, topic in topic_by_note.items())
     else:
         _print_nothing(memory)
     return not rows
 
 
 def _print_nothing(memory: Memory) -> None:
-    """Prints that nothing here is recorded, or can be read, and why."""
+    """Prints why there is no bag to show, and the files that cannot be read."""
     snapshot = memory.index.snapshot()
     print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
     for aside in (*snapshot.damaged, *snapshot.unread):
@@ -72,7 +72,7 @@ def _print_nothing(memory: Memory) -> None:
 
 
 def _row_with_rate(topic: TopicRow, snapshot: Snapshot, latching: Latching) -> JsonObject:
-    """Returns a topic's row as the tool has it, with its rate: planners read that elsewhere."""
+    """Returns the row that `list_recorded_topics` replies, with the rate and all notes."""
     row = shown(topic, Scope())
     if topic.undecodable:
         row["undecodable"] = topic.undecodable
@@ -88,54 +88,61 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     settings = bags.settings("server.max_reply_chars=1000000000", "server.tools=all")
     robots = settings.fleet.robots
     reports: dict[str, dict[str, JsonObject]] = {}
-    are_bags = False
+    has_bags = False
     for name in robots or ("",):
         own, memory = open_robot(settings, name, verbose=bags.verbose)
         reports[name] = report = _report(own, memory)
-        are_bags |= bool(memory.index.snapshot().bags)
+        has_bags = has_bags or bool(memory.index.snapshot().bags)
         if robots and not as_json:
             stdout_console().rule(name, align="left")
         if not as_json:
-            _show(memory, report)
+            _print_report(memory, report)
     if as_json:
         print_json(reports if robots else reports[""])
-    return not are_bags
+    return not has_bags
 
 
 def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
-    """Returns what is recorded in one bag directory: replies of two tools, and how much it is."""
+    """Returns the amount of data in a bag directory, and the replies of two tools."""
     report = {"held": _amount_recorded(memory.index.snapshot())}
     for tool in ("memory_status", "data_time_range"):
         report[tool] = json.loads(call_once(build_dispatcher(settings, memory), tool, {}).text)
     return report
 
 
-def _show(memory: Memory, report: Mapping[str, JsonObject]) -> None:
-    """Prints a report for people."""
+def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
+    """Prints a report for people, without keys that are empty or say what another says."""
     snapshot = memory.index.snapshot()
-    aside = (snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
-    if not any((snapshot.bags, *aside)):
+    files = (snapshot.bags, snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
+    if not any(files):
         _print_nothing(memory)
         return
-    shown = _for_people({key: value for part in report.values() for key, value in part.items()})
+    values: JsonObject = {}
+    for part in report.values():
+        values |= part
+    left_out = _TOLD_TWICE if values["recorder"] is not None else _TOLD_TWICE | _OF_RECORDER
+    for key, value in [*values.items()]:
+        is_empty = value in ([], 0) and key != "earliest"  # a clock may begin at 0
+        if key in left_out or is_empty:
+            del values[key]
     budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
-    if budget.most is not None:  # bags that are only looked at have none
-        shown["budget"] = describe_budget(budget)
+    if budget.most is not None:  # bags of other programs have no budget
+        values["budget"] = describe_budget(budget)
     if snapshot.silent_topics:
         topics = sorted(snapshot.silent_topics)
-        shown["topics_without_messages"] = listed(topics, at_most=_MOST_SILENT)
-    print_reply(cut_lists(shown, shown))
+        values["topics_without_messages"] = listed(topics, at_most=_MOST_SILENT)
+    print_reply(cut_lists(values, values))
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:
-    """Returns how much is recorded, as `ros2 bag info` does."""
+    """Returns counts and sizes of what is recorded, as `ros2 bag info` does."""
     bags, first, last = snapshot.bags, snapshot.earliest, snapshot.latest
-    span = None if first is None or last is None else round(unix_from_ns(last - first), 3)
+    span_s = None if first is None or last is None else round(unix_from_ns(last - first), 3)
     amount: JsonObject = {
         "recordings": len(recordings_of(snapshot)),
         "bags": len(bags),
         "storage": storage_of(bags) or None,
-        "duration_s": span,
+        "duration_s": span_s,
         "messages": sum(bag.summary.count for bag in bags),
         "topics": len(snapshot.timeline.topics()),
         "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
@@ -148,22 +155,13 @@ def _amount_recorded(snapshot: Snapshot) -> JsonObject:
 
 
 def storage_of(bags: Sequence[BagFile]) -> str:
-    """Returns the kinds of bags: `mcap`, or `db3, mcap`."""
-    return ", ".join(sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags}))
-
-
-def _for_people(reply: JsonObject) -> JsonObject:
-    """Returns a reply without keys that are empty or repeated, or about a missing recorder."""
-    left_out = _TOLD_TWICE if reply["recorder"] is not None else _TOLD_TWICE | _OF_RECORDER
-    return {
-        key: value
-        for key, value in reply.items()
-        if key not in left_out and (value not in ([], 0) or key == "earliest")
-    }
+    """Returns the kinds of bags, as `mcap` or `db3, mcap`."""
+    kinds = {bag_kind(bag.path.name) or "" for bag in bags}
+    return ", ".join(sorted(kind.removeprefix(".") for kind in kinds))
 
 
 def describe_budget(budget: Budget) -> str:
-    """Returns how much of the budget the bags take, and what is beside them; how long it lasts."""
+    """Returns how much of the budget is used, by what, and how many days it lasts."""
     text = (
         f"{format_size(budget.used)} of {format_size(budget.most or 0)}: "
         f"bags {format_size(max(budget.used - budget.state, 0))}, "
@@ -195,28 +193,34 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     """
     memory = bags.memory()
     snapshot, root = memory.index.snapshot(), memory.index.bag_dir
-    rows, not_read = [*_rows(snapshot, root)], [*_not_read(snapshot, root)]
+    rows, not_read = [*_recording_rows(snapshot, root)], [*_files_not_read(snapshot, root)]
     is_empty = not (rows or snapshot.damaged or snapshot.unread)
     if as_json:
         print_json([*rows, *not_read])
     elif is_empty:
         _print_nothing(memory)
     else:
-        # For people there is the length.
-        short = [{key: row[key] for key in row if key != "end"} for row in rows]
-        lists: JsonObject = {"recordings": [*short], "not_read": [*not_read]}
-        print_reply({title: rows for title, rows in lists.items() if rows})
+        for row in rows:
+            del row["end"]  # people see the length
+        lists: JsonObject = {"recordings": [*rows], "not_read": [*not_read]}
+        print_reply({title: entries for title, entries in lists.items() if entries})
     return is_empty
 
 
-def _rows(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
+def _recording_rows(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
     """Yields the recordings, the oldest first."""
     own = OwnRecordings(root)
-    for path, bags in sorted(recordings_of(snapshot).items(), key=lambda pair: pair[1][0].start):
+    bags_by_folder = recordings_of(snapshot)
+    for path in sorted(bags_by_folder, key=lambda path: bags_by_folder[path][0].start):
+        bags = bags_by_folder[path]
         start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
-        whose = "saved moment" if Path(path).is_relative_to(root / MOMENTS_FOLDER) else None
-        with suppress(OSError):  # where the list cannot be read, nobody knows
-            whose = whose or ("this recorder" if own.owns_bag(bags[0].path) else "another recorder")
+        whose = None
+        if Path(path).is_relative_to(root / MOMENTS_FOLDER):
+            whose = "saved moment"
+        else:
+            with suppress(OSError):  # where the list cannot be read, nobody knows
+                is_own = own.owns_bag(bags[0].path)
+                whose = "this recorder" if is_own else "another recorder"
         yield {
             "recording": name_of(path, bags, str(root)),
             "start": unix_from_ns(start),
@@ -231,9 +235,10 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
         }
 
 
-def _not_read(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
-    """Yields the files without any message that is read."""
-    reasons = {aside.path: aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
-    for path in sorted({*reasons, *snapshot.empty}):
-        reason = reasons.get(path, "no message was recorded")
-        yield {"file": str(path).removeprefix(f"{root}/"), "reason": reason}
+def _files_not_read(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
+    """Yields the files of which no message is read, each with the reason."""
+    reasons = dict.fromkeys(snapshot.empty, "no message was recorded")
+    for aside in (*snapshot.damaged, *snapshot.unread):
+        reasons[aside.path] = aside.reason
+    for path in sorted(reasons):
+        yield {"file": str(path).removeprefix(f"{root}/"), "reason": reasons[path]}

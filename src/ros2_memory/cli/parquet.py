@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -49,6 +49,7 @@ _GROUP_ROWS: Final = 20_000
 """Rows of a row group: some megabytes."""
 _AS_JSON: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
 _DAY_NS: Final = 86_400 * NS_PER_S
+_NO_ORIENTATION: Final = (None,) * 4
 _NO_POSE: Final = (None,) * 7
 _MAX_OPEN_FILES: Final = 16
 """Messages come in time order, so few recordings are written at a time."""
@@ -58,42 +59,51 @@ Row = tuple[object, ...]
 
 
 class _PartFile:
-    """One file being written; messages are buffered for a row group."""
+    """A Parquet file that is being written; rows are buffered for a row group."""
 
     def __init__(self, path: Path) -> None:
-        self.rows: list[Row] = []
+        self._rows: list[Row] = []
         self._writer = pq.ParquetWriter(path, SCHEMA, compression="zstd")
 
-    def flush(self) -> None:
-        """Writes what is buffered as a row group."""
-        if self.rows:
-            columns = dict(zip(SCHEMA.names, zip(*self.rows, strict=True), strict=True))
-            self._writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
-            self.rows.clear()
+    def add(self, row: Row) -> None:
+        """Adds a row, and writes a row group if the buffer is full."""
+        self._rows.append(row)
+        if len(self._rows) >= _GROUP_ROWS:
+            self._write_group()
 
     def close(self) -> None:
-        """Writes what is buffered, and ends the file."""
-        self.flush()
+        """Writes the buffered rows, and ends the file."""
+        if self._rows:
+            self._write_group()
         self._writer.close()
+
+    def _write_group(self) -> None:
+        columns = dict(zip(SCHEMA.names, zip(*self._rows, strict=True), strict=True))
+        self._writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
+        self._rows.clear()
 
 
 class Dataset:
-    """Writes messages as rows, and counts the rows and the files.
+    """Writes messages as rows of partitioned Parquet files.
 
     Args:
         root: the folder; partitions that exist already are refused.
-        robot: the name of a further partition, so that many robots share a dataset; not one of
-            bags that have none.
+        reader: decodes the messages.
+        extractor: reads values and poses of decoded messages.
+        robot: the name of a further partition, so that many robots share a dataset; None for a
+            dataset of one robot.
 
     Attributes:
-        undecoded: the types of messages of which rows have no value.
+        rows: the number of rows written.
+        files: the number of files written.
+        undecoded: the types of messages whose rows have no value.
     """
 
     def __init__(
         self, root: Path, reader: BagReader, extractor: SchemaExtractor, robot: str | None
     ) -> None:
-        self._dataset = root
-        self._root = root if robot is None else root / f"robot={quote(robot, safe=' ')}"
+        self._root = root
+        self._robot = robot
         self._reader = reader
         self._extractor = extractor
         self.rows = 0
@@ -101,57 +111,54 @@ class Dataset:
         self.undecoded: set[str] = set()
 
     def write(self, messages: Iterable[StoredMessage]) -> None:
-        """Writes all messages; the files appear at the end, or none where it fails.
+        """Writes all messages. The files appear at the end; if it fails, none does.
 
         Raises:
-            InvalidArgumentsError: the partition of a message existed before, or the others have a
-                robot, or none.
+            InvalidArgumentsError: a partition exists already, or the existing ones are by robot and
+                these are not, or the reverse.
         """
-        is_alone = self._root == self._dataset
-        other, change = ("robot=*", "give") if is_alone else ("recording=*", "leave out")
-        if mixed := next(self._dataset.glob(other), None):
+        folder = self._partitions_folder()
+        open_parts: dict[tuple[str, int], _PartFile] = {}  # the one used last stands last
+        temporary_by_path: dict[Path, Path] = {}
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder, prefix=".") as temporary:
+            for stored in messages:
+                partition = stored.bag.recording.name, stored.time // _DAY_NS
+                part = open_parts.pop(partition, None)
+                if part is None:
+                    if len(open_parts) == _MAX_OPEN_FILES:
+                        open_parts.pop(next(iter(open_parts))).close()
+                    path = _new_file(folder, *partition, temporary_by_path)
+                    temporary_by_path[path] = Path(temporary, str(len(temporary_by_path)))
+                    part = _PartFile(temporary_by_path[path])
+                open_parts[partition] = part
+                part.add(self._row(stored.record))
+                self.rows += 1
+            for part in open_parts.values():
+                part.close()
+            for path, temporary_file in temporary_by_path.items():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                temporary_file.replace(path)
+        self.files = len(temporary_by_path)
+
+    def _partitions_folder(self) -> Path:
+        """Returns the folder of the partitions by recording.
+
+        Raises:
+            InvalidArgumentsError: the dataset has partitions by robot and this one not, or reversed.
+        """
+        folder, other, change = self._root, "robot=*", "give"
+        if self._robot is not None:
+            folder /= f"robot={quote(self._robot, safe=' ')}"
+            other, change = "recording=*", "leave out"
+        if mixed := next(self._root.glob(other), None):
             raise InvalidArgumentsError(
                 f"{mixed} may have these rows already, which would be there twice; {change} "
                 "--robot, or name another folder"
             )
-        parts: dict[tuple[str, Ns], _PartFile] = {}  # the one used last stands last
-        written: dict[Path, Path] = {}  # by its final path, where each file lies meanwhile
-        self._root.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=self._root, prefix=".") as temporary:
-            for stored in messages:
-                key = stored.bag.recording.name, stored.time // _DAY_NS
-                part = parts.pop(key, None)
-                if part is None:
-                    temporary_file = Path(temporary) / str(len(written))
-                    written[self._new_file(*key, written)] = temporary_file
-                    part = _PartFile(temporary_file)
-                    if len(parts) == _MAX_OPEN_FILES:
-                        parts.pop(next(iter(parts))).close()
-                parts[key] = part
-                part.rows.append(self._row(stored.record))
-                self.rows += 1
-                if len(part.rows) >= _GROUP_ROWS:
-                    part.flush()
-            for part in parts.values():
-                part.close()
-            for path, temporary_file in written.items():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                temporary_file.replace(path)
-        self.files = len(written)
-
-    def _new_file(self, recording: str, day: int, others: Collection[Path]) -> Path:
-        """Returns the path of a further file of a partition."""
-        date = datetime.fromtimestamp(day * _DAY_NS // NS_PER_S, tz=UTC).date()
-        folder = self._root / f"recording={quote(recording, safe=' ')}" / f"date={date}"
-        if any(folder.glob("*.parquet")):
-            raise InvalidArgumentsError(
-                f"{folder} has rows already, which would be there twice; export whole days (UTC)"
-                ", name another folder, or delete this one"
-            )
-        return folder / f"part-{sum(path.parent == folder for path in others)}.parquet"
+        return folder
 
     def _row(self, record: Record) -> Row:
-        """Returns the row of a message."""
         channel = record.channel
         row = (channel.topic, channel.type, record.log_time, record.publish_time)
         try:
@@ -167,4 +174,22 @@ class Dataset:
         if pose is None:
             return (*row, text, None, None, *_NO_POSE, stamp)
         frame = encodable(pose.frame_id) or None
-        return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]), stamp)
+        orientation = pose.orientation or _NO_ORIENTATION
+        return (*row, text, None, frame, *pose.position, *orientation, stamp)
+
+
+def _new_file(folder: Path, recording: str, day: int, others: Collection[Path]) -> Path:
+    """Returns the path of a further file of a recording and a day (since 1970, UTC).
+
+    Raises:
+        InvalidArgumentsError: an earlier export wrote files there.
+    """
+    date = datetime.fromtimestamp(day * _DAY_NS // NS_PER_S, tz=UTC).date()
+    partition = folder / f"recording={quote(recording, safe=' ')}" / f"date={date}"
+    if any(partition.glob("*.parquet")):
+        raise InvalidArgumentsError(
+            f"{partition} has rows already, which would be there twice; export whole days (UTC)"
+            ", name another folder, or delete this one"
+        )
+    number = sum(path.parent == partition for path in others)
+    return partition / f"part-{number}.parquet"

@@ -19,14 +19,14 @@ def serve(
     With a PATH over HTTP, and the page of the memory opens in the browser. Otherwise over stdio, or
     over HTTP with server.transport=sse. Stop it with Ctrl-C, or close stdin.
     """
-    folder, given = settings_to_look(bag_dir, words)
-    if folder is not None:
-        given.append(f"recording.bag_dir={quoted(str(folder.absolute()))}")
+    folder, settings = settings_to_look(bag_dir, words)
     options: list[str] = []
-    if folder is not None and bag_dir is None:
-        options = ["--page", "print" if no_open else "open"]
-        if "MCP_TRANSPORT" not in os.environ:
-            given.insert(0, "server.transport=sse")
-    program = [sys.executable, "-P", "-m", "ros2_memory.server", *options, *given]
+    if folder is not None:
+        settings.append(f"recording.bag_dir={quoted(str(folder.absolute()))}")
+        if bag_dir is None:  # a PATH
+            options = ["--page", "print" if no_open else "open"]
+            if "MCP_TRANSPORT" not in os.environ:
+                settings.insert(0, "server.transport=sse")
+    program = [sys.executable, "-P", "-m", "ros2_memory.server", *options, *settings]
     # In place of this process, whose signals and garbage collection are those of a short command.
     os.execv(sys.executable, program)  # noqa: S606 - there is nothing for a shell to do

@@ -36,13 +36,13 @@ def sql(
     lake = open_lake(settings, cast("DuckdbNode", settings.lake.engine))
     if not lake.days("bags"):
         raise InvalidArgumentsError(f"{settings.lake.warehouse}: there is no lake, or no bag in it")
-    found = lake.query(select)
+    table = lake.query(select)
     if as_csv:
-        print_exactly([csv_line(found.columns), *map(csv_line, found.rows)])
+        print_exactly([csv_line(table.columns), *map(csv_line, table.rows)])
         return
-    if len(set(found.columns)) < len(found.columns):
+    if len(set(table.columns)) < len(table.columns):
         raise InvalidArgumentsError("two columns have one name: give one another with AS, or --csv")
-    answer: list[JsonValue] = [dict(zip(found.columns, row, strict=True)) for row in found.rows]
+    answer: list[JsonValue] = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     if as_json:
         print_line(to_json_text(answer))
     else:

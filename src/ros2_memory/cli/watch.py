@@ -23,6 +23,7 @@ from ros2_memory.history.scan import count_messages
 from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status, usual_rate
+from ros2_memory.results import Status
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
 """Current rates are those of the newest data of this length."""
@@ -65,18 +66,10 @@ def watch(
 
 
 def _observe(memory: Memory) -> JsonObject:
-    """Returns the current state: times in Unix seconds, rates in Hz, ages in seconds.
-
-    Where `data.now=latest`, as in a simulation, the age of the newest data says nothing on whether
-    it is live: a live recorder does, or a file that grows.
-    """
-    snapshot, wall = memory.index.snapshot(), memory.clock.now()
+    """Returns the current state: times in Unix seconds, rates in Hz, ages in seconds."""
+    snapshot = memory.index.snapshot()
     status, latest = memory_status(memory, Call()), snapshot.dating.latest
-    splits = ns_from_unix(LIVE_SPLITS * memory.limits.split_duration_s)
-    is_live = latest is not None and abs(wall - latest) <= max(splits, LIVE_NS)
-    if memory.limits.now == "latest":
-        is_recording = status.live and status.recorder == RecorderState.RECORDING
-        is_live = latest is not None and (is_recording or bool(snapshot.active))
+    is_live = latest is not None and _is_live(memory, snapshot, status, latest)
     missing = status.missing if status.live else ()
     unoffered = [f"offered by no publisher: {listed(missing)}"] if missing else []
     return {
@@ -87,29 +80,43 @@ def _observe(memory: Memory) -> JsonObject:
         "latest": None if status.latest is None else unix_from_ns(status.latest),
         "is_live": is_live,
         "problems": [*unoffered, *status.problems],
-        "topics": [] if latest is None else [*_rows(memory, snapshot, latest, is_live=is_live)],
+        "topics": [] if latest is None else [*_rates(memory, snapshot, latest, is_live=is_live)],
     }
 
 
-def _rows(memory: Memory, snapshot: Snapshot, latest: Ns, *, is_live: bool) -> Iterator[JsonObject]:
-    """Yields the rate of every topic that is not latched.
+def _is_live(memory: Memory, snapshot: Snapshot, status: Status, latest: Ns) -> bool:
+    """Returns whether new data arrives, judged by the age of the newest data.
 
-    Without a usual rate for logs, for topics whose last messages were deleted by request, and where
-    some of the newest time was excluded.
+    With `data.now=latest`, as in a simulation, that age says nothing: then a recorder at work or a
+    file that is being written shows it.
+    """
+    if memory.limits.now == "latest":
+        is_recording = status.live and status.recorder == RecorderState.RECORDING
+        return is_recording or bool(snapshot.active)
+    splits = ns_from_unix(LIVE_SPLITS * memory.limits.split_duration_s)
+    return abs(memory.clock.now() - latest) <= max(splits, LIVE_NS)
+
+
+def _rates(
+    memory: Memory, snapshot: Snapshot, latest: Ns, *, is_live: bool
+) -> Iterator[JsonObject]:
+    """Yields the current and the usual rate of every topic that is not latched.
+
+    There is no usual rate for logs, for a topic whose newest messages were deleted by request, and
+    if some of the newest time was excluded.
     """
     window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
     timeline, latching = snapshot.timeline, memory.limits.latching
-    view = View(memory, Call())
-    is_excluded = bool(excluded_spans(memory.index.bag_dir, window))
+    bag_dir, view = memory.index.bag_dir, View(memory, Call())
+    is_excluded = bool(excluded_spans(bag_dir, window))
     for topic in timeline.topics():
         if latching.is_latched(snapshot, topic):
             continue
-        # Of a bag that was deleted, or is not complete yet, the next observation sees more.
+        # A bag that cannot be read now, deleted or not complete yet, counts in the next update.
         count = count_messages(view, topic, window, np.empty(0, np.int64)).messages.sum()
         last = max(totals.last for totals in timeline.totals(topic).values())
+        is_cut = bool(cut_spans(bag_dir, topic, TimeWindow(last + 1, latest + 1)))
         usual = usual_rate(snapshot, topic, latching)
-        since = TimeWindow(last + 1, latest + 1)
-        is_cut = cut_spans(memory.index.bag_dir, topic, since)
         if timeline.is_log(topic) or is_cut or is_excluded:
             usual = None
         age_s, rate = max(unix_from_ns(latest - last), 0.0), int(count) / unix_from_ns(WINDOW_NS)
@@ -123,10 +130,10 @@ def _rows(memory: Memory, snapshot: Snapshot, latest: Ns, *, is_live: bool) -> I
 
 
 def assessment(rate: float, usual: float | None, age_s: float) -> str:
-    """Returns how a topic's rate (Hz) is: `as usual`, `slow`, `fast` or `silent`.
+    """Compares a topic's rate with its usual one (Hz): `as usual`, `slow`, `fast` or `silent`.
 
-    It is as usual without a usual rate. `age_s` is how much older its newest message is than the
-    newest of all topics.
+    `age_s` is how much older its newest message is than the newest of all topics. Without a usual
+    rate a topic is `as usual`.
     """
     window_s = unix_from_ns(WINDOW_NS)
     if usual is None:
