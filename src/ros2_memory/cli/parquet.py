@@ -145,7 +145,8 @@ class Dataset:
         """Returns the folder of the partitions by recording.
 
         Raises:
-            InvalidArgumentsError: the dataset has partitions by robot and this one not, or reversed.
+            InvalidArgumentsError: the dataset is partitioned by robot, and this part is not; or
+                the reverse.
         """
         folder, other, change = self._root, "robot=*", "give"
         if self._robot is not None:

@@ -1,4 +1,4 @@
-"""Rows of arrays, and groups of them."""
+"""Arrays of rows: sums, ranges, look-ups, groups, and columns in few bytes."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
 _MOST_KEYS: Final = 2**62
 _KEYS_OF_ROW: Final = 8
-"""Of no more possible rows for each that there is, looking them up is quicker than sorting."""
+"""If there are no more possible rows for each row, a table of them is quicker than sorting."""
 _EVERY_BYTE: Final = (1,)
 
 
 def gathered(
     buffer: bytes, dtype: np.dtype[Scalar], places: Ints
 ) -> np.ndarray[tuple[int], np.dtype[Scalar]]:
-    """Returns what lies at some places of a buffer, aligned or not.
+    """Returns the elements that begin at some bytes of a buffer, aligned or not.
 
     Raises:
-        IndexError: something ends behind the buffer.
+        IndexError: an element ends behind the buffer.
     """
     # An element at every byte. As bytes: field by field a structure takes ten times as long.
     count = max(len(buffer) - dtype.itemsize + 1, 0)
@@ -49,7 +49,7 @@ def gathered(
 def row_sums(rows: NDArray[np.float64]) -> Floats:
     """Returns the sum of each row, added from left to right.
 
-    Of rows of two to four numbers; `sum(axis=1)` takes six times as long for these.
+    For rows of two to four numbers, where `sum(axis=1)` takes six times as long.
     """
     sums: Floats = rows[:, 0].copy()
     for column in rows.T[1:]:
@@ -58,7 +58,7 @@ def row_sums(rows: NDArray[np.float64]) -> Floats:
 
 
 def row_maxima(rows: NDArray[np.float64]) -> Floats:
-    """Returns the greatest number of each row of a few; NaN where it has one."""
+    """Returns the greatest number of each row, NaN if it has one; for rows of a few numbers."""
     greatest: Floats = rows[:, 0].copy()
     for column in rows.T[1:]:
         np.maximum(greatest, column, out=greatest)
@@ -66,30 +66,36 @@ def row_maxima(rows: NDArray[np.float64]) -> Floats:
 
 
 def in_ranges(starts: Ints, sizes: Ints) -> Ints:
-    """Returns the numbers of ranges, one range after another."""
+    """Returns the numbers of all ranges, joined: starts 3, 8 and sizes 2, 1 give 3, 4, 8."""
     before = np.cumsum(sizes) - sizes
     numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
     return numbers
 
 
-def places_among(numbers: Ints, some: Ints) -> tuple[Ints, Flags]:
-    """Returns where each number lies among some, which ascend, and whether it is one of them."""
-    place = np.searchsorted(some, numbers)
-    if not some.size:
-        return place, np.zeros(place.shape, np.bool_)
-    # What lies behind all of them is not the last, either.
-    return place, some.take(place, mode="clip") == numbers
+def places_among(numbers: Ints, ascending: Ints) -> tuple[Ints, Flags]:
+    """Looks up numbers in an ascending array; returns their positions, and which are in it.
+
+    The position of a number that is not in it is where it would be inserted.
+    """
+    places = np.searchsorted(ascending, numbers)
+    if not ascending.size:
+        return places, np.zeros(places.shape, np.bool_)
+    # Clipped: a number greater than all is compared with the last one, and differs from it.
+    return places, ascending.take(places, mode="clip") == numbers
 
 
 def begins_of(group: Ints, groups: int) -> Ints:
-    """Returns where each of so many groups begins in rows that are in their order, and the end."""
+    """Returns where each group begins in rows that are sorted by group, and the end.
+
+    `group` has the group of each row: a number from 0 up to `groups`, exclusive.
+    """
     begins = np.zeros(groups + 1, np.int64)
     np.cumsum(np.bincount(group, minlength=groups), out=begins[1:])
     return begins
 
 
 def rows_by(group: Ints, groups: int) -> list[Ints]:
-    """Returns the rows of each of so many groups, in their order."""
+    """Returns the rows of each group, ascending; the arguments are those of `begins_of`."""
     return np.split(np.argsort(group, kind="stable"), begins_of(group, groups)[1:])[:-1]
 
 
@@ -99,13 +105,13 @@ def run_starts(numbers: Ints) -> Ints:
 
 
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
-    """Returns some rows of a table, which is a dataclass with a column in each field."""
+    """Returns the selected rows of a table: a dataclass with a column in each field."""
     names = [column.name for column in fields(table)]
     return replace(table, **{name: getattr(table, name)[which] for name in names})
 
 
 def stacked(tables: Sequence[T]) -> T:
-    """Returns the rows of such tables, of which there is one at least, one after the other."""
+    """Returns one table with the rows of all tables, one after the other; there is at least one."""
     if len(tables) == 1:
         return tables[0]
     first, *_ = tables
@@ -115,31 +121,32 @@ def stacked(tables: Sequence[T]) -> T:
 
 
 def numbered(values: Iterable[Word]) -> tuple[tuple[Word, ...], Ints]:
-    """Returns the different values, in the order of their first, and which of them each one is."""
+    """Returns the distinct values, in order of first appearance, and the index of each value."""
     code_of: dict[Word, int] = {}
     codes = [code_of.setdefault(value, len(code_of)) for value in values]
     return tuple(code_of), np.array(codes, np.int64)
 
 
 def joined_codes(parts: Iterable[tuple[Codes, Sequence[Word]]]) -> tuple[Ints, tuple[Word, ...]]:
-    """Returns codes one after the other, by one list of words in place of one for each part."""
+    """Joins columns of codes, each with a list of the words it means, into one with one list."""
     code_of: dict[Word, int] = {}
     codes = [np.empty(0, np.int64)]
     recoded: dict[tuple[Word, ...], Ints] = {}  # many parts have the same words
     for old, words in parts:
-        listed = tuple(words)
-        if listed not in recoded:
-            new = [code_of.setdefault(word, len(code_of)) for word in listed]
-            recoded[listed] = np.array(new, np.int64)
-        codes.append(recoded[listed][old])
+        part_words = tuple(words)
+        if part_words not in recoded:
+            new = [code_of.setdefault(word, len(code_of)) for word in part_words]
+            recoded[part_words] = np.array(new, np.int64)
+        codes.append(recoded[part_words][old])
     return np.concatenate(codes), tuple(code_of)
 
 
 def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
-    """Returns the times (ns) of several parts in one order.
+    """Merges the times (ns) of several parts; equal times stay in the order of the parts.
 
-    Besides their order among the parts behind each other, and for each part the places of its
-    times in that order. Of equal times those of an earlier part come first.
+    Returns:
+        The merged times; for each of them its index in the joined parts; and for each part the
+        indices of its times in the merged ones.
     """
     times = np.concatenate(parts)
     order = np.argsort(times, kind="stable")
@@ -149,30 +156,30 @@ def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
 
 
 def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """Returns the distinct rows of some columns in order, and the number of each row among them."""
+    """Returns the distinct rows of a table in ascending order, and the index of each row's."""
     lows = [int(column.min(initial=0)) for column in columns]
     sizes = [
         int(column.max(initial=0)) - low + 1 for column, low in zip(columns, lows, strict=True)
     ]
-    most = math.prod(sizes)
-    if most >= _MOST_KEYS:
-        rows, number = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
-        return rows, number.reshape(-1)
+    possible = math.prod(sizes)
+    if possible >= _MOST_KEYS:
+        rows, index = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
+        return rows, index.reshape(-1)
     # One number for each row, in the order of the rows: sorting rows takes ten times as long.
     keys = np.zeros(len(columns[0]), np.int64)
     for column, low, size in zip(columns, lows, sizes, strict=True):
         keys = keys * size + (column.astype(np.int64) - low)
-    if most <= _KEYS_OF_ROW * len(keys):
-        is_there = np.zeros(most, np.bool_)
+    if possible <= _KEYS_OF_ROW * len(keys):
+        is_there = np.zeros(possible, np.bool_)
         is_there[keys] = True
-        distinct, number = np.flatnonzero(is_there), np.cumsum(is_there)[keys] - 1
+        distinct, index = np.flatnonzero(is_there), np.cumsum(is_there)[keys] - 1
     else:
-        distinct, number = np.unique(keys, return_inverse=True)
-    return np.stack(np.unravel_index(distinct, sizes), axis=1) + np.array(lows), number
+        distinct, index = np.unique(keys, return_inverse=True)
+    return np.stack(np.unravel_index(distinct, sizes), axis=1) + np.array(lows), index
 
 
 def narrowed(column: Ints) -> Ints:
-    """Returns integers in as few bytes each as they need."""
+    """Returns a column in the smallest type of integers that holds it."""
     low, high = int(column.min(initial=0)), int(column.max(initial=0))
     kinds = (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.int64)
     kind = next(kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max)
@@ -180,11 +187,7 @@ def narrowed(column: Ints) -> Ints:
 
 
 class Columns:
-    """A table of integers, which is read like an array of rows, in as few bytes as they need.
-
-    Args:
-        columns: what it consists of.
-    """
+    """A table of integers, indexed like an array of rows, stored column by column in few bytes."""
 
     def __init__(self, columns: Iterable[Ints]) -> None:
         self.columns = [*map(narrowed, columns)]
@@ -194,9 +197,10 @@ class Columns:
         return len(self.columns[0])
 
     def __getitem__(self, at: Which | tuple[Which, int]) -> Ints:
-        """Returns some rows, or these of one column."""
+        """Returns the selected rows; or, of a pair, those of one column."""
         if isinstance(at, tuple):
-            return self.columns[at[1]][at[0]].astype(np.int64)
+            rows, column = at
+            return self.columns[column][rows].astype(np.int64)
         return np.stack([column[at] for column in self.columns], axis=1, dtype=np.int64)
 
 
@@ -204,9 +208,9 @@ class Groups(NamedTuple):
     """Rows by their group, numbered from 0 without a gap.
 
     Attributes:
-        order: the rows by group, those of one in their order.
-        begins: where each group begins in it.
-        sizes: how many rows each has.
+        order: the rows sorted by group; the rows of one group ascend.
+        begins: where each group begins in `order`.
+        sizes: the number of rows of each group.
     """
 
     order: Ints
@@ -215,7 +219,7 @@ class Groups(NamedTuple):
 
     @classmethod
     def of(cls, group: Ints) -> Groups:
-        """Returns the groups of rows."""
+        """Groups rows by the group that each has."""
         sizes = np.bincount(group).astype(np.int64)
         return cls(np.argsort(group, kind="stable"), np.cumsum(sizes) - sizes, sizes)
 
@@ -225,11 +229,11 @@ class Groups(NamedTuple):
         return self.order[self.begins]
 
     def sums(self, values: Ints) -> Ints:
-        """Returns the sum of each group."""
+        """Returns the sum of each group's values."""
         return np.add.reduceat(values[self.order], self.begins) if len(values) else values
 
     def ends(self, values: Ints) -> tuple[Ints, Ints]:
-        """Returns the least and the greatest of each group."""
+        """Returns the least and the greatest of each group's values."""
         ordered = values[self.order]
         if not len(values):
             return ordered, ordered

@@ -1,8 +1,8 @@
 """What one bag holds, topic by topic, stored so that 60,000 bags fit into a small memory.
 
-Nearly all bags of a robot hold the same topics and differ in counts and times alone. So a summary
-is a `SummarySchema`, which many bags share, and its numbers as bytes; a `TopicSummary` is made when
-it is asked for.
+Nearly all bags of a robot hold the same topics, and differ only in counts and times. So a summary
+has a `SummarySchema`, which many bags share, and its numbers as bytes; a `TopicSummary` is unpacked
+on demand.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import struct
 import sys
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 SetBack: TypeAlias = "tuple[Ns, Ns] | None"
-"""By how much log times go back, and the first one after that; None where they do not."""
+"""The step back of log times, and the first log time after it; None without such a step."""
 OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
 """Messages are written out of order by less than this, also across two splits."""
 
@@ -35,7 +36,7 @@ _NUMBERS: Final = struct.Struct("<qqq")
 
 _COUNT_BYTES: Final = 3
 _TIME_BYTES: Final = 5
-"""Of a count, and of a time since the first one, in packed numbers: for bags of up to 18 min."""
+"""Of a packed count, and of a packed time since the bag's start: up to 18 min after it."""
 _TOPIC_BYTES: Final = _COUNT_BYTES + 2 * _TIME_BYTES
 _BASE: Final = struct.Struct("<q")
 
@@ -44,10 +45,12 @@ _CACHED_SCHEMAS: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """What one bag holds of one topic under one type; at least one message.
+    """The messages of one topic and type in one bag; at least one.
 
-    `first` and `last` are the exact log times of its earliest and latest message (inclusive).
-    `latched`: some publisher offered it as transient local.
+    Attributes:
+        first: the least log time.
+        last: the greatest log time (inclusive).
+        latched: whether some publisher offered the topic as transient local.
     """
 
     topic: str
@@ -95,12 +98,12 @@ class SummarySchema:
 
     @cached_property
     def clock_set_back(self) -> SetBack:
-        """As `set_back`; None in a damaged file, of which it says nothing about a clock."""
+        """`set_back`, if it shows that a clock was set back: not in a damaged file."""
         return None if self.is_damaged else self.set_back
 
     @cached_property
     def positions(self) -> dict[str, tuple[int, ...]]:
-        """By topic, its positions among `topics`: one for each of its types."""
+        """The positions of each topic among `topics`: one for each of its types."""
         positions: dict[str, tuple[int, ...]] = {}
         for position, header in enumerate(self.topics):
             positions[header.topic] = (*positions.get(header.topic, ()), position)
@@ -112,18 +115,17 @@ class SummarySchema:
         return struct.Struct(f"<{3 * len(self.topics)}q")
 
     def to_json(self) -> str:
-        """Returns the schema as JSON; equal ones give equal texts."""
+        """Returns the schema as JSON; equal schemas give equal texts."""
         topics = [[*header] for header in self.topics]
-        stated = [self.silent, self.complete, self.notes, self.set_back, self.pauses, self.absences]
-        return json.dumps([topics, *stated])
+        values = [self.silent, self.complete, self.notes, self.set_back, self.pauses, self.absences]
+        return json.dumps([topics, *values])
 
     @staticmethod
     def from_json(text: str) -> SummarySchema:
-        """Returns the schema that `to_json` returned so.
+        """Returns the schema of a text that `to_json` returned.
 
         Raises:
-            ValueError: the text is not valid.
-            TypeError: likewise.
+            ValueError, TypeError: the text is not valid.
         """
         topics, silent, complete, notes, set_back, pauses, absences = json.loads(text)
         return shared_schema(
@@ -132,15 +134,15 @@ class SummarySchema:
                 tuple(silent),
                 complete,
                 tuple(notes),
-                set_back and tuple(set_back),
+                None if set_back is None else tuple(set_back),
                 tuple(map(tuple, pauses)),
-                tuple((topic, tuple(map(tuple, listed))) for topic, listed in absences),
+                tuple((topic, tuple(map(tuple, counted))) for topic, counted in absences),
             )
         )
 
 
 _DAMAGED: Final = "damaged"
-"""In each note on bytes that cannot have been written so."""
+"""A word in each note on bytes that no recorder wrote so."""
 WRONG_STATISTICS: Final = "its own statistics are wrong"
 READ_WITHOUT_INDEXES: Final = "its messages were read without its indexes"
 MESSAGES_MISSING: Final = "messages may be missing"
@@ -150,38 +152,42 @@ DOUBTS: Final = (
     "its message indexes ",
     "its chunk indexes ",
 )
-"""Beginnings of notes on files that contradict themselves, and were read from end to end."""
+"""Beginnings of notes on files that contradict themselves; these are read from end to end."""
 
 
 def numbers_of(
     schema: SummarySchema, joined: bytes, summaries: int, positions: Sequence[int]
 ) -> Ints:
-    """Returns count, first and last of some topics, of the joined `data` of so many summaries.
+    """Unpacks the numbers of some topics from the joined `data` of several summaries.
 
-    These share the schema, and the size of their data. Of the shape (positions, summaries, 3).
+    All summaries have this schema, and data of the same size.
+
+    Returns:
+        Count, first and last log time, in the shape (positions, summaries, 3).
     """
     size = len(joined) // summaries
     if size == schema.numbers.size:
-        whole = np.frombuffer(joined, "<i8").reshape(summaries, -1, 3)
-        return whole[:, positions].swapaxes(0, 1)
+        numbers = np.frombuffer(joined, "<i8").reshape(summaries, -1, 3)
+        return numbers[:, positions].swapaxes(0, 1)
     base = np.ndarray((summaries,), "<i8", joined, 0, (size,))
-    # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
+    # Read as eight bytes each: a count (3 bytes) with a first time (5 bytes), and, five bytes
+    # later, the end of that first time (3 bytes) with a last time (5 bytes).
     shape, strides = (2, len(schema.topics), summaries), (_TIME_BYTES, _TOPIC_BYTES, size)
     pairs = np.ndarray(shape, "<i8", joined, _BASE.size, strides)[:, [*positions]]
-    numbers: Ints = np.empty((3, len(positions), summaries), np.int64)
-    numbers[0] = pairs[0] & ((1 << 8 * _COUNT_BYTES) - 1)
-    numbers[1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
-    return numbers.transpose(1, 2, 0)
+    unpacked: Ints = np.empty((3, len(positions), summaries), np.int64)
+    unpacked[0] = pairs[0] & ((1 << 8 * _COUNT_BYTES) - 1)
+    unpacked[1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
+    return unpacked.transpose(1, 2, 0)
 
 
 def set_back_while_written(by: Ns) -> str:
-    """Returns the sentence on a clock that was set back, at least by this, within one bag."""
+    """Returns a sentence on a clock that was set back by at least `by` within one bag."""
     return f"the clock was set back by {by / NS_PER_S:.0f} s or more while it was being written"
 
 
 @lru_cache(maxsize=_CACHED_SCHEMAS)
 def shared_schema(schema: SummarySchema) -> SummarySchema:
-    """Returns one schema for all bags that have it, with one copy of each name."""
+    """Returns the one object for all equal schemas, with one object for each name."""
     intern = sys.intern
     topics = tuple(
         TopicHeader(intern(topic), intern(type_name), intern(encoding), latched)
@@ -191,21 +197,21 @@ def shared_schema(schema: SummarySchema) -> SummarySchema:
 
 
 class BagSummary:
-    """What one bag file holds. Immutable; equal to any other of the same content.
+    """What one bag file holds. Immutable; summaries of equal content are equal.
 
     Args:
         topics: one for each topic and type; their numbers fit into 64 bits.
         silent: the topics that are declared without a message.
-        complete: False where the file ends early and only what was readable is counted.
+        complete: False if the file ends early and only its readable part is counted.
         notes: sentences on what is wrong with the file.
-        set_back: where the log times of a topic go back most in the order of writing, if they do
-            so by a second.
-        pauses: where no topic has a message for a while, though some usually have.
-        absences: where one topic has none for long, each with how many it has before.
+        set_back: the greatest step back of log times of a topic, in the order of writing, if it is
+            a second or more.
+        pauses: times without a message of any topic, if some topic usually has messages.
+        absences: long times without a message of one topic, each with the messages before it.
 
     Attributes:
         schema: the summary without its numbers.
-        data: the numbers, in about half of their bytes where they fit.
+        data: the numbers, packed into about half of their bytes if they fit.
     """
 
     __slots__ = ("data", "schema")
@@ -230,18 +236,17 @@ class BagSummary:
         self.schema = shared_schema(
             SummarySchema(tuple(headers), silent, complete, notes, set_back, pauses, absences)
         )
-        numbers = [part for topic in topics for part in (topic.count, topic.first, topic.last)]
-        self.data = _packed(self.schema, numbers)
+        self.data = _packed(self.schema, topics)
 
     @classmethod
     def decoded(cls, schema: SummarySchema, data: bytes) -> Self:
-        """Returns the summary of a schema whose `data` are these."""
+        """Returns the summary with this schema and these data."""
         summary = cls.__new__(cls)
         summary.schema = schema
         summary.data = data
         return summary
 
-    def _numbers_at(self, position: int) -> tuple[int, int, int]:
+    def _numbers_at(self, position: int) -> tuple[int, Ns, Ns]:
         """Returns count, first and last of the topic at a position, without unpacking others."""
         packed = self.data
         if len(packed) == self.schema.numbers.size:
@@ -270,13 +275,13 @@ class BagSummary:
             self.notes if notes is None else notes,
             set_back=self.schema.set_back,
             pauses=self.schema.pauses,
-            # Of other messages they are not known.
+            # Absences of other messages are unknown.
             absences=self.schema.absences if topics is None else (),
         )
 
     @property
     def topics(self) -> tuple[TopicSummary, ...]:
-        """Each topic under each of its types, computed again."""
+        """Each topic under each of its types; unpacked at each access."""
         return tuple(map(self.at, range(len(self.schema.topics))))
 
     def at(self, position: int) -> TopicSummary:
@@ -289,7 +294,7 @@ class BagSummary:
         return tuple(self.at(position) for position in self.schema.positions.get(topic, ()))
 
     def span_of(self, topics: Collection[str]) -> Span:
-        """Returns the first and last log time of these topics; it must hold one of them."""
+        """Returns the first and last log time of some topics, of which the bag has at least one."""
         positions = self.schema.positions
         numbers = [
             self._numbers_at(position) for topic in topics for position in positions.get(topic, ())
@@ -318,7 +323,7 @@ class BagSummary:
 
     @property
     def count(self) -> int:
-        """Messages on all topics."""
+        """The number of messages on all topics."""
         return sum(count for count, _, _ in self._numbers())
 
     @property
@@ -336,7 +341,7 @@ class BagSummary:
         """Log time of the latest message (inclusive). Only for a bag that is not empty."""
         return max(last for _, _, last in self._numbers())
 
-    def _numbers(self) -> Iterable[tuple[int, int, int]]:
+    def _numbers(self) -> Iterable[tuple[int, Ns, Ns]]:
         return map(self._numbers_at, range(len(self.schema.topics)))
 
     def __eq__(self, other: object) -> bool:
@@ -351,15 +356,21 @@ class BagSummary:
         return f"BagSummary(topics={self.topics!r}, schema={self.schema!r})"
 
 
-def _packed(schema: SummarySchema, numbers: Sequence[int]) -> bytes:
-    """Returns count, first and last of each topic in about half of the bytes, where they fit."""
-    base = min(numbers[1::3], default=0)
-    parts = [_BASE.pack(base)] if numbers else []
+def _packed(schema: SummarySchema, topics: Sequence[TopicSummary]) -> bytes:
+    """Packs count, first and last of each topic: relative to the bag's start if that fits.
+
+    Relative numbers take 13 bytes a topic, others 24.
+    """
+    if not topics:
+        return b""
+    base = min(topic.first for topic in topics)
+    parts = [_BASE.pack(base)]
     try:
-        for count, first, last in zip(*[iter(numbers)] * 3, strict=True):
-            parts.append(count.to_bytes(_COUNT_BYTES, "little"))
-            parts.append((first - base).to_bytes(_TIME_BYTES, "little"))
-            parts.append((last - base).to_bytes(_TIME_BYTES, "little"))
+        for topic in topics:
+            parts.append(topic.count.to_bytes(_COUNT_BYTES, "little"))
+            parts.append((topic.first - base).to_bytes(_TIME_BYTES, "little"))
+            parts.append((topic.last - base).to_bytes(_TIME_BYTES, "little"))
     except OverflowError:
-        return schema.numbers.pack(*numbers)
+        numbers = ((topic.count, topic.first, topic.last) for topic in topics)
+        return schema.numbers.pack(*chain.from_iterable(numbers))
     return b"".join(parts)
