@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 from itertools import count, pairwise
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Quaternion, Transform, Vector3
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
-_Farthest: TypeAlias = "tuple[NDArray[np.intp], NDArray[np.intp], Numbers, NDArray[np.intp]]"
-"""Where intervals start and end; what is farthest in each: its squared deviation, and its index."""
 N = TypeVar("N", float, "NDArray[np.float64]")
 
 GIMBAL_LOCK_SINE: Final = 1 - 1e-14
@@ -32,10 +30,10 @@ _PARALLEL_COSINE: Final = 1 - 1e-10
 """Beyond this, slerp would divide two tiny sines; an angle as if it were this moves it by 1e-15."""
 
 _MOST_LOPSIDED: Final = 64
-"""How often, on average, a point may be looked at before intervals are halved instead."""
+"""How often, on average, a point may be measured before intervals are halved instead."""
 
 _TOGETHER: Final = 1 << 14
-"""Of so many points deviations are computed at once: they stay in the processor's cache."""
+"""Points whose deviations are computed at once: they fit into the processor's cache."""
 
 _BACKWARDS_WEIGHT: Final = 0.5**2
 """The weight, for squared deviations, of moving back along a segment."""
@@ -44,6 +42,27 @@ _SHORTEST_SQUARED: Final = 1e-300
 """Chords whose squared length is not greater are points."""
 
 _SAME_M: Final = 1e-6
+"""Transforms that differ by less (m, and in the cosine of half the angle) are the same."""
+
+
+class _Path(NamedTuple):
+    """The points of a path: a row of coordinates (m) for each axis, and the times (s).
+
+    `of_time` is the share of a point's distance in time that counts as deviation.
+    """
+
+    coordinates: NDArray[np.float64]
+    clock: Numbers
+    of_time: float
+
+
+class _Farthest(NamedTuple):
+    """The point of each interval that deviates most: its squared deviation (m2) and its index."""
+
+    starts: NDArray[np.intp]
+    ends: NDArray[np.intp]
+    squared: Numbers
+    point: NDArray[np.intp]
 
 
 def normalised(q: Quaternion) -> Quaternion | None:
@@ -80,7 +99,7 @@ def yaw(q: Quaternion) -> float:
 def multiply(a: tuple[N, N, N, N], b: tuple[N, N, N, N]) -> tuple[N, N, N, N]:
     """Returns the rotation `b` followed, about the fixed axes, by `a` (Hamilton's product a b).
 
-    Of numbers, or of arrays of them.
+    The parts are numbers, or arrays of numbers.
     """
     ax, ay, az, aw = a
     bx, by, bz, bw = b
@@ -93,7 +112,7 @@ def multiply(a: tuple[N, N, N, N], b: tuple[N, N, N, N]) -> tuple[N, N, N, N]:
 
 
 def rotate(q: tuple[N, N, N, N], v: tuple[N, N, N]) -> tuple[N, N, N]:
-    """Returns `v` rotated by `q`; of numbers, or of arrays of them."""
+    """Returns `v` rotated by `q`; the parts are numbers, or arrays of numbers."""
     x, y, z, w = q
     vx, vy, vz = v
     cx = 2 * (y * vz - z * vy)
@@ -122,7 +141,7 @@ def alike(one: Transform, other: Transform) -> bool:
 def slerp(a: tuple[N, N, N, N], b: tuple[N, N, N, N], ratio: N) -> tuple[N, N, N, N]:
     """Returns the rotation between `a` (ratio 0) and `b` (1), the shorter way, at even speed.
 
-    Of numbers, or of arrays of them.
+    The parts are numbers, or arrays of numbers.
     """
     cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     angle = np.arccos(np.minimum(abs(cosine), _PARALLEL_COSINE))
@@ -143,132 +162,173 @@ def simplified(
     at_most: int,
     of_time: float = 0.1,
 ) -> tuple[NDArray[np.intp], float]:
-    """Draws a path with few of its points (Ramer, Douglas and Peucker), in space and time.
+    """Selects few points that draw a path (Ramer, Douglas and Peucker), in space and time.
 
-    Points are added to those that are kept anyway until every other one lies within a tolerance of
-    the segment that spans it, unless that takes more points than allowed: then as near as these
-    allow. The cost is bounded: where the splits stay lopsided, intervals are halved instead, which
+    Points are added until every other point lies within the tolerance of the segment that spans
+    it; or, if that takes more than `at_most` points, until there are so many, the worst deviation
+    first. The cost is bounded: where the splits stay lopsided, intervals are halved instead, which
     keeps some more points than needed.
 
-    The deviation of a point is at least half the distance that it lies back along its segment from
-    an earlier point, so that turning points are kept; and a share of its distance from where the
-    segment has the robot at that time, so that stops are kept (the synchronised distance of
-    Meratnia and de By, Spatiotemporal Compression Techniques for Moving Point Objects, EDBT 2004).
+    The deviation of a point is the greatest of three: its distance from the segment; half of the
+    distance that it lies back along the segment from an earlier point, so that turning points are
+    kept; and a share of its distance from where the segment has the robot at that time, so that
+    stops are kept (the synchronised distance of Meratnia and de By, Spatiotemporal Compression
+    Techniques for Moving Point Objects, EDBT 2004).
 
     Args:
-        points: x, y and z (m) of each as a row; finite.
-        clock: the time of each (s).
-        kept: the indices of those that are kept anyway, ascending; the first and the last of all
-            are among them.
-        tolerance_m: see above.
-        at_most: so many points draw the path, unless `kept` are more.
-        of_time: that share.
+        points: x, y and z (m) of each point as a row; finite.
+        clock: the time of each point (s).
+        kept: the ascending indices of points that are selected in any case; the first and the last
+            point of all are among them.
+        tolerance_m: the greatest deviation of a point that is not selected.
+        at_most: the greatest number of points, unless `kept` are more.
+        of_time: the share of the third deviation.
 
     Returns:
-        The indices of the kept points, ascending, and the largest deviation (m) of another one.
+        The indices of the selected points, ascending, and the largest deviation (m) of another one.
     """
-    # What is the same everywhere, as z mostly is, is off by nothing.
-    columns = points.T[(points != points[0]).any(axis=0)].copy()
-    kept_indices, error = [kept], 0.0
-    looked_at: list[_Farthest] = []
+    # An axis on which all points are equal, as z mostly is, adds nothing to a deviation.
+    path = _Path(points.T[(points != points[0]).any(axis=0)].copy(), clock, of_time)
+    selected, error = [kept], 0.0
+    measured: list[_Farthest] = []
     starts, ends = kept[:-1], kept[1:]
     for depth in count():
-        inner = ends - starts > 1
-        starts, ends = starts[inner], ends[inner]
+        has_inner = ends - starts > 1
+        starts, ends = starts[has_inner], ends[has_inner]
         if not starts.size:
             break
-        most, where = _farthest_of_each(columns, clock, starts, ends, of_time)
-        looked_at.append((starts, ends, most, where))
-        splits = most > tolerance_m * tolerance_m
-        error = max(error, float(most[~splits].max(initial=0.0)))
-        starts, ends, where = starts[splits], ends[splits], where[splits]
+        farthest = _farthest_of_each(path, starts, ends)
+        measured.append(farthest)
+        splits = farthest.squared > tolerance_m * tolerance_m
+        error = max(error, float(farthest.squared[~splits].max(initial=0.0)))
+        starts, ends, split = starts[splits], ends[splits], farthest.point[splits]
         if depth >= _MOST_LOPSIDED:
-            where = (starts + ends) // 2
-        kept_indices.append(where)
-        if sum(map(len, kept_indices)) > at_most:
-            return _worst_first(
-                columns,
-                clock,
-                kept,
-                looked_at,
-                tolerance_m=tolerance_m,
-                at_most=at_most,
-                of_time=of_time,
-            )
-        starts, ends = np.append(starts, where), np.append(where, ends)
+            split = (starts + ends) // 2
+        selected.append(split)
+        if sum(map(len, selected)) > at_most:
+            return _worst_first(path, kept, measured, tolerance_m=tolerance_m, at_most=at_most)
+        starts, ends = np.append(starts, split), np.append(split, ends)
         order = np.argsort(starts)
         starts, ends = starts[order], ends[order]
-    return np.sort(np.concatenate(kept_indices)), math.sqrt(error)
+    return np.sort(np.concatenate(selected)), math.sqrt(error)
 
 
 def _worst_first(
-    columns: NDArray[np.float64],
-    clock: Numbers,
+    path: _Path,
     kept: NDArray[np.intp],
-    looked_at: Sequence[_Farthest],
+    measured: Sequence[_Farthest],
     *,
     tolerance_m: float,
     at_most: int,
-    of_time: float,
 ) -> tuple[NDArray[np.intp], float]:
-    """Does what `simplified` does, the worst interval first: of a few points these are the best.
+    """Selects points as `simplified` does, by splitting the worst interval at each step.
 
-    `looked_at` is what is known of some intervals.
+    That is slower, and the best choice of few points. `measured` saves measuring intervals again.
     """
-    indices = kept.tolist()
-    worst: list[tuple[float, int, int, int]] = []
-    measured = {
-        (start, end): (-most, where)
-        for batch in looked_at
-        for start, end, most, where in zip(*(column.tolist() for column in batch), strict=True)
+    known = {
+        (start, end): (squared, point)
+        for batch in measured
+        for start, end, squared, point in zip(*(column.tolist() for column in batch), strict=True)
     }
+    worst: list[tuple[float, int, int, int]] = []  # a heap: -squared deviation, point, start, end
 
-    def farthest(start: int, end: int) -> tuple[float, int]:
-        most, where = _farthest_of_each(columns, clock, np.array([start]), np.array([end]), of_time)
-        return -float(most[0]), int(where[0])
+    def push(start: int, end: int) -> None:
+        if end - start <= 1:
+            return
+        if (start, end) in known:
+            squared, point = known[start, end]
+        else:
+            farthest = _farthest_of_each(path, np.array([start]), np.array([end]))
+            squared, point = float(farthest.squared[0]), int(farthest.point[0])
+        heapq.heappush(worst, (-squared, point, start, end))
 
-    def look(*edges: int) -> None:
-        for start, end in pairwise(edges):
-            if end - start > 1:
-                off, where = measured.get((start, end)) or farthest(start, end)
-                heapq.heappush(worst, (off, where, start, end))
-
-    look(*indices)
-    scans_left = _MOST_LOPSIDED * len(clock)
-    while worst and -worst[0][0] > tolerance_m * tolerance_m and len(indices) < at_most:
+    selected = kept.tolist()
+    for start, end in pairwise(selected):
+        push(start, end)
+    scans_left = _MOST_LOPSIDED * len(path.clock)
+    while worst and -worst[0][0] > tolerance_m * tolerance_m and len(selected) < at_most:
         _, split, start, end = heapq.heappop(worst)
         scans_left -= end - start
         if scans_left < 0:
             split = (start + end) // 2
-        indices.append(split)
-        look(start, split, end)
+        selected.append(split)
+        push(start, split)
+        push(split, end)
     error = math.sqrt(-worst[0][0]) if worst else 0.0
-    return np.sort(np.array(indices, np.intp)), error
+    return np.sort(np.array(selected, np.intp)), error
 
 
-def _farthest_of_each(
-    columns: NDArray[np.float64],
-    clock: Numbers,
-    starts: NDArray[np.intp],
-    ends: NDArray[np.intp],
-    of_time: float,
-) -> tuple[Numbers, NDArray[np.intp]]:
+class _Segments(NamedTuple):
+    """The segments between the first and the last point of each interval.
+
+    Attributes:
+        starts: the index of each first point.
+        chords: from the first to the last point, a row for each axis.
+        squared: the squared length (m2).
+        per_squared: 1 / `squared`; 0 for a segment that is too short to divide by, as of a loop.
+        per_second: 1 / the duration (s); 0 for a segment of no duration.
+    """
+
+    starts: NDArray[np.intp]
+    chords: NDArray[np.float64]
+    squared: Numbers
+    per_squared: Numbers
+    per_second: Numbers
+
+    @classmethod
+    def between(cls, path: _Path, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> _Segments:
+        """Returns the segments of intervals of a path."""
+        chords = path.coordinates[:, ends] - path.coordinates[:, starts]
+        squared = (chords * chords).sum(axis=0)
+        duration = path.clock[ends] - path.clock[starts]
+        nothing = np.zeros(len(starts))
+        is_long = squared > _SHORTEST_SQUARED
+        per_squared = np.divide(1.0, squared, out=nothing.copy(), where=is_long)
+        per_second = np.divide(1.0, duration, out=nothing, where=duration > 0)
+        return cls(starts, chords, squared, per_squared, per_second)
+
+    def squared_deviations(
+        self, path: _Path, at: NDArray[np.intp], interval: NDArray[np.intp], reached: float
+    ) -> tuple[Numbers, float]:
+        """Returns the squared deviation (m2) of points, and how far along they reached.
+
+        Args:
+            path: the path.
+            at: the indices of the points, ascending.
+            interval: the interval that each point lies in.
+            reached: what the call for the points before returned, if those lie in the same
+                interval as the first of these; else 0.
+        """
+        start = self.starts[interval]
+        # `coordinates[:, at]` would be in the order of `at` in memory, which is slow to add up.
+        chord = self.chords.take(interval, axis=1)
+        here = path.coordinates.take(at, axis=1) - path.coordinates.take(start, axis=1)
+        along = ((here * chord).sum(axis=0) * self.per_squared[interval]).clip(0.0, 1.0)
+        off = ((here - along * chord) ** 2).sum(axis=0)
+        # How far along earlier points of the same interval are: those of each interval are greater
+        # by 2 than all of the interval before.
+        farthest = along + 2.0 * interval
+        farthest[0] = max(farthest[0], reached)
+        np.maximum.accumulate(farthest, out=farthest)
+        back = farthest - 2.0 * interval - along
+        np.maximum(off, back * back * self.squared[interval] * _BACKWARDS_WEIGHT, out=off)
+        per_second = self.per_second[interval]
+        on_time = (path.clock[at] - path.clock[start]) * per_second
+        late = ((here - on_time * chord) ** 2).sum(axis=0) * path.of_time**2
+        np.maximum(off, np.where(per_second > 0, late, 0.0), out=off)
+        return off, float(farthest[-1])
+
+
+def _farthest_of_each(path: _Path, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> _Farthest:
     """Finds the point of each interval with the largest deviation from the segment of its ends.
 
-    Intervals are in order and have a point inside.
-
-    Returns:
-        The squared deviation (m2) of each, and its index.
+    Intervals are in order and have a point inside. Of equal deviations the first point counts.
     """
-    chords = columns[:, ends] - columns[:, starts]
-    squared = (chords * chords).sum(axis=0)
-    # A chord that is too short to divide by is a point, as that of a closed loop.
-    scale = np.divide(1.0, squared, out=np.zeros(len(squared)), where=squared > _SHORTEST_SQUARED)
-    lasted = clock[ends] - clock[starts]
-    rate = np.divide(1.0, lasted, out=np.zeros(len(lasted)), where=lasted > 0)
+    segments = _Segments.between(path, starts, ends)
+    # The inner points of all intervals, one after the other, are looked at in blocks.
     stops = np.cumsum(ends - starts - 1)
     begins = stops - (ends - starts - 1)
-    most, where = np.zeros(len(starts)), starts + 1
+    squared, point = np.zeros(len(starts)), starts + 1
     reached = 0.0
     for low in range(0, int(stops[-1]), _TOGETHER):
         high = min(low + _TOGETHER, int(stops[-1]))
@@ -276,29 +336,14 @@ def _farthest_of_each(
         edges = np.append(begins[first:end], high).clip(low)
         interval = np.repeat(np.arange(first, end), np.diff(edges))
         at = np.arange(low, high) + (starts + 1 - begins)[interval]
-        # `columns[:, at]` would be in the order of `at` in memory, which is slow to add up.
-        chord = chords.take(interval, axis=1)
-        here = columns.take(at, axis=1) - columns.take(starts[interval], axis=1)
-        along = ((here * chord).sum(axis=0) * scale[interval]).clip(0.0, 1.0)
-        off = ((here - along * chord) ** 2).sum(axis=0)
-        # How far along the points before are, of each interval alone: those of a later interval
-        # are greater by 2 than all before.
-        farthest = along + 2.0 * interval
-        if begins[first] < low:
-            farthest[0] = max(farthest[0], reached)
-        np.maximum.accumulate(farthest, out=farthest)
-        reached = farthest[-1]
-        back = farthest - 2.0 * interval - along
-        np.maximum(off, back * back * squared[interval] * _BACKWARDS_WEIGHT, out=off)
-        on_time = (clock[at] - clock[starts[interval]]) * rate[interval]
-        late = ((here - on_time * chord) ** 2).sum(axis=0) * of_time**2
-        np.maximum(off, np.where(rate[interval] > 0, late, 0.0), out=off)
+        is_continued = begins[first] < low
+        off, reached = segments.squared_deviations(
+            path, at, interval, reached if is_continued else 0.0
+        )
         greatest = np.maximum.reduceat(off, edges[:-1] - low)
-        is_greater = greatest > most[first:end]
-        most[first:end][is_greater] = greatest[is_greater]
-        # The first of several that are as far: written last.
-        farthest_points = np.flatnonzero((off == most[interval]) & is_greater[interval - first])[
-            ::-1
-        ]
-        where[interval[farthest_points]] = at[farthest_points]
-    return most, where
+        is_greater = greatest > squared[first:end]
+        squared[first:end][is_greater] = greatest[is_greater]
+        is_farthest = (off == squared[interval]) & is_greater[interval - first]
+        last_to_first = np.flatnonzero(is_farthest)[::-1]  # the first of several is written last
+        point[interval[last_to_first]] = at[last_to_first]
+    return _Farthest(starts, ends, squared, point)
