@@ -30,7 +30,7 @@ _MOST_KNOWN: Final = 1 << 14
 
 
 class Identity(NamedTuple):
-    """Shows whether a directory is the very one that was seen before, and not another of its name.
+    """Tells a directory from another one that later has its name.
 
     An inode number alone does not: ext4 gives a directory that was deleted and restored its number
     again. Its generation (FS_IOC_GETVERSION) does: ext4, XFS, Btrfs and F2FS choose a new one for
@@ -41,12 +41,12 @@ class Identity(NamedTuple):
     generation: int | None = None
 
     def matches(self, listed: Identity) -> bool:
-        """Returns whether this is the directory that was listed under an identity."""
+        """Returns whether this is the directory that was listed with an identity."""
         return self.inode == listed.inode and listed.generation in {None, self.generation}
 
 
 def identity_of(directory: Path | str) -> Identity | None:
-    """Returns the identity of a directory; None if there is none of that name, or a link.
+    """Returns the identity of a directory; None if it is a link, or missing.
 
     Raises:
         OSError: the directory cannot be opened.
@@ -58,15 +58,15 @@ def identity_of(directory: Path | str) -> Identity | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     try:
-        return identity_at(descriptor)
+        return _identity_at(descriptor)
     finally:
         os.close(descriptor)
 
 
 def known_identity(directory: str) -> Identity | None:
-    """Returns the identity of a directory as `identity_of` does; None if it cannot be opened.
+    """Returns `identity_of` a directory from a cache; None if the directory cannot be opened.
 
-    It is opened again only after its entries or its attributes changed.
+    The directory is opened again after its entries or its attributes changed.
     """
     try:
         status = os.stat(directory, follow_symlinks=False)  # noqa: PTH116 - called for many
@@ -80,7 +80,7 @@ def _identity_as_of(directory: str, _inode: int, _ctime_ns: int) -> Identity | N
     return identity_of(directory)
 
 
-def identity_at(descriptor: int) -> Identity:
+def _identity_at(descriptor: int) -> Identity:
     """Returns the identity of an open directory."""
     inode = os.fstat(descriptor).st_ino
     try:
@@ -91,12 +91,12 @@ def identity_at(descriptor: int) -> Identity:
 
 
 def mode_of(path: Path) -> int:
-    """Returns `st_mode` of a path, of a symbolic link its own; 0 where there is nothing.
+    """Returns `st_mode` of a path without following a link; 0 if nothing is there.
 
-    Not by `Path.exists`, which takes what the disk does not tell for missing since Python 3.14.
+    `Path.exists` would not do: since Python 3.14 it takes a disk that fails for a missing file.
 
     Raises:
-        OSError: the disk does not tell.
+        OSError: the disk fails.
     """
     try:
         return path.lstat().st_mode
@@ -105,10 +105,10 @@ def mode_of(path: Path) -> int:
 
 
 def is_folder(path: Path) -> bool:
-    """Returns whether it is a directory, and not a link to one.
+    """Returns whether a path is a directory, and not a link to one.
 
     Raises:
-        OSError: the disk does not tell.
+        OSError: the disk fails.
     """
     return stat.S_ISDIR(mode_of(path))
 
@@ -116,9 +116,10 @@ def is_folder(path: Path) -> bool:
 def walk(
     root: Path, on_error: Callable[[OSError], object] = lambda _: None
 ) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
-    """Yields a directory and each below it, with their entries; skips what cannot be listed.
+    """Yields a directory and every directory below it, each with its entries.
 
-    The root may be a link; none below it is followed.
+    `on_error` is called for a directory that cannot be listed. The root may be a link; no link
+    below it is followed.
     """
     waiting = [os.fspath(root)]
     while waiting:
@@ -134,7 +135,7 @@ def walk(
 
 
 def files_below(root: Path, suffix: str) -> Iterator[Path]:
-    """Yields the files below a directory with a suffix, links to files included, in no order."""
+    """Yields the files below a directory whose names end so, also links to files, in no order."""
     for path, entries in walk(root):
         for entry in entries:
             if entry.name.endswith(suffix) and entry.is_file():
@@ -142,7 +143,7 @@ def files_below(root: Path, suffix: str) -> Iterator[Path]:
 
 
 def remove(root: Path) -> None:
-    """Deletes a directory and all below it, as far as possible."""
+    """Deletes a directory and everything below it, as far as possible."""
     folders = []
     for path, entries in walk(root):
         folders.append(path)
@@ -157,16 +158,16 @@ def remove(root: Path) -> None:
 
 @contextmanager
 def opened(root: Path, path: Path) -> Iterator[int]:
-    """Yields a descriptor of the root or a directory below it, opened without following a link.
+    """Opens the root or a directory below it without following a link; yields the descriptor.
 
     Raises:
-        OSError: it cannot be opened; `LINK_NOT_FOLLOWED` where it lies behind a link.
+        OSError: the directory cannot be opened; `LINK_NOT_FOLLOWED` if it lies behind a link.
     """
     parts = path.relative_to(root).parts
     descriptor = os.open(root, _PASSABLE if parts else _LISTABLE)
     try:
-        for nth, name in enumerate(parts, start=1):
-            flags = (_LISTABLE if nth == len(parts) else _PASSABLE) | os.O_NOFOLLOW
+        for depth, name in enumerate(parts, start=1):
+            flags = (_LISTABLE if depth == len(parts) else _PASSABLE) | os.O_NOFOLLOW
             try:
                 inner = os.open(name, flags, dir_fd=descriptor)
             except NotADirectoryError as error:
@@ -179,14 +180,14 @@ def opened(root: Path, path: Path) -> Iterator[int]:
 
 
 def make(root: Path, path: Path) -> None:
-    """Makes a directory below the root, and its parents, but not the root, a disk of its own maybe.
+    """Makes a directory below the root, and its parents; not the root, which may be a mount point.
 
     Raises:
-        OSError: it cannot be made, or would lie behind a link.
+        OSError: a directory cannot be made, or would lie behind a link.
     """
-    parts = path.relative_to(root).parts
-    for depth in range(1, len(parts) + 1):
-        folder = root.joinpath(*parts[:depth])
+    folder = root
+    for name in path.relative_to(root).parts:
+        folder /= name
         folder.mkdir(exist_ok=True)
         if folder.is_symlink():
             reason = f"{folder.name} is a symbolic link, which is not followed"
@@ -194,13 +195,13 @@ def make(root: Path, path: Path) -> None:
 
 
 def link_in(path: Path) -> Path | None:
-    """Returns the first symbolic link in a path, itself included; None without one."""
+    """Returns the first symbolic link on the way to a path, or the path if it is one; else None."""
     whole = path.absolute()
     return next((part for part in (*reversed(whole.parents), whole) if part.is_symlink()), None)
 
 
 def _link_error(error: OSError, name: str, directory: int, path: Path) -> OSError:
-    """Returns `LINK_NOT_FOLLOWED` if the name is a link, else the error."""
+    """Returns an error that says `LINK_NOT_FOLLOWED` if the name is a link; else `error`."""
     try:
         mode = os.stat(name, dir_fd=directory, follow_symlinks=False).st_mode
     except OSError:

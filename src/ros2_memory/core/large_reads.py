@@ -1,4 +1,4 @@
-"""Lets one question at a time hold much of a bag: some kilobytes of it decompress to gigabytes."""
+"""Lets one thread at a time hold much of a bag: some kilobytes of it decompress to gigabytes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 LARGE_BYTES: Final = 4 << 20
-"""Up to so much of a bag any thread holds at once; who needs more waits for its turn."""
+"""Bytes of bags that any thread may hold; one that needs more waits for its turn."""
 _LOOKED_S: Final = 0.1
-"""How often one that waits looks whether its time is over."""
+"""How often a thread that waits calls `check`."""
 
 
 class _Block:
-    """A block of one thread, which may have the turn."""
+    """The block of `during` that a thread is in, and whether it has the turn."""
 
     def __init__(self, check: Callable[[], None], waited: Callable[[Ns], None]) -> None:
         self.check = check
@@ -31,13 +31,13 @@ class _Block:
 
 
 class LargeReads:
-    """The turn to hold more than `LARGE_BYTES` of bags, of all threads that share it. Thread-safe.
+    """The turn to hold more than `LARGE_BYTES` of bags: one thread has it at a time. Thread-safe.
 
-    A thread takes it when it first needs it, and has it until its block ends: so what it holds
-    always lets it go on, and whoever waits holds little. Outside of blocks nothing waits, as in
-    programs that do one thing at a time.
+    A thread takes the turn when it first needs it, and keeps it until its block of `during` ends:
+    so a thread that holds much can always go on, and one that waits holds little. Outside of a
+    block nothing waits, as in programs that do one thing at a time.
 
-    No thread may wait for it with a lock that is taken by one that has it.
+    No thread may wait for the turn while it has a lock that the thread with the turn may take.
     """
 
     def __init__(self) -> None:
@@ -51,14 +51,13 @@ class LargeReads:
         check: Callable[[], None] = lambda: None,
         waited: Callable[[Ns], None] = lambda _: None,
     ) -> Iterator[None]:
-        """Within the block this thread may have to wait, and in the end its turn is over.
+        """Lets this thread wait for the turn within the block, and ends its turn after it.
 
         Args:
-            check: raises where the time of who waits is over.
-            waited: is called with how long it waited.
+            check: is called while it waits; raises if its time is over.
+            waited: is called with the time that it waited.
         """
-        before = self._block_of_thread
-        if before is not None:
+        if self._block_of_thread is not None:
             yield
             return
         block = self._own.block = _Block(check, waited)
@@ -70,7 +69,7 @@ class LargeReads:
 
     @contextmanager
     def exempt(self) -> Iterator[None]:
-        """Within the block this thread never waits: for what is done under a lock."""
+        """Lets this thread never wait within the block, which holds a lock."""
         before, self._own.block = self._block_of_thread, None
         try:
             yield
@@ -78,7 +77,7 @@ class LargeReads:
             self._own.block = before
 
     def acquire(self) -> None:
-        """Waits until this thread may hold more than `LARGE_BYTES`. Raises what `check` does."""
+        """Waits until this thread has the turn. Raises what `check` raises."""
         block = self._block_of_thread
         if block is None or block.has_turn:
             return
@@ -98,7 +97,7 @@ class LargeReads:
             block.waited(time.perf_counter_ns() - begun)
 
     def release(self) -> None:
-        """Ends the turn of this thread, which holds nothing large at the moment, if it has it."""
+        """Ends the turn of this thread before its block ends: it holds nothing large now."""
         block = self._block_of_thread
         if block is not None:
             self._end(block)
@@ -110,7 +109,7 @@ class LargeReads:
     def _end(self, block: _Block) -> None:
         if not block.has_turn:
             return
-        # Before another one's turn, which adds to what is not given back.
+        # First of all: the next thread adds to the memory that is not returned.
         return_free_memory()
         with self._changed:
             block.has_turn = False

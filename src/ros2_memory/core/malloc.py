@@ -13,18 +13,18 @@ _KEPT: Final = 64 << 20
 
 
 def share_one_arena() -> None:
-    """Has threads that start later share one heap: each of their own keeps what it has freed."""
+    """Makes threads that start later share one heap: a heap of its own keeps what it has freed."""
     _set(_ARENA_MAX, 1)
 
 
 def return_large_at_once() -> None:
-    """Has blocks of 64 KiB and more go back to the system when they are freed, which takes time."""
+    """Returns blocks of 64 KiB and more to the system when they are freed, which takes time."""
     _set(_MMAP_THRESHOLD, _LARGE)
     _set(_TRIM_THRESHOLD, _LARGE)
 
 
 def keep_freed() -> None:
-    """Has up to 64 MiB of freed memory stay with the process, which takes it again sooner."""
+    """Keeps up to 64 MiB of freed memory, which is then allocated again sooner."""
     _set(_MMAP_THRESHOLD, _KEPT // 2)
     _set(_TRIM_THRESHOLD, _KEPT)
 

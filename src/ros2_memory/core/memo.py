@@ -1,4 +1,4 @@
-"""What was derived from an object and is remembered as long as that object lives."""
+"""Values derived from an object, which live as long as the object."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class Key(Generic[T]):
 
 
 class Memo:
-    """Values by key, each made once. Thread-safe; two threads may both make one, and one stays."""
+    """Values by key, each made on demand. Thread-safe: if two threads make one, the first stays."""
 
     def __init__(self) -> None:
         self._values: dict[Key[object], object] = {}
 
     def of(self, key: Key[T], make: Callable[[], T]) -> T:
-        """Returns the value of a key; makes it where it is asked for the first time."""
+        """Returns the value of a key; makes it at the first call."""
         name = cast("Key[object]", key)
         if name not in self._values:
             return cast("T", self._values.setdefault(name, make()))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 PLAIN_KINDS: Final = (".mcap", ".db3")
 UNMARKED_KINDS: Final = frozenset({".db3"})
-"""Those of which a file does not show whether its writer has finished."""
+"""Kinds whose files do not show whether their writer has finished."""
 COMPRESSED: Final = ".zstd"
 BAG_KINDS: Final = (*PLAIN_KINDS, *(f"{kind}{COMPRESSED}" for kind in PLAIN_KINDS))
 """Suffixes of bag files, whichever adapter reads them."""
@@ -45,7 +45,7 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 
 
 def _whole_us(time: Ns) -> Ns:
-    """Returns a time rounded to whole microseconds, half of one up."""
+    """Rounds a time to whole microseconds, half a microsecond up."""
     return (time + NS_PER_US // 2) // NS_PER_US * NS_PER_US
 
 
@@ -102,9 +102,8 @@ class TimeWindow:
     def asked(self) -> Span:
         """Returns the inclusive bounds that were asked for, without the tolerance of floats.
 
-        They are whole microseconds, as a float of seconds states them.
-
-        Of a window that was clamped to less than the tolerance, its start twice.
+        They are rounded to microseconds, which a float of seconds resolves. A window that was
+        clamped to less than the tolerance gives its start twice.
         """
         start = _whole_us(self.start + START_SLACK_NS)
         return start, max(start, _whole_us(self.stop - 1 - AT_OR_BEFORE_SLACK_NS))
@@ -127,12 +126,12 @@ class TimeWindow:
         return TimeWindow(start, max(start, min(self.stop, other.stop)))
 
     def aligned(self, length: Ns) -> TimeWindow:
-        """Returns the slices of the clock of a length that this window is in."""
+        """Returns the window widened to multiples of a length at both ends."""
         start, stop = self.start // length * length, -(-self.stop // length) * length
         return TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
 
     def widened(self, by: Ns) -> TimeWindow:
-        """Returns a window that is longer by this on both sides."""
+        """Returns the window widened by a duration at both ends."""
         return TimeWindow(max(self.start - by, MIN_NS), min(self.stop + by, MAX_NS))
 
     @property
@@ -153,9 +152,12 @@ class BagState(StrEnum):
 class BagFile(NamedTuple):
     """One bag file that answers queries (of any state but damaged, and not empty).
 
-    `file` is its path as a string, to save memory: the index keeps 60,000. `start` and `end` are
-    the log times of its first and last message, both inclusive. `sidecar_ns` is the mtime of
-    `handover.json` beside it, which decides which of its messages count, or 0.
+    Attributes:
+        file: the path, as a string to save memory: the index keeps 60,000.
+        start: the log time of the first message.
+        end: the log time of the last message (inclusive).
+        sidecar_ns: the mtime of `handover.json` beside the file, which decides which of its
+            messages count; 0 without one.
     """
 
     file: str
@@ -169,7 +171,7 @@ class BagFile(NamedTuple):
 
     @property
     def identity(self) -> tuple[str, int, Ns, Ns, Ns, Ns]:
-        """What tells the messages that count from those that its file had at any other time."""
+        """Equal only while the same messages of the file count."""
         return self.file, self.size, self.mtime_ns, self.sidecar_ns, self.start, self.end
 
     @property
@@ -184,7 +186,7 @@ class BagFile(NamedTuple):
         return folder_path(folder or slash)
 
     def reaches_into(self, window: TimeWindow) -> bool:
-        """Whether it may have messages in a window, as it begins and ends."""
+        """Returns whether the bag's span overlaps a window."""
         return window.overlaps(self.start, self.end)
 
 
@@ -197,10 +199,12 @@ folder_path = lru_cache(maxsize=_CACHED_PATHS)(Path)
 class SetAside:
     """A file that does not answer: active, damaged, or of a kind that the adapter does not read.
 
-    `written` is when it was last written to; None where that is unknown, or goes on. `answers`: it
-    is active, and its complete chunks answer all the same, up to `until` (the log time of their
-    last message, inclusive; None where none is on disk yet). `growing`: two scans saw it grow, or a
-    live recorder names it; another active file may as well have been left open by a crash.
+    Attributes:
+        written: when the file was last written to; None if that is unknown, or goes on.
+        answers: whether the file is active, and its complete chunks answer all the same.
+        until: the log time of the last message that answers (inclusive); None without one.
+        growing: whether two scans saw the file grow, or a live recorder names it; another active
+            file may as well have been left open by a crash.
     """
 
     path: Path
@@ -223,8 +227,8 @@ class Sample:
 class Pose:
     """Position (m) and orientation in `frame_id`; a zero or NaN quaternion is no orientation.
 
-    `frame_id` is empty where the message names none. `places` are the named places that it is
-    in, the smallest first, if that was asked for.
+    `frame_id` is empty if the message names no frame. `places` are the named places around the
+    position, the smallest first, if they were asked for.
     """
 
     position: Vector3
@@ -237,7 +241,7 @@ class Pose:
 class Geodetic:
     """A position on Earth (WGS 84): degrees north and east, metres above the ellipsoid or NaN.
 
-    `has_fix` is False where the receiver says that it has none (`NavSatStatus.STATUS_NO_FIX`).
+    `has_fix` is False if the receiver reports `NavSatStatus.STATUS_NO_FIX`.
     """
 
     latitude: float
@@ -266,7 +270,7 @@ class Transform:
 
 @dataclass(frozen=True, slots=True)
 class FrameEdge:
-    """A parent and child pair; `static` where no dynamic message names the pair."""
+    """A parent and a child frame; `static` unless a message of /tf names the pair."""
 
     parent: str
     child: str
@@ -287,11 +291,11 @@ class StampedTransform:
 
 @dataclass(frozen=True, slots=True)
 class Selected:
-    """The rows that a statement of SQL found.
+    """The rows that a statement of SQL selected.
 
     Attributes:
-        columns: their names.
-        rows: each a list of values as JSON; times, which it has not, are texts.
+        columns: the names of the columns.
+        rows: the values of each row as JSON; times are texts.
         is_cut: whether there are more rows.
     """
 

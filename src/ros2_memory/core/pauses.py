@@ -1,6 +1,6 @@
-"""Pauses of a bag: from one message to the next, of any topic, nothing was logged for a while.
+"""Pauses of a bag: times of half a second or more without a message of any topic.
 
-And those of one topic alone, which are much longer: they may be silences.
+And absences of one topic, which are much longer: they may be silences.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.arrays import Ints
 
 Pauses: TypeAlias = "tuple[Span, ...]"
-"""From the log time of the last message before each to that of the first after it, in order."""
+"""The log times of the last message before each pause and of the first one after it, in order."""
 CountedPause: TypeAlias = "tuple[Ns, Ns, int]"
 """A pause, and how many messages the bag has before it."""
 Absences: TypeAlias = "tuple[tuple[str, tuple[CountedPause, ...]], ...]"
@@ -28,11 +28,11 @@ SHORTEST_SILENCE_NS: Final[Ns] = 30 * NS_PER_S
 SILENT_PERIODS: Final = 20
 """A topic is silent after so many of its periods without a message."""
 _PERIODS: Final = 1.5
-"""Half of those of a gap: in a bag with long pauses the mean period is longer than the usual."""
+"""Half as many as make a gap: in a bag with long pauses the mean period exceeds the usual one."""
 _CHAINED: Final = 3
-"""A pause among those of slow topics is one of them unless it is so many times as long."""
+"""A pause in a chain belongs to slow topics unless it is so many times as long as the median."""
 _MOST: Final = 64
-"""The longest pauses of a bag are stated."""
+"""Pauses that the summary of a bag states: the longest ones."""
 
 
 def pauses_among(
@@ -42,54 +42,73 @@ def pauses_among(
     *,
     longer_than: Ns = SHORTEST_PAUSE_NS,
 ) -> list[CountedPause]:
-    """Returns the pauses between spans of log time (inclusive), in any order, of some messages."""
+    """Returns the pauses between spans of messages, given in any order.
+
+    Args:
+        firsts: the first log time of each span.
+        lasts: the last log time of each span (inclusive).
+        counts: the number of messages in each span.
+        longer_than: shorter pauses are left out.
+    """
     order = np.argsort(firsts, kind="stable")
     begins, reach = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
-    apart = begins - reach > longer_than
+    is_pause = begins - reach > longer_than
     columns = (reach, begins, np.cumsum(counts[order])[:-1])
-    return [*zip(*(column[apart].tolist() for column in columns), strict=True)]
+    return [*zip(*(column[is_pause].tolist() for column in columns), strict=True)]
 
 
 def noteworthy(pauses: Sequence[CountedPause], counts: Sequence[int], length: Ns) -> Pauses:
-    """Returns the pauses that may be more than what lies between messages of slow topics.
+    """Returns the pauses of a bag that may be more than the time between messages of slow topics.
 
-    That is where frequent topics come back after each. While they are off and slow ones go on, one
-    pause follows the other, with some messages between them.
+    While frequent topics are off, the slow ones go on: one pause follows the other, with few
+    messages in between. Of such a chain only pauses that are much longer than its median count.
 
     Args:
-        pauses: of a bag, in order.
-        counts: how many messages it has of each topic.
+        pauses: of the bag, in order.
+        counts: how many messages the bag has of each topic.
         length: from its first message to its last.
     """
     if not pauses:
         return ()
-    slower = _PERIODS * length / sorted(counts, reverse=True)[:2][-1]
+    *_, second_most = sorted(counts, reverse=True)[:2]
+    slow_period = _PERIODS * length / second_most
     chains: list[list[CountedPause]] = []
-    since, sent_before = MIN_NS, 0
+    chain_end, sent_before = MIN_NS, 0
     for start, end, sent in pauses:
-        if end - start > slower:
-            if sent - sent_before > max(len(counts), (start - since) / slower) or not chains:
-                chains.append([])
-            chains[-1].append((start, end, sent))
-            since, sent_before = end, sent
-    longer = [
-        (start, end) for chain in chains for start, end, _ in chain if end - start > _usual(chain)
-    ]
-    longer.sort(key=lambda pause: pause[0] - pause[1])  # the longest first
-    return tuple(sorted(longer[:_MOST]))
+        if end - start <= slow_period:
+            continue
+        # Between two chains frequent topics come back, with more messages than slow ones send.
+        expected = max(len(counts), (start - chain_end) / slow_period)
+        if not chains or sent - sent_before > expected:
+            chains.append([])
+        chains[-1].append((start, end, sent))
+        chain_end, sent_before = end, sent
+    long: list[CountedPause] = []
+    for chain in chains:
+        lengths = sorted(end - start for start, end, _ in chain)
+        median = lengths[(len(chain) - 1) // 2]
+        limit = _CHAINED * median if len(chain) > 1 else 0
+        long += (pause for pause in chain if _length(pause) > limit)
+    return tuple((start, end) for start, end, _ in _longest(long))
 
 
 def absences_of(pauses: Sequence[CountedPause], count: int, length: Ns) -> tuple[CountedPause, ...]:
     """Returns the longest pauses of a topic that are far longer than its mean period in a bag.
 
-    `count` and `length`: how many messages of it the bag has, and from the first to the last.
+    Args:
+        pauses: of the topic.
+        count: how many messages of the topic the bag has.
+        length: from the first of these messages to the last.
     """
     limit = SILENT_PERIODS * length // max(count - 1, 1)
-    longer = [pause for pause in pauses if pause[1] - pause[0] > limit]
-    return tuple(sorted(sorted(longer, key=lambda pause: pause[0] - pause[1])[:_MOST]))
+    return _longest([pause for pause in pauses if _length(pause) > limit])
 
 
-def _usual(chain: Sequence[CountedPause]) -> Ns:
-    """Returns how long pauses of a chain may be; 0 for one that stands alone."""
-    lengths = sorted(end - start for start, end, _ in chain)
-    return _CHAINED * lengths[(len(chain) - 1) // 2] if len(chain) > 1 else 0
+def _length(pause: CountedPause) -> Ns:
+    start, end, _ = pause
+    return end - start
+
+
+def _longest(pauses: list[CountedPause]) -> tuple[CountedPause, ...]:
+    """Returns the `_MOST` longest pauses, in order of time."""
+    return tuple(sorted(sorted(pauses, key=_length, reverse=True)[:_MOST]))

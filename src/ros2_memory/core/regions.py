@@ -1,4 +1,4 @@
-"""Regions of the plane: circles, boxes and polygons, and when a path is inside of one.
+"""Regions of the plane: circles, boxes and polygons, and the parts of a path inside of them.
 
 Lengths are metres. The border of a region is inside.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,10 +23,12 @@ Floats: TypeAlias = "NDArray[np.float64]"
 Point: TypeAlias = "tuple[float, float]"
 Bounds: TypeAlias = "tuple[float, float, float, float]"
 """The least and greatest x, and the least and greatest y."""
+_NEVER: Final = (2.0, -1.0)
+"""The shares of a step that is never inside: no share from 0 to 1 lies between them."""
 
 
 class Steps(NamedTuple):
-    """Straight steps of a path: where each begins and ends."""
+    """Straight steps of a path, from (x, y) to (to_x, to_y)."""
 
     x: Floats
     y: Floats
@@ -34,16 +36,16 @@ class Steps(NamedTuple):
     to_y: Floats
 
     def nearest_to(self, x: float, y: float) -> tuple[Floats, Floats]:
-        """Returns at which share of each step it is nearest to a point, and how far from it."""
+        """Returns the share of each step that is nearest to a point, and its distance (m)."""
         along_x, along_y = self.to_x - self.x, self.to_y - self.y
-        size = along_x * along_x + along_y * along_y
+        squared = along_x * along_x + along_y * along_y
         share = (x - self.x) * along_x + (y - self.y) * along_y
-        share = (share / np.where(size > 0, size, 1.0)).clip(0.0, 1.0)
+        share = (share / np.where(squared > 0, squared, 1.0)).clip(0.0, 1.0)
         return share, np.hypot(self.x + share * along_x - x, self.y + share * along_y - y)
 
 
 class ClippedSteps(NamedTuple):
-    """Parts of steps: which step, and from which share of it to which (0 to 1)."""
+    """Parts of steps: the index of the step, and the shares (0 to 1) at which the part lies."""
 
     step: NDArray[np.intp]
     start: Floats
@@ -69,7 +71,10 @@ class Circle:
         return x - radius, x + radius, y - radius, y + radius
 
     def shares_inside(self, steps: Steps) -> tuple[Floats, Floats]:
-        """Returns from and to which share each step is inside; reversed where it never is."""
+        """Returns from which to which share each step is inside; `_NEVER` if it never is.
+
+        A point at share s of a step is on the circle where a s^2 + 2 b s + c = 0.
+        """
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
         px, py = steps.x - self.x, steps.y - self.y
         a = dx * dx + dy * dy
@@ -77,13 +82,14 @@ class Circle:
         c = px * px + py * py - self.radius_m * self.radius_m
         moves = a > 0
         with np.errstate(over="ignore", invalid="ignore"):  # a radius may be 1e308
-            within = b * b - a * c
-        root = np.sqrt(np.maximum(within, 0.0))
-        size = np.where(moves, a, 1.0)
-        start = np.where(moves, (-b - root) / size, 0.0)
-        stop = np.where(moves, (-b + root) / size, 1.0)
-        meets = np.where(moves, within >= 0, c <= 0)
-        return np.where(meets, start, 2.0), np.where(meets, stop, -1.0)
+            discriminant = b * b - a * c
+        root = np.sqrt(np.maximum(discriminant, 0.0))
+        divisor = np.where(moves, a, 1.0)
+        start = np.where(moves, (-b - root) / divisor, 0.0)
+        stop = np.where(moves, (-b + root) / divisor, 1.0)
+        meets = np.where(moves, discriminant >= 0, c <= 0)
+        never_start, never_stop = _NEVER
+        return np.where(meets, start, never_start), np.where(meets, stop, never_stop)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +111,7 @@ class Rectangle:
         return self.min_x, self.max_x, self.min_y, self.max_y
 
     def shares_inside(self, steps: Steps) -> tuple[Floats, Floats]:
-        """Returns from and to which share each step is inside; reversed where it never is."""
+        """Returns from which to which share each step is inside; the first is greater if never."""
         start, stop = np.zeros(len(steps.x)), np.ones(len(steps.x))
         for at, to, low, high in (
             (steps.x, steps.to_x, self.min_x, self.max_x),
@@ -113,11 +119,12 @@ class Rectangle:
         ):
             along = to - at
             moves = along != 0
-            size = np.where(moves, along, 1.0)
-            to_low, to_high = (low - at) / size, (high - at) / size
-            still = (at >= low) & (at <= high)
-            start = np.maximum(start, np.where(moves, np.minimum(to_low, to_high), ~still * 2.0))
-            stop = np.minimum(stop, np.where(moves, np.maximum(to_low, to_high), 1.0))
+            divisor = np.where(moves, along, 1.0)
+            at_low, at_high = (low - at) / divisor, (high - at) / divisor
+            is_between = (at >= low) & (at <= high)
+            start_if_still = np.where(is_between, 0.0, _NEVER[0])
+            start = np.maximum(start, np.where(moves, np.minimum(at_low, at_high), start_if_still))
+            stop = np.minimum(stop, np.where(moves, np.maximum(at_low, at_high), 1.0))
         return start, stop
 
 
@@ -128,7 +135,7 @@ class Polygon:
     corners: tuple[Point, ...]
 
     def contains(self, x: float, y: float) -> bool:
-        """Returns whether a point is inside; of the border itself, either."""
+        """Returns whether a point is inside; a point on the border may count as either."""
         return bool(_inside(self.corners, np.array([x]), np.array([y]))[0])
 
     @property
@@ -138,7 +145,7 @@ class Polygon:
         return min(xs), max(xs), min(ys), max(ys)
 
     def clipped(self, steps: Steps) -> ClippedSteps:
-        """Returns the parts of steps inside: between the crossings of the polygon's sides."""
+        """Returns the parts of steps inside: those between two crossings whose middle is inside."""
         cuts = self._cuts(steps)
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
         middle = (cuts[1:] + cuts[:-1]) / 2
@@ -154,9 +161,9 @@ class Polygon:
         )
 
     def _cuts(self, steps: Steps) -> Floats:
-        """Returns the shares at which each step (a column) meets a side, ascending, with 0 and 1.
+        """Returns the shares at which steps (columns) cross sides, ascending between 0 and 1.
 
-        1 stands for each side that it does not meet, too.
+        The share is 1 for a side that the step does not cross.
         """
         count = len(steps.x)
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
@@ -164,11 +171,11 @@ class Polygon:
         for (ax, ay), (bx, by) in pairwise((*self.corners, self.corners[0])):
             side_x, side_y = bx - ax, by - ay
             cross = dx * side_y - dy * side_x
-            size = np.where(cross != 0, cross, 1.0)
-            along = ((ax - steps.x) * side_y - (ay - steps.y) * side_x) / size
-            beside = ((ax - steps.x) * dy - (ay - steps.y) * dx) / size
-            meets = (cross != 0) & (along > 0) & (along < 1) & (beside >= 0) & (beside <= 1)
-            cuts.append(np.where(meets, along, 1.0))
+            divisor = np.where(cross != 0, cross, 1.0)
+            of_step = ((ax - steps.x) * side_y - (ay - steps.y) * side_x) / divisor
+            of_side = ((ax - steps.x) * dy - (ay - steps.y) * dx) / divisor
+            on_both = (of_step > 0) & (of_step < 1) & (of_side >= 0) & (of_side <= 1)
+            cuts.append(np.where((cross != 0) & on_both, of_step, 1.0))
         return np.sort(np.stack(cuts), axis=0)
 
 
@@ -189,17 +196,17 @@ class AnyOf:
         return min(low_x), max(high_x), min(low_y), max(high_y)
 
     def clipped(self, steps: Steps) -> ClippedSteps:
-        """Returns the parts of steps inside; what lies in two regions is one part."""
+        """Returns the parts of steps inside; parts that overlap or touch are one part."""
         parts = [clipped(region, steps) for region in self.regions]
         step, start, stop = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         if not len(step):
             return ClippedSteps(step, start, stop)
         order = np.lexsort((start, step))
         step, start, stop = step[order], start[order], stop[order]
-        # Steps are whole numbers: so far along the path.
+        # `step + stop` ascends along the path, as shares are at most 1.
         reached = np.maximum.accumulate(step + stop)
-        new = (step[1:] != step[:-1]) | (step[1:] + start[1:] > reached[:-1])
-        begins = np.flatnonzero(np.append([True], new))
+        is_new = (step[1:] != step[:-1]) | (step[1:] + start[1:] > reached[:-1])
+        begins = np.flatnonzero(np.append([True], is_new))
         return ClippedSteps(step[begins], start[begins], np.maximum.reduceat(stop, begins))
 
 
@@ -207,8 +214,9 @@ Region: TypeAlias = "Circle | Rectangle | Polygon | AnyOf"
 
 
 def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> Flags:
+    """Returns which points lie in a polygon: a ray to greater x crosses an odd number of sides."""
     inside = np.zeros(np.shape(x), np.bool_)
-    for (ax, ay), (bx, by) in zip(corners, (*corners[1:], corners[0]), strict=True):
+    for (ax, ay), (bx, by) in pairwise((*corners, corners[0])):
         crosses = (ay > y) != (by > y)
         height = (by - ay) or 1.0
         inside ^= crosses & (x < (bx - ax) * (y - ay) / height + ax)
@@ -216,7 +224,7 @@ def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> Flags:
 
 
 def clipped(region: Region, steps: Steps) -> ClippedSteps:
-    """Returns the parts of steps that are inside of a region, in order."""
+    """Returns the parts of steps inside of a region, in order."""
     low_x, high_x, low_y, high_y = region.bounds
     near = np.flatnonzero(
         (np.minimum(steps.x, steps.to_x) <= high_x)

@@ -13,11 +13,7 @@ STOPPING: Final = "STOPPING=1"
 
 
 def notify(*assignments: str) -> bool:
-    """Notifies systemd of the state of this process by assignments such as `READY`.
-
-    Returns:
-        Whether they were sent; they are dropped where that is not possible.
-    """
+    """Sends assignments such as `READY` to systemd; returns whether they were sent."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return False
@@ -41,16 +37,16 @@ class Watchdog:
         self._due_s = 0.0
 
     def keep_alive(self) -> None:
-        """Sends `WATCHDOG=1` where half of the interval has passed; may be called at any rate."""
+        """Sends `WATCHDOG=1` if it is due; may be called at any rate."""
         if self._every_s is not None and time.monotonic() >= self._due_s:
             notify(WATCHDOG)
             self._due_s = time.monotonic() + self._every_s / 2
 
 
 def watchdog_interval_s() -> float | None:
-    """Returns how often to send `WATCHDOG`: half of the time after which systemd acts.
+    """Returns half of the time after which systemd acts without a `WATCHDOG` (WATCHDOG_USEC).
 
-    None where systemd does not expect it, or expects it of another process.
+    None if systemd expects no `WATCHDOG` of this process.
     """
     pid = os.environ.get("WATCHDOG_PID", str(os.getpid()))
     microseconds = os.environ.get("WATCHDOG_USEC", "")

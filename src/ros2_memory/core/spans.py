@@ -19,74 +19,76 @@ Spans: TypeAlias = list[Span]
 
 
 def united(spans: Iterable[Span], apart: Ns = 0) -> Spans:
-    """Returns spans, sorted; those that touch, or are no farther apart, are merged."""
+    """Merges spans that overlap, touch, or are no farther apart; returns them sorted."""
     merged: Spans = []
     for start, stop in sorted(spans):
-        if merged:
+        if merged and start - merged[-1][1] <= apart:
             last_start, last_stop = merged[-1]
-            if start - last_stop <= apart:
-                merged[-1] = last_start, max(last_stop, stop)
-                continue
-        merged.append((start, stop))
+            merged[-1] = last_start, max(last_stop, stop)
+        else:
+            merged.append((start, stop))
     return merged
 
 
 def enclosing(spans: Iterable[Span]) -> Span:
-    """Returns the earliest begin and the latest end of spans, of which there is one at least."""
-    firsts, lasts = zip(*spans, strict=True)
-    return min(firsts), max(lasts)
+    """Returns the earliest start and the latest stop of spans; there is at least one."""
+    starts, stops = zip(*spans, strict=True)
+    return min(starts), max(stops)
 
 
 def without(spans: Iterable[Span], others: Sequence[Span]) -> Spans:
-    """Returns what is left of spans outside of others, which are sorted and apart."""
-    left: Spans = []
+    """Returns the parts of spans outside of other spans, which are sorted and apart."""
+    parts: Spans = []
     for start, stop in spans:
         at = start
-        nth = bisect_right(others, start, key=itemgetter(1))
-        for begin, until in islice(others, nth, None):
-            if begin >= stop:
+        first = bisect_right(others, start, key=itemgetter(1))
+        for other_start, other_stop in islice(others, first, None):
+            if other_start >= stop:
                 break
-            if begin > at:
-                left.append((at, begin))
-            at = until
+            if other_start > at:
+                parts.append((at, other_start))
+            at = other_stop
         if at < stop:
-            left.append((at, stop))
-    return left
+            parts.append((at, stop))
+    return parts
 
 
 def lies_inside(spans: Sequence[Span], moment: Ns) -> bool:
-    """Returns whether a moment lies in one of spans that are sorted and apart."""
+    """Returns whether a moment lies in one of the spans, which are sorted and apart."""
     return overlaps_any(spans, moment, moment)
 
 
 def overlaps_any(spans: Sequence[Span], first: Ns, last: Ns) -> bool:
-    """Returns whether a time (inclusive) overlaps one of spans that are sorted and apart."""
-    nth = bisect_right(spans, first, key=lambda span: span[1])
-    return nth < len(spans) and spans[nth][0] <= last
+    """Returns whether `[first, last]` overlaps one of the spans, which are sorted and apart."""
+    nearest = bisect_right(spans, first, key=itemgetter(1))
+    if nearest == len(spans):
+        return False
+    start, _ = spans[nearest]
+    return start <= last
 
 
 def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[Span]:
     """Returns the half-open spans in which different recordings can hold copies.
 
-    That is the time that both hold, widened by the horizon at both ends; spans that touch are
-    merged.
+    That is the time that two recordings both hold, widened at both ends by `COPY_HORIZON_NS`.
 
     Args:
-        held: first and last log times (inclusive) of files or recordings, and their recording.
+        held: the first and the last log time (inclusive) of each file, and its recording.
     """
     spans: list[Span] = []
-    # What reaches farthest of all so far, and of all other recordings than that.
+    # The last time that any recording holds so far, and that any other recording than this holds.
     farthest: tuple[Ns, object] = (MIN_NS, None)
-    another: tuple[Ns, object] = (MIN_NS, None)
+    farthest_other: tuple[Ns, object] = (MIN_NS, None)
     for first, last, recording in sorted(held, key=itemgetter(0)):
-        reach, holder = another if recording == farthest[1] else farthest
-        if holder is not None and reach + COPY_HORIZON_NS >= first:
+        is_farthest = recording == farthest[1]
+        reach, other = farthest_other if is_farthest else farthest
+        if other is not None and reach + COPY_HORIZON_NS >= first:
             until = min(reach, last, MAX_NS - COPY_HORIZON_NS - 1) + COPY_HORIZON_NS + 1
             spans.append((first - COPY_HORIZON_NS, until))
-        if recording == farthest[1]:
+        if is_farthest:
             farthest = max(farthest[0], last), recording
         elif last >= farthest[0]:
-            farthest, another = (last, recording), farthest
-        elif last > another[0]:
-            another = last, recording
+            farthest, farthest_other = (last, recording), farthest
+        elif last > farthest_other[0]:
+            farthest_other = last, recording
     return united(spans)
