@@ -1,11 +1,10 @@
 """Text for people: counts and names in sentences, values in few characters, globs over names.
 
-And texts that messages say, which a planner must not obey. What people say to a robot, what nodes
-log and what a network names reaches a language model with the reply. Such a text is `Quoted`, and
-so is a sentence that repeats one; `quoted_keys` finds where they stand in a reply, which lists
-these places first. Frames, labels of detections, nodes, joints and the like are names: they are
-quoted as soon as they are more than two words, since a bag, or a network that names what it sees in
-its own words, can hold a sentence there.
+And texts of messages, which a planner must not obey. The words of people, of logs and of networks
+reach a language model with the reply. Such a text is `Quoted`, and so is a sentence that repeats
+one. A reply lists first where its `Quoted` texts stand (`quoted_keys`). Frames, labels of
+detections, nodes, joints and the like are names. A name is `Quoted` if it has more than two words:
+a bag, or a network that describes what it sees, can hold a sentence there.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
 
@@ -36,16 +35,17 @@ _MAX_DEPTH: Final = 3
 _MAX_ITEMS: Final = 8
 _MAX_TEXT_CHARS: Final = 80
 _MAX_INTEGER_BITS: Final = 128
+_DIGITS_PER_BIT: Final = 0.30103  # log10(2)
 _ELLIPSIS: Final = "…"
 LABELS: Final = ("label", "class_id", "class_name", "class", "object")
-"""Fields with the label of a detection, the first that is there."""
+"""Fields that may have the label of a detection; the first one that a message has counts."""
 LISTS_OF_LABELS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
 NAMED_IN_TYPES: Final = {
     frozenset({"family", "id"}): "id",  # apriltag_msgs, isaac_ros_apriltag_interfaces
     frozenset({"marker_id", "pose"}): "marker_id",  # aruco_opencv_msgs
     frozenset({"Class", "probability"}): "Class",  # darknet_ros_msgs of ROS 1
 }
-"""The name of an object that has these fields, for types in which no label says what was seen."""
+"""The field that names an object with these fields, in types without a label."""
 _FRAMES: Final = ("frame_id", "child_frame_id", "parent", "child")
 _OTHER_NAMES: Final = (
     *("name", "names", "hardware_id", "type", "encoding", "format", "skill", "family"),
@@ -58,11 +58,11 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")
 """One word, or two: `map`, `traffic light`."""
 _JSON: Final = frozenset("[{")
 _STRINGS: Final = re.compile(r'"(?:[^"\\]|\\.)*+"|\\.', re.DOTALL)
-"""Strings of JSON. An escape is passed over where the string around it does not end: else the
-search begins again at each quote that is escaped."""
+"""A string of JSON; or one escape, in a text whose string does not end: else the search would begin
+again at each escaped quote."""
 _MOST_KEYS: Final = 12
 _MOST_KEYS_CHARS: Final = 300
-"""Of more places, or longer ones, a reply lists its own keys above them."""
+"""Of more or longer paths, a reply lists the first keys only."""
 
 
 def looks_like_json(text: str) -> bool:
@@ -71,9 +71,9 @@ def looks_like_json(text: str) -> bool:
 
 
 def caseless(text: str) -> str:
-    """Returns a text as it is compared: without regard to case, and to how letters are written.
+    """Returns a text as texts are compared: without case, and accents in one form (NFC).
 
-    That is to accents, and in JSON to escapes, as of all letters that are not ASCII.
+    Escapes of letters in a JSON text are resolved.
     """
     if "\\" in text and looks_like_json(text):
         text = _STRINGS.sub(_unescaped, text)
@@ -82,7 +82,7 @@ def caseless(text: str) -> str:
 
 
 def _unescaped(match: re.Match[str]) -> str:
-    """Returns a string of JSON as it is meant, in quotes; anything else as it is."""
+    """Returns a matched JSON string without its escapes, in quotes; any other match as it is."""
     if match[0][0] == '"' and "\\" in match[0]:
         with suppress(ValueError):
             return f'"{json.loads(match[0], strict=False)}"'
@@ -90,21 +90,24 @@ def _unescaped(match: re.Match[str]) -> str:
 
 
 def similar(name: str, names: Iterable[str], at_most: int = 3) -> list[str]:
-    """Returns names that contain one or are part of it, the nearest first, then those like it.
+    """Returns the names that contain `name` or are part of it, then others like it; ignores case.
 
-    Without regard to case.
+    Of the first kind those of the nearest length come first.
     """
     asked = caseless(name[:_LONGEST_COMPARED])
     by_folded = {caseless(other): other for other in names}
-    parts = [other for other in by_folded if asked in other or other in asked]
-    parts = [other for other in parts if min(len(asked), len(other)) >= _SHORTEST_PART]
+    parts = []
+    for other in by_folded:
+        is_part = asked in other or other in asked
+        if is_part and min(len(asked), len(other)) >= _SHORTEST_PART:
+            parts.append(other)
     parts.sort(key=lambda other: abs(len(other) - len(asked)))
     near = dict.fromkeys([*parts, *get_close_matches(asked, by_folded, at_most)])
     return [by_folded[other] for other in near][:at_most]
 
 
 def dotted(path: str, name: str) -> str:
-    """Returns the dot-path of a field; `path` is that of the message around it, if any."""
+    """Returns the dot-path of a field; `path` is that of the message around it, or empty."""
     return f"{path}.{name}" if path else name
 
 
@@ -114,14 +117,17 @@ def counted(count: int, singular: str, plural: str | None = None) -> str:
 
 
 def listed(names: Sequence[str], count: int | None = None, at_most: int = MAX_NAMED) -> str:
-    """Returns the first few names, and how many more there are of `count` (or of the names)."""
+    """Returns the first names, and how many more there are: `a, b, c and 4 more`.
+
+    `count` is the number of all names, if `names` has not all of them.
+    """
     more = (len(names) if count is None else count) - min(len(names), at_most)
     shown = ", ".join(shortened(name) for name in names[:at_most])
     return f"{shown} and {more} more" if more > 0 else shown
 
 
 def shortened(text: str, max_chars: int = _MAX_NAME_CHARS) -> str:
-    """Returns the text, cut to `max_chars` with an ellipsis; a quoted one stays so."""
+    """Returns the text, cut to `max_chars` with an ellipsis; a `Quoted` one stays `Quoted`."""
     return text if len(text) <= max_chars else type(text)(text[: max_chars - 1] + _ELLIPSIS)
 
 
@@ -135,9 +141,11 @@ class Reason:
     """A fault that several things can share, reported in one sentence.
 
     Attributes:
-        what: the sentence after its subject; `many` where that differs for several.
-        noun: what the things are; `plural` where that is not `noun` with an s.
+        what: the sentence after its subject.
+        noun: what the things are.
+        plural: of the noun, if it is not the noun with an s.
         of: precedes the noun or the name, such as "messages of ".
+        many: `what` for several things, if it differs.
     """
 
     what: str
@@ -147,7 +155,7 @@ class Reason:
     many: str | None = None
 
     def sentence(self, things: Mapping[str, str]) -> str:
-        """Returns the sentence on these things, by name; each has a detail or an empty text."""
+        """Returns the sentence on things; `things` has a detail, or an empty text, by name."""
         [name, detail], *others = sorted(things.items())
         if not others:
             return f"{self.of}{name} {self.what}" + (f": {detail}" if detail else "")
@@ -161,9 +169,9 @@ class Reason:
 def match_topics(names: Iterable[str], glob: str) -> list[str]:
     """Returns the names that a glob matches, in their order.
 
-    `*`, `?` and `[...]` work as in a shell, except that a slash is a character like any other.
-    Upper and lower case differ. A glob that is a name matches itself, too. `fnmatch.filter`
-    matches likewise, but caches 32,768 globs: clients could fill memory with them.
+    `*`, `?` and `[...]` work as in a shell, but also match slashes; case counts. A name matches
+    itself, whatever characters it has. `fnmatch.filter` does the same, but caches 32,768 globs:
+    clients could fill memory with them.
     """
     matches = re.compile(translate(glob)).match
     return [name for name in names if name == glob or matches(name)]
@@ -176,17 +184,21 @@ def abbreviate(value: object, max_chars: int = 80) -> str:
     ellipsis marks what is left out. NaN and infinities are shown as such; a lone surrogate is
     escaped.
     """
-    text = json.dumps(_pruned(value, _MAX_DEPTH), ensure_ascii=False, default=_type_name)
+    text = json.dumps(
+        _pruned(value, _MAX_DEPTH),
+        ensure_ascii=False,
+        default=lambda other: f"a {type(other).__name__}",
+    )
     return shortened(encodable(text), max_chars)
 
 
 def _pruned(value: object, levels: int) -> object:
-    """Returns the value without what is too deep, too long or too many."""
+    """Returns a value without items below `levels` levels, and with long parts cut."""
     if isinstance(value, str):
         return value if len(value) <= _MAX_TEXT_CHARS else value[:_MAX_TEXT_CHARS] + _ELLIPSIS
     if isinstance(value, int) and value.bit_length() > _MAX_INTEGER_BITS:
         # Python refuses to convert integers of thousands of digits to decimal.
-        return f"a number of {value.bit_length() * 0.30103:.0f} digits"
+        return f"a number of {value.bit_length() * _DIGITS_PER_BIT:.0f} digits"
     if not isinstance(value, dict | list | tuple):
         return value
     if not levels:
@@ -202,33 +214,32 @@ def _pruned(value: object, levels: int) -> object:
     return [*items, _ELLIPSIS] if is_longer else items
 
 
-def _type_name(value: object) -> str:
-    return f"a {type(value).__name__}"
-
-
 class Quoted(str):
-    """A text that a message says, or one that repeats it."""
+    """A text of a message, or a sentence that repeats one."""
 
     __slots__ = ()
 
 
 def named(name: str) -> str:
-    """Returns the name of a frame or a label; quoted if it is more than two words."""
+    """Returns the name of a frame or a label, `Quoted` if it is more than two words."""
     return name if not name or _NAME.fullmatch(name) else Quoted(name)
 
 
 def repeating(sentence: str, names: Iterable[str]) -> str:
-    """Returns a sentence with names of frames or labels in it; quoted if one of them is."""
+    """Returns a sentence, `Quoted` if one of the names of frames or labels in it is."""
     return Quoted(sentence) if any(isinstance(named(name), Quoted) for name in names) else sentence
 
 
 def still_quoted(text: str, *parts: str) -> str:
-    """Returns a text that was made with parts of it; quoted if one of these is."""
+    """Returns a text, `Quoted` if one of its parts is."""
     return Quoted(text) if any(isinstance(part, Quoted) for part in parts) else text
 
 
 def quote(value: JsonValue, field: str = "") -> JsonValue:
-    """Returns a value of a message with its texts quoted; `field` is the path that it is of."""
+    """Returns a value of a message with its texts `Quoted`; `field` is its dot-path.
+
+    Texts in a field for names are treated as names.
+    """
     if isinstance(value, str):
         is_name = not value or field.rpartition(".")[2] in NAMES_IN_MESSAGES
         return named(value) if is_name else Quoted(value)
@@ -240,9 +251,10 @@ def quote(value: JsonValue, field: str = "") -> JsonValue:
 
 
 def quoted_keys(reply: JsonValue) -> list[str]:
-    """Returns the dot-paths of the keys of a reply at which quoted texts stand, without indices.
+    """Returns the dot-paths of a reply at which `Quoted` texts stand, without indices of lists.
 
-    A cell of a table (`fields`, `rows`) is at `rows` and the name of its column.
+    A cell of a table (`fields`, `rows`) is at `rows` and the name of its column. If there are many
+    paths, only the first key of each is returned.
     """
     paths: dict[str, None] = {}
     columns = reply.get("fields") if isinstance(reply, dict) else None
@@ -250,26 +262,26 @@ def quoted_keys(reply: JsonValue) -> list[str]:
     if isinstance(reply, dict) and isinstance(columns, list) and isinstance(rows, list):
         for row in rows:
             for name, cell in zip(columns, row if isinstance(row, list) else (), strict=True):
-                _add_quoted_paths(
-                    cell, f"rows.{name}" if not isinstance(name, Quoted) else "rows", paths
-                )
+                path = "rows" if isinstance(name, Quoted) else f"rows.{name}"
+                paths |= dict.fromkeys(_quoted_paths(cell, path))
         reply = {key: value for key, value in reply.items() if key != "rows"}
-    _add_quoted_paths(reply, "", paths)
+    paths |= dict.fromkeys(_quoted_paths(reply, ""))
     if len(paths) > _MOST_KEYS or sum(map(len, paths)) > _MOST_KEYS_CHARS:
         paths = dict.fromkeys(path.partition(".")[0] for path in paths)
     return [*paths]
 
 
-def _add_quoted_paths(value: JsonValue, path: str, paths: dict[str, None]) -> None:
+def _quoted_paths(value: JsonValue, path: str) -> Iterator[str]:
+    """Yields the dot-path of each `Quoted` text and key in a value at `path`."""
     if isinstance(value, Quoted):
-        paths[path] = None
+        yield path
     elif isinstance(value, list):
         for part in value:
-            _add_quoted_paths(part, path, paths)
+            yield from _quoted_paths(part, path)
     elif isinstance(value, dict):
         for name, part in value.items():
             if isinstance(name, Quoted):
-                paths[path] = None
-                _add_quoted_paths(part, path, paths)
+                yield path
+                yield from _quoted_paths(part, path)
             else:
-                _add_quoted_paths(part, dotted(path, name), paths)
+                yield from _quoted_paths(part, dotted(path, name))
