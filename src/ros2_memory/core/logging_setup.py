@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def _without(package: str) -> Iterator[None]:
-    """Has imports of a package fail for a while, as if it were not installed."""
+def _not_installed(package: str) -> Iterator[None]:
+    """Makes imports of a package fail in the block, unless it was imported before."""
     if package in sys.modules:
         yield
         return
@@ -35,12 +35,12 @@ def _without(package: str) -> Iterator[None]:
 
 # Where Rich is installed, structlog imports it for a layout of tracebacks that is not used here:
 # 8 MB, and a twentieth of a server's start.
-with _without("rich"):
+with _not_installed("rich"):
     import structlog
     from structlog.stdlib import ProcessorFormatter
 
 _SESSION_LOGGER: Final = "mcp.server.streamable_http"
-"""Logs at the end of each request that a session ends, though there are no sessions."""
+"""A logger that reports the end of a session at each request, though there are no sessions."""
 
 MAX_CHARS: Final = 8000
 """Characters of any text of a log event, such as a traceback or what a library repeats."""
@@ -62,7 +62,7 @@ def configure_logging(
 ) -> None:
     """Sends every event of at least `level` to stderr, with a UTC timestamp.
 
-    Call it before a server is built: the MCP SDK configures logging itself where nobody has.
+    Call it before a server is built: the MCP SDK configures logging itself if nobody has.
 
     Args:
         level: the least severe level that is logged.
@@ -77,18 +77,6 @@ def configure_logging(
         structlog.processors.TimeStamper(fmt="iso", utc=True),
         structlog.processors.StackInfoRenderer(),
     ]
-    render: list[Processor] = (
-        [structlog.processors.format_exc_info, _cut, structlog.processors.JSONRenderer()]
-        if layout == "json"
-        else [
-            _cut,
-            structlog.dev.ConsoleRenderer(
-                colors=sys.stderr.isatty(),
-                # The default one prints local variables, which may be secret.
-                exception_formatter=structlog.dev.plain_traceback,
-            ),
-        ]
-    )
     structlog.configure(
         processors=[*common, ProcessorFormatter.wrap_for_formatter],
         wrapper_class=structlog.make_filtering_bound_logger(level),
@@ -100,7 +88,7 @@ def configure_logging(
     handler.setFormatter(
         ProcessorFormatter(
             foreign_pre_chain=[*common, structlog.stdlib.ExtraAdder()],
-            processors=[ProcessorFormatter.remove_processors_meta, *render],
+            processors=[ProcessorFormatter.remove_processors_meta, *_renderers(layout)],
         )
     )
     handler.addFilter(_LibraryFilter())
@@ -111,6 +99,18 @@ def configure_logging(
     if not arguments:
         handler.addFilter(_remove_arguments)
     logging.captureWarnings(capture=True)
+
+
+def _renderers(layout: Literal["json", "pretty"]) -> list[Processor]:
+    """Returns the last processors of an event, which make its line."""
+    if layout == "json":
+        return [structlog.processors.format_exc_info, _cut, structlog.processors.JSONRenderer()]
+    console = structlog.dev.ConsoleRenderer(
+        colors=sys.stderr.isatty(),
+        # The default one prints local variables, which may be secret.
+        exception_formatter=structlog.dev.plain_traceback,
+    )
+    return [_cut, console]
 
 
 def get_logger(name: str) -> FilteringBoundLogger:
@@ -132,7 +132,7 @@ def _cut(_logger: object, _method: str, event: EventDict) -> EventDict:
 
 
 def _remove_arguments(record: logging.LogRecord) -> bool:
-    """Removes what a client may have sent from a library's record: arguments and traceback."""
+    """Removes from a record of the MCP library what a client may have sent; keeps the record."""
     if record.name.partition(".")[0] == _LIBRARY:
         record.msg, record.args = str(record.msg)[:_KIND_CHARS], ()
         record.exc_info = record.exc_text = None
@@ -140,11 +140,11 @@ def _remove_arguments(record: logging.LogRecord) -> bool:
 
 
 class LogThrottle:
-    """Counts events by kind, so that each kind is logged every `every_s` at most.
+    """Counts events by kind, so that each kind is logged once in `every_s` at most.
 
     Args:
         monotonic: a clock that never steps, in seconds.
-        every_s: seconds between two events of a kind.
+        every_s: the least time between two events of a kind (s).
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class LogThrottle:
         self._silent_until: dict[Hashable, float] = {}
 
     def count(self, kind: Hashable) -> int:
-        """Counts an event; returns how many to log, or 0 while its kind must not be logged."""
+        """Counts an event; returns how many are to be logged as one, or 0 if none is now."""
         self._counts[kind] += 1
         now = self._monotonic()
         if now < self._silent_until.get(kind, now):
@@ -170,9 +170,10 @@ class LogThrottle:
 
 
 class _LibraryFilter(logging.Filter):
-    """Throttles warnings and errors of network libraries; the next one has the count `suppressed`.
+    """Throttles warnings and errors of network libraries.
 
-    Records are of one kind if they begin with the same words.
+    Records of a logger that begin with the same words are of one kind. A record has as
+    `suppressed` how many of its kind were left out before it.
     """
 
     def __init__(self) -> None:
@@ -199,26 +200,26 @@ def withhold_warnings() -> None:
 
 
 def withheld_warnings() -> Counter[str]:
-    """Returns how often each event was withheld since the last call."""
-    counted = Counter[str]()
+    """Returns how often each event was withheld, and begins to count anew."""
+    total = Counter[str]()
     for handler in logging.getLogger().handlers:
         for log_filter in handler.filters:
             if isinstance(log_filter, _WarningCounter):
-                counted += log_filter.counted
-                log_filter.counted.clear()
-    return counted
+                total += log_filter.counts
+                log_filter.counts.clear()
+    return total
 
 
 class _WarningCounter(logging.Filter):
-    """Counts warnings by event, those of a library by the name of its logger, and drops them."""
+    """Drops warnings, and counts them: by event, or by the name of a library's logger."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.counted = Counter[str]()
+        self.counts = Counter[str]()
 
     def filter(self, record: logging.LogRecord) -> bool:
         if record.levelno != logging.WARNING:
             return True
         event: object = record.msg
-        self.counted[str(event.get("event")) if isinstance(event, dict) else record.name] += 1
+        self.counts[str(event.get("event")) if isinstance(event, dict) else record.name] += 1
         return False

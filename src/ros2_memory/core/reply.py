@@ -3,13 +3,13 @@
     @result("topic", TIME("first_seen", "first"), AGO("ago_s", "last"), digits(3)("score").if_known)
     class Sighting:
 
-A key is the name of an attribute, which is shown as it is, or a unit called with the name of the
-key and with what it is made of: an attribute, a dot-path, or a function of the result; by default
-the attribute that has the key's name without its unit. Timestamps are Unix seconds, rounded up to
-whole microseconds so that one that is passed back finds its own message; metres and metres per
-second to 1e-4, degrees to 1e-2, durations to 1e-3 s, unless `digits` says otherwise. A number that
-is not finite is null, and so is what is not known; `local` is there only in replies that span more
-than half a day (`LocalTimes`), and `notes` (`render`) only if there are any.
+A key is the name of an attribute, which is shown as it is; or a unit, called with the name of the
+key and with its source: an attribute, a dot-path, or a function of the result. The default source
+is the attribute with the key's name without its unit. Timestamps are Unix seconds, rounded up to
+whole microseconds: a timestamp that is passed back finds its own message. Metres and metres per
+second are rounded to 1e-4, degrees to 1e-2, durations to 1e-3 s, unless `digits` says otherwise.
+Unknown values and numbers that are not finite are null. Replies that span more than half a day
+have `local` (`LocalTimes`); replies with notes have `notes` (`render`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ T = TypeVar("T")
 
 JsonObject: TypeAlias = "dict[str, JsonValue]"
 Source: TypeAlias = "str | Callable[[Never], object]"
-"""What a key is made of: the attribute of a dot-path, None where a part of it is; or a function."""
+"""Where the value of a key comes from: a dot-path of attributes, or a function of the result."""
 
 LOCAL_BEYOND_NS: Final[Ns] = 12 * 3600 * NS_PER_S
 """Shorter spans have no local times."""
@@ -60,12 +60,12 @@ _DAY_CHARS: Final = len("Tue 2026-11-17 ")
 
 
 def moment(at: Ns | None) -> float | None:
-    """Returns a time in Unix seconds, if there is one."""
+    """Returns a time in Unix seconds, or None."""
     return None if at is None else unix_rounded_up(at)
 
 
 def seconds(duration: Ns) -> float:
-    """Returns a duration in seconds."""
+    """Returns a duration in seconds, rounded to 1e-3 s."""
     return round(unix_from_ns(duration), 3)
 
 
@@ -75,12 +75,12 @@ def rounded(number: float, places: int) -> float | None:
 
 
 def degrees(angle: float | None) -> float | None:
-    """Returns an angle, given in radians, in degrees, if there is one."""
+    """Returns an angle (rad) in degrees, or None."""
     return None if angle is None else rounded(math.degrees(angle), 2)
 
 
 def file_name(path: Path | str, bag_dir: Path) -> str:
-    """Returns a bag's path below the bag directory; never an absolute path of the machine."""
+    """Returns a bag's path relative to the bag directory; of a bag outside of it the name alone."""
     bag = Path(path)
     return str(bag.relative_to(bag_dir)) if bag.is_relative_to(bag_dir) else bag.name
 
@@ -89,35 +89,43 @@ def file_name(path: Path | str, bag_dir: Path) -> str:
 class LocalTimes:
     """Local times beside Unix seconds, for a reply that spans more than half a day.
 
-    Its oldest time is `first`. `last` is now where it counts ages, else its newest time.
+    Attributes:
+        first: the oldest time of the reply.
+        last: the present, if the reply counts ages; else its newest time.
     """
 
     first: Ns | None
     last: Ns | None
 
     def text(self, start: Ns | None, end: Ns | None = None) -> str | None:
-        """Returns a time, or a stretch whose ends may be unknown; None where that is not shown."""
+        """Returns the local time of a moment (`start`) or a stretch, either end of it unknown.
+
+        None if both are unknown, or the reply spans half a day or less.
+        """
         first, last = self.first, self.last
         if first is None or last is None or last - first <= LOCAL_BEYOND_NS:
             return None
-        begins, ends = (None if at is None else local_text(at) for at in (start, end))
-        if begins is None or ends is None or begins == ends:
-            return begins or (f"- {ends}" if ends else None)
+        begins = None if start is None else local_text(start)
+        ends = None if end is None else local_text(end)
+        if ends is None or begins == ends:
+            return begins
+        if begins is None:
+            return f"- {ends}"
         day = begins[:_DAY_CHARS]
         return f"{begins} - {ends.removeprefix(day)}"
 
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """What rows depend on besides themselves.
+    """What the JSON of a row depends on besides the row.
 
     Attributes:
-        answer: the whole, whose rows they are.
-        now: what ages count from.
-        bag_dir: files are named relative to it.
-        local: of the span of the reply.
-        days: those of which a row has said a local time.
-        notes: on what was left out.
+        answer: the answer that the row belongs to.
+        now: the time that ages count from.
+        bag_dir: the directory that names of files are relative to.
+        local: the local times of the reply.
+        days: the days of which a row has shown a local time (`LOCAL_OF_DAYS`).
+        notes: notes on what was left out, which are added while rows are rendered.
     """
 
     answer: object = None
@@ -129,7 +137,7 @@ class Scope:
 
 
 class Absent(Enum):
-    """What a unit returns where its key is left out."""
+    """A unit returns `ABSENT` for a value whose key is left out."""
 
     ABSENT = auto()
 
@@ -139,10 +147,10 @@ class Unit:
     """How the values of a kind are shown.
 
     Attributes:
-        convert: a value to JSON.
-        suffix: of the names of keys in this unit.
-        is_spread: the value is an object whose keys are shown in the place of its own.
-        takes_none: None is converted, too; else it is null.
+        convert: converts a value to JSON.
+        suffix: the end of the names of keys in this unit.
+        is_spread: whether the value is an object whose keys take the place of its own key.
+        takes_none: whether None is converted, too; else it is null.
     """
 
     convert: Callable[[Never, Scope], JsonValue | Absent]
@@ -151,7 +159,7 @@ class Unit:
     takes_none: bool = False
 
     def __call__(self, name: str, *sources: Source) -> Key:
-        """Returns a key in this unit; of several sources the values are a tuple."""
+        """Returns a key in this unit; its value is a tuple if it has several sources."""
         getters = [_getter(source) for source in sources or (name.removesuffix(self.suffix),)]
         if len(getters) == 1:
             return Key(name, self, getters[0])
@@ -159,11 +167,12 @@ class Unit:
 
     @property
     def spread(self) -> Unit:
-        """The same unit, of objects that are shown without a key of their own."""
+        """The unit, for objects that are shown without a key of their own."""
         return replace(self, is_spread=True)
 
 
 def _getter(source: Source) -> Callable[[object], object]:
+    """Returns a function that reads a source; None if a part of a dot-path is None."""
     if not isinstance(source, str):
         return cast("Callable[[object], object]", source)
     if "." not in source:
@@ -171,9 +180,10 @@ def _getter(source: Source) -> Callable[[object], object]:
     parts = source.split(".")
 
     def get(owner: object) -> object:
+        value = owner
         for part in parts:
-            owner = None if owner is None else getattr(owner, part)
-        return owner
+            value = None if value is None else getattr(value, part)
+        return value
 
     return get
 
@@ -187,16 +197,18 @@ class Key:
     """One key of a reply.
 
     Attributes:
-        name: in JSON.
-        unit: of its values.
-        get: the value, from the result.
-        applies: whether the result may have such a key.
-        is_shown: whether there is one, of its value.
-        most: of a list so many are shown: the first, or the last of them if that is negative. Of
-            more, a key tells the number (`<name>_<counted>`), and of the last a note.
-        is_added: whether the sum of several robots' values says something.
-        row_time: of a list of rows, which several robots' replies share: the key of their time.
-        is_short: it stays where a reply has to be short.
+        name: the key in JSON.
+        unit: how its values are shown.
+        get: reads the value of a result.
+        applies: tells whether a result has the key at all.
+        is_shown: tells whether the key is shown, by its value.
+        most: how many items of a list are shown: the first ones, or the last ones if negative; 0
+            for all. The number of a longer list is in the key `<name>_<counted>`; a note says that
+            the last ones are shown.
+        counted: see `most`; empty for no such key.
+        is_added: whether the values of several robots are added up.
+        row_time: the key of a row's time, if the rows of several robots are merged by it.
+        is_short: whether the key stays in a short reply.
     """
 
     name: str
@@ -212,21 +224,21 @@ class Key:
 
     @property
     def if_known(self) -> Key:
-        """The key, left out where its value is None."""
+        """The key, left out if its value is None."""
         return replace(self, is_shown=lambda value: value is not None)
 
     @property
     def if_any(self) -> Key:
-        """The key, left out where its value is None, empty, zero or false."""
+        """The key, left out if its value is None, empty, zero or false."""
         return replace(self, is_shown=bool)
 
     def when(self, attribute: str) -> Key:
-        """Returns the key, left out where an attribute is None, empty, zero or false."""
+        """Returns the key, left out if an attribute is None, empty, zero or false."""
         get = _getter(attribute)
         return replace(self, applies=lambda owner: bool(get(owner)))
 
     def unless(self, attribute: str) -> Key:
-        """Returns the key, left out where an attribute is anything else."""
+        """Returns the key, left out unless an attribute is None, empty, zero or false."""
         get = _getter(attribute)
         return replace(self, applies=lambda owner: not get(owner))
 
@@ -236,23 +248,20 @@ class Key:
         return replace(self, is_short=True)
 
     def first(self, most: int, counted: str = "count") -> Key:
-        """Returns the key with the first `most` of its list, and how many there are of more.
-
-        That is in another key, if `counted` is not empty.
-        """
+        """Returns the key with the first `most` items of its list; see `Key.counted`."""
         return replace(self, most=most, counted=counted)
 
     def last(self, most: int, counted: str = "count") -> Key:
-        """Returns the key with the last `most` of its list; likewise, and with a note."""
+        """Returns the key with the last `most` items of its list; see `Key.counted`."""
         return replace(self, most=-most, counted=counted)
 
     @property
     def added(self) -> Key:
-        """The key, of which several robots' values, or counts by name, are added up."""
+        """The key, whose numbers, or numbers by name, are added up over several robots."""
         return replace(self, is_added=True)
 
     def along(self, row_time: str) -> Key:
-        """Returns the key whose rows become one list of several robots', in order of a time."""
+        """Returns the key, whose rows of several robots are merged in order of a time."""
         return replace(self, row_time=row_time)
 
     def add_to(self, reply: JsonObject, owner: object, scope: Scope) -> None:
@@ -268,9 +277,8 @@ class Key:
             value = value[: self.most] if self.most > 0 else value[self.most :]
         converted: JsonValue | Absent = None
         if value is not None or self.unit.takes_none:
-            converted = cast("Callable[[object, Scope], JsonValue]", self.unit.convert)(
-                value, scope
-            )
+            convert = cast("Callable[[object, Scope], JsonValue | Absent]", self.unit.convert)
+            converted = convert(value, scope)
         if isinstance(converted, Absent):
             return
         if not self.unit.is_spread:
@@ -280,8 +288,7 @@ class Key:
         if total > abs(self.most) and self.counted:
             reply[f"{self.name}_{self.counted}"] = total
             if self.most < 0:
-                last = f"the last {-self.most} of {total} are listed"
-                scope.notes.append(f"{self.name}: {last}")
+                scope.notes.append(f"{self.name}: the last {-self.most} of {total} are listed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,7 +297,7 @@ class Keys:
 
     Attributes:
         keys: all of them.
-        span: the oldest time and the newest, which decide whether it has local times.
+        span: reads the oldest and the newest time, which decide whether there are local times.
     """
 
     keys: tuple[Key, ...]
@@ -298,11 +305,11 @@ class Keys:
 
     @property
     def short(self) -> Keys:
-        """Those that stay where a reply has to be short."""
+        """The keys that stay in a short reply."""
         return replace(self, keys=tuple(key for key in self.keys if key.is_short))
 
     def render(self, owner: object, scope: Scope) -> JsonObject:
-        """Returns an object with these keys."""
+        """Returns the JSON of a result by these keys."""
         if self.span is not None:
             first, last = cast("tuple[Ns | None, Ns | None]", self.span(owner))
             now = getattr(owner, "now", scope.now)
@@ -320,65 +327,65 @@ class Declared(Protocol):
 
 
 def keys(*declared: str | Key, span: tuple[Source, Source] | None = None) -> Keys:
-    """Returns the keys of an object; a text is the name of an attribute that is shown as it is.
+    """Returns the keys of an object; a text declares the attribute of that name, shown as it is.
 
-    `span` is made of the oldest and the newest time of the reply.
+    `span` are the sources of the oldest and the newest time of the reply.
     """
-    whole = tuple(PLAIN(key) if isinstance(key, str) else key for key in declared)
-    return Keys(whole, None if span is None else PLAIN("span", *span).get)
+    all_keys = tuple(PLAIN(key) if isinstance(key, str) else key for key in declared)
+    return Keys(all_keys, None if span is None else PLAIN("span", *span).get)
 
 
 @dataclass_transform(frozen_default=True)
 def result(
     *declared: str | Key, span: tuple[Source, Source] | None = None
 ) -> Callable[[type[T]], type[T]]:
-    """Returns what makes a class an immutable dataclass with these keys."""
+    """Returns a decorator that makes a class an immutable dataclass with these keys."""
     form = keys(*declared, span=span)
 
     def declare(cls: type[T]) -> type[T]:
-        whole = dataclass(frozen=True, slots=True)(cls)
-        cast("type[Declared]", whole).reply = form
-        return whole
+        model = dataclass(frozen=True, slots=True)(cls)
+        cast("type[Declared]", model).reply = form
+        return model
 
     return declare
 
 
 def render(answer: object, bag_dir: Path, form: Keys | None = None) -> JsonObject:
-    """Returns the JSON of an answer, by the keys it declares or others, with its notes last."""
+    """Returns the JSON of an answer with its notes last; `form` replaces the keys it declares."""
     scope = Scope(answer, getattr(answer, "now", 0), bag_dir)
     reply = shown(answer, scope, form)
     return with_notes(reply, [*getattr(answer, "notes", ()), *scope.notes])
 
 
 def shown(owner: object, scope: Scope, form: Keys | None = None) -> JsonObject:
-    """Returns the JSON of a result, by the keys it declares or others."""
+    """Returns the JSON of a result; `form` replaces the keys that it declares."""
     return (form or cast("Declared", owner).reply).render(owner, scope)
 
 
 def with_notes(reply: JsonObject, notes: Sequence[str]) -> JsonObject:
-    """Returns a reply with its notes, where there are any."""
+    """Returns a reply with its notes, if there are any."""
     return {**reply, "notes": [*notes]} if notes else reply
 
 
 def itself_if(attribute: str) -> Source:
-    """Returns the source of keys that stand in an object of their own, where one is known."""
+    """Returns the source of an object made of several attributes; None if `attribute` is None."""
     get = _getter(attribute)
     return lambda owner: None if get(owner) is None else owner
 
 
 def unit(convert: Callable[[Never], JsonValue], suffix: str = "") -> Unit:
-    """Returns a unit whose values depend on nothing else."""
+    """Returns a unit whose values do not depend on the scope."""
     any_convert = cast("Callable[[object], JsonValue]", convert)
     return Unit(lambda value, _: any_convert(value), suffix)
 
 
 def digits(places: int) -> Unit:
-    """Returns the unit of numbers that are rounded to so many places."""
+    """Returns the unit of numbers that are rounded to some decimal places."""
     return unit(lambda number: rounded(number, places))
 
 
 def objects(form: Keys | None = None) -> Unit:
-    """Returns the unit of lists of objects that have these keys, or declare their own."""
+    """Returns the unit of lists of objects, with the keys of `form` or those they declare."""
 
     def convert(rows: Iterable[object], scope: Scope) -> JsonValue:
         return [shown(row, scope, form) for row in rows]
@@ -387,22 +394,22 @@ def objects(form: Keys | None = None) -> Unit:
 
 
 def an_object(form: Keys | None = None) -> Unit:
-    """Returns the unit of an object that has these keys, or declares its own."""
+    """Returns the unit of an object, with the keys of `form` or those it declares."""
     return Unit(lambda owner, scope: shown(owner, scope, form))
 
 
 def by_name(value_unit: Unit, longest: int = 1000) -> Unit:
-    """Returns the unit of pairs of a name, which is cut, and a value, as an object by name."""
+    """Returns the unit of (name, value) pairs, shown as one object; long names are cut."""
     convert = cast("Callable[[object, Scope], JsonValue]", value_unit.convert)
 
-    def convert_all(pairs: Iterable[tuple[str, object]], scope: Scope) -> JsonValue:
+    def convert_pairs(pairs: Iterable[tuple[str, object]], scope: Scope) -> JsonValue:
         return {shortened(name, longest): convert(value, scope) for name, value in pairs}
 
-    return Unit(convert_all)
+    return Unit(convert_pairs)
 
 
 def vector(axes: str, places: int) -> Unit:
-    """Returns the unit of points or vectors by their axes; of those not named nothing is shown."""
+    """Returns the unit of vectors as objects by axis; parts beyond the named axes are left out."""
 
     def convert(parts: Sequence[float]) -> JsonValue:
         return {axis: rounded(part, places) for axis, part in zip(axes, parts, strict=False)}
@@ -411,7 +418,7 @@ def vector(axes: str, places: int) -> Unit:
 
 
 def texts(longest: int) -> Unit:
-    """Returns the unit of lists of texts that are cut."""
+    """Returns the unit of lists of texts; a longer text is cut."""
 
     def convert(lines: Iterable[str]) -> JsonValue:
         return [shortened(line, longest) for line in lines]
@@ -420,8 +427,10 @@ def texts(longest: int) -> Unit:
 
 
 def _heading(pose: Pose) -> float | None:
-    unit_quaternion = None if pose.orientation is None else normalised(pose.orientation)
-    return None if unit_quaternion is None else yaw(unit_quaternion)
+    if pose.orientation is None:
+        return None
+    orientation = normalised(pose.orientation)
+    return None if orientation is None else yaw(orientation)
 
 
 def _plain(value: JsonValue | tuple[JsonValue, ...]) -> JsonValue:
@@ -442,8 +451,10 @@ def _counts(counts: Iterable[tuple[str, JsonValue]]) -> JsonValue:
 
 def _inside(places: Sequence[str]) -> JsonValue:
     """Returns the smallest of the named places that a point is in, and those around it."""
-    reply: JsonObject = {"in": places[0]} if places else {}
-    return {**reply, "also_in": [*places[1:]]} if places[1:] else reply
+    if not places:
+        return {}
+    smallest, *around = places
+    return {"in": smallest, "also_in": [*around]} if around else {"in": smallest}
 
 
 def _counted(count: tuple[int, bool]) -> JsonValue:
@@ -452,7 +463,7 @@ def _counted(count: tuple[int, bool]) -> JsonValue:
 
 
 def _ago(at: Ns | None, scope: Scope) -> float | Absent:
-    """Returns how long ago a time was (s); 0 of what still goes on, none of what is dated ahead."""
+    """Returns how long ago a time was (s): 0 if it is None and goes on; absent if it lies ahead."""
     if at is None:
         return 0.0
     return Absent.ABSENT if at > scope.now + FUTURE_NS else seconds(scope.now - at)
@@ -473,6 +484,7 @@ def _local(times: Sequence[Ns | None], scope: Scope) -> JsonValue | Absent:
 
 
 def _local_of_days(at: Sequence[Ns | None] | Ns | None, scope: Scope) -> JsonValue | Absent:
+    """Returns the local time of a row that is the first one of its day, and notes the day."""
     times = (at,) if at is None or isinstance(at, int) else at
     texts = (scope.local.text(at) for at in times if at is not None)
     days = {text[:_DAY_CHARS] for text in texts if text is not None}
@@ -486,33 +498,33 @@ PLAIN: Final = unit(_plain)
 MESSAGE: Final = unit(quote)
 """A value of a message, or a part of it: its texts are quoted (`core/text.py`)."""
 NAME: Final = unit(_name)
-"""Of a frame, or a label: quoted if it is more than two words; likewise in the next two."""
+"""The name of a frame or a label, quoted if it has more than two words; so in the next two."""
 NAMES: Final = unit(_names)
 COUNTS_BY_NAME: Final = unit(_counts)
 PAIRS: Final = unit(dict)
 TIME: Final = unit(unix_rounded_up)
 ISO_LOCAL: Final = unit(iso_local, "_local")
 LOCAL: Final = Unit(_local)
-"""Of two times, which are the ends of a stretch."""
+"""The local times of the two ends of a stretch."""
 LOCAL_OF_DAYS: Final = Unit(_local_of_days)
-"""Likewise, in the first row of each day: for rows that a planner reads many of."""
+"""The same in the first row of each day only: for long lists of rows."""
 SECONDS: Final = unit(seconds, "_s")
 TENTHS_OF_S: Final = unit(lambda duration: round(seconds(duration), 1), "_s")
 MINUTES: Final = unit(lambda duration: round(duration / 60e9, 2))
 AGO: Final = Unit(_ago, takes_none=True)
 TENTHS_OF_S_AGO: Final = Unit(_tenths_ago)
 YAW: Final = Unit(lambda angle, _: {"yaw_deg": degrees(angle)}, is_spread=True, takes_none=True)
-"""An angle (rad) under its own key."""
+"""An angle (rad), under the key `yaw_deg`."""
 XYZ: Final = vector("xyz", 4)
 INSIDE: Final = unit(_inside).spread
-"""The named places that something is in, the smallest first."""
+"""The named places around something, the smallest first."""
 TOTAL: Final = unit(_counted).spread
-"""How many there are, and whether that is all; under another name where not all were counted."""
+"""A number, and whether all were counted: `total`, or else `at_least`."""
 FILE: Final = Unit(lambda path, scope: file_name(path, scope.bag_dir))
 LASTED: Final = unit(_lasted)
-"""The time between two, or three: the third is how much of it does not count."""
+"""The duration from the first time to the second, less the time that did not count (third)."""
 OBJECT: Final = an_object()
 OBJECTS: Final = objects()
 POSE_KEYS: Final = keys(XYZ.spread("position"), YAW("yaw", _heading), INSIDE("places"))
-"""A position, its yaw, and the named places that it is in."""
+"""A position, its yaw, and the named places around it."""
 POSE: Final = an_object(POSE_KEYS).spread

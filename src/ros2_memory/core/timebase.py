@@ -49,19 +49,19 @@ _BETWEEN_HOURS: Final = re.compile("-|to|and|,")
 _LONGEST_TIME: Final = 64
 _MINUTE_S: Final = 60.0
 _END_S: Final = 1.125e-6
-"""How long before its end a span ends, so that a time in a query, which is granted a microsecond
-and is a float of seconds, reaches no message at the end itself."""
+"""How long before the next day, minute or second a written one ends: a query's end is granted a
+microsecond and is rounded to a float of seconds, and must not reach a message at the next one."""
 
 MIN_NS: Final[Ns] = -(2**63)
 MAX_NS: Final[Ns] = 2**63 - 1
 """The range of times: what a signed 64-bit nanosecond clock (and SQLite) can hold."""
 
 FUTURE_NS: Final[Ns] = 60 * NS_PER_S
-"""Dates this little ahead of the clock come from a clock that is being corrected."""
+"""A date that is ahead of the clock by no more comes from a clock that is being corrected."""
 
 
 def ns_from_unix(seconds: float) -> Ns:
-    """Returns nanoseconds for Unix (or plain) seconds, rounded to nearest, limited to 64 bits.
+    """Converts Unix (or plain) seconds to nanoseconds, rounded to nearest, limited to 64 bits.
 
     Raises:
         ValueError: `seconds` is NaN or infinite.
@@ -93,14 +93,14 @@ def ms_from_ns(ns: Ns) -> float:
 
 
 def ms_since(begun: Ns) -> float:
-    """Returns the milliseconds since `time.perf_counter_ns()` was so much, for log events."""
+    """Returns the milliseconds since a reading of `time.perf_counter_ns()`, for log events."""
     return round(ms_from_ns(time.perf_counter_ns() - begun), 3)
 
 
 def iso_local(ns: Ns) -> str | None:
     """Returns ISO 8601 local time with offset; None for years that the calendar does not have.
 
-    Rounded up to microseconds, as `unix_rounded_up`; whole seconds have no decimals.
+    The time is rounded up to microseconds as by `unix_rounded_up`; whole seconds have no decimals.
     """
     try:
         return _with_offset(ns).isoformat()
@@ -109,9 +109,9 @@ def iso_local(ns: Ns) -> str | None:
 
 
 def local_time(ns: Ns) -> datetime:
-    """Returns local time, rounded up to microseconds, which `unix_from_text` reads as ISO 8601.
+    """Returns local time, rounded up to microseconds, whose ISO form `unix_from_text` reads.
 
-    It has its offset only where clocks were set back, and it occurs twice.
+    It has an offset only if the local time occurs twice, because clocks were set back.
 
     Raises:
         ValueError, OverflowError, OSError: the calendar does not have its year.
@@ -128,7 +128,10 @@ def _with_offset(ns: Ns) -> datetime:
 
 
 def local_text(ns: Ns) -> str | None:
-    """Returns `local_time` as `Tue 2026-11-17 14:05:03`, rounded down to seconds; else as above."""
+    """Returns local time rounded down to seconds, as `Tue 2026-11-17 14:05:03`.
+
+    It has an offset if the local time occurs twice. None for years that the calendar does not have.
+    """
     try:
         local = local_time(ns // NS_PER_S * NS_PER_S)
     except (OverflowError, ValueError, OSError):
@@ -137,43 +140,45 @@ def local_text(ns: Ns) -> str | None:
 
 
 def unix_from_text(text: str) -> float:
-    """Returns the Unix seconds of a time that is written as ISO 8601.
+    """Returns the Unix seconds of a time that is written in ISO 8601.
 
-    Without an offset it is local time, by the zone of this machine (or of TZ), and a date alone is
-    its midnight. A local time that occurs twice, since clocks were set back, is the first of the
-    two; one that clocks skipped counts by the offset before (both as in RFC 5545). A weekday may
-    precede it, as in replies. Unix seconds in quotes are read, too, if they have nine digits or
-    more: fewer could be a date.
+    Without an offset it is local time, by the zone of this machine (or of TZ); a date alone is its
+    midnight. A local time that occurs twice, because clocks were set back, is the first of the two;
+    one that clocks skipped counts by the offset before (both as in RFC 5545). A weekday may stand
+    before it, as in replies. A text of nine digits or more is read as Unix seconds; fewer could be
+    a date.
 
     Raises:
-        ValueError: it is neither, no such day exists, or it is another weekday; the message
-            completes "the time, which".
+        ValueError: the text has no such form, or names a day that does not exist, or another
+            weekday; the message completes "the time, which".
     """
-    weekday, written = _without_weekday(text.strip() if len(text) <= _LONGEST_TIME else "")
+    weekday, written = _split_weekday(text.strip() if len(text) <= _LONGEST_TIME else "")
     if _DIGITS.fullmatch(written):
         return float(written)
-    begins, is_end = _END_OF_DAY.subn("00:00", written if _ISO.fullmatch(written) else "")
+    iso = written if _ISO.fullmatch(written) else ""
+    iso, days_later = _END_OF_DAY.subn("00:00", iso)
     try:
-        read = datetime.fromisoformat(begins)
-        seconds = (read + timedelta(days=is_end)).timestamp()
+        date = datetime.fromisoformat(iso)
+        seconds = (date + timedelta(days=days_later)).timestamp()
     except (ValueError, OverflowError, OSError):
         raise ValueError("is not a valid time in ISO 8601, such as 2026-11-20T14:05:00") from None
-    if weekday is not None and weekday != _WEEKDAYS[read.weekday()]:
-        raise ValueError(f"is a {_WEEKDAYS[read.weekday()]}, not a {weekday}")
+    if weekday is not None and weekday != _WEEKDAYS[date.weekday()]:
+        raise ValueError(f"is a {_WEEKDAYS[date.weekday()]}, not a {weekday}")
     return seconds
 
 
 def hours_from_text(text: str) -> tuple[clock_time, clock_time]:
-    """Returns two local times of day of a text, such as 19:00-22:00 or 19:00 to 24:00.
+    """Returns the two local times of day in a text such as `19:00-22:00` or `19:00 to 24:00`.
 
     Raises:
-        ValueError: it is something else; the message completes "the hours, which".
+        ValueError: the text has no such form; the message completes "the hours, which".
     """
     parts = _BETWEEN_HOURS.split(text) if len(text) <= _LONGEST_TIME else ()
     try:
         begin, end = (part.strip() for part in parts)
-        ends = "00:00" if _MIDNIGHT.fullmatch(end) else end
-        first, last = clock_time.fromisoformat(begin), clock_time.fromisoformat(ends)
+        if _MIDNIGHT.fullmatch(end):
+            end = "00:00"
+        first, last = clock_time.fromisoformat(begin), clock_time.fromisoformat(end)
     except ValueError:
         raise ValueError("is not two times of day") from None
     if first.tzinfo is not None or last.tzinfo is not None:
@@ -182,10 +187,10 @@ def hours_from_text(text: str) -> tuple[clock_time, clock_time]:
 
 
 def require_no_date(seconds: float) -> None:
-    """Checks that Unix seconds are no date without dashes.
+    """Checks that a number was not meant as a date, such as 20261120.
 
     Raises:
-        ValueError: they are; the message completes "the time, which".
+        ValueError: it has the digits of a date; the message completes "the time, which".
     """
     digits = str(seconds).removesuffix(".0")
     if _DATE_WITHOUT_DASHES.fullmatch(digits):
@@ -194,51 +199,61 @@ def require_no_date(seconds: float) -> None:
 
 
 def rest_of_text_s(text: str) -> float:
-    """Returns how long a time as text lasts after its first moment (s), less `_END_S`.
+    """Returns how many seconds a written time lasts after its first moment, less `_END_S`.
 
-    Its last decimal is all part of it: 14:05:03.74 lasts 10 ms, up to, but not at, 14:05:03.75, and
-    14:05:03 all of its second. One without seconds is exact, as Unix seconds are.
+    It lasts as long as its last decimal: 14:05:03.74 up to, but not including, 14:05:03.75, and
+    14:05:03 a second. A time without seconds, and Unix seconds, are moments: 0.
     """
     match = _SECONDS.search(text)
-    return max(10.0 ** -len(match[1] or "") - _END_S, 0.0) if match else 0.0
+    if match is None:
+        return 0.0
+    decimals = len(match[1] or "")
+    return max(10.0**-decimals - _END_S, 0.0)
 
 
 def rounded_off_s(text: str) -> float:
-    """Returns how much `local_text` may have rounded off a time as text (s).
+    """Returns how many seconds `local_text` may have rounded off a written time.
 
-    Only what it writes has a weekday; other times end where they say.
+    Only a time that `local_text` wrote has a weekday; any other one ends where it says.
     """
-    weekday, written = _without_weekday(text.strip())
+    weekday, written = _split_weekday(text.strip())
     return rest_of_text_s(written) if weekday else 0.0
 
 
 def window_end_s(text: str, end_s: float, start_s: float | None) -> float:
-    """Returns the Unix seconds at which a window ends by a text that is the time `end_s`.
+    """Returns the Unix seconds at which a window ends whose end is written as `text`.
 
-    A date alone is the end of its local day, and a minute or a second its own end where the window
-    starts with it; see also `rounded_off_s`.
+    A date alone includes its local day. A minute or a second includes all of itself if the window
+    also starts there; else the window ends at its first moment, but for what `local_text` rounded
+    off.
+
+    Args:
+        text: the end as it was written.
+        end_s: the first moment of the end (Unix s).
+        start_s: where the window starts (Unix s).
     """
-    named_s = _named_span_s(_without_weekday(text.strip())[1])
-    goes_on = named_s > _MINUTE_S or start_s == end_s
-    return end_s + (named_s if goes_on else rounded_off_s(text))
+    _, written = _split_weekday(text.strip())
+    span_s = _written_span_s(written)
+    is_date = span_s > _MINUTE_S
+    return end_s + (span_s if is_date or start_s == end_s else rounded_off_s(text))
 
 
-def _named_span_s(written: str) -> float:
-    """Returns how long what a text names, up to a local day, goes on after its begin (s).
+def _written_span_s(written: str) -> float:
+    """Returns how many seconds the written day, minute or second lasts, less `_END_S`.
 
-    Less `_END_S`; 0 for Unix seconds, and what is no ISO 8601.
+    0 for Unix seconds, and for any text that is not ISO 8601.
     """
     if _SECONDS.search(written) or not _ISO.fullmatch(written):
         return rest_of_text_s(written)
     if ":" in written:
         return _MINUTE_S - _END_S
-    read = datetime.fromisoformat(written)
-    if (read.hour, read.minute) != (0, 0) or "T" in written.upper():
+    date = datetime.fromisoformat(written)
+    if (date.hour, date.minute) != (0, 0) or "T" in written.upper():
         return 0.0
-    return (read + timedelta(days=1)).timestamp() - read.timestamp() - _END_S
+    return (date + timedelta(days=1)).timestamp() - date.timestamp() - _END_S
 
 
-def _without_weekday(text: str) -> tuple[str | None, str]:
+def _split_weekday(text: str) -> tuple[str | None, str]:
     first, _, rest = text.partition(" ")
     weekday = first.rstrip(",").title()
     return (weekday, rest.strip()) if weekday in _WEEKDAYS else (None, text)
@@ -256,13 +271,18 @@ class WallClock(Clock):
     """The clock of the system."""
 
     def now(self) -> Ns:
-        """Returns the present time by the system's clock."""
+        """Returns the system's time."""
         return time.time_ns()
 
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """The monotonic time (s) at which a query must give up; `Deadline.never()` has none."""
+    """The time at which a query must give up.
+
+    Attributes:
+        at_s: by the monotonic clock; infinite if it never has to.
+        budget_s: how long the query may take in all.
+    """
 
     at_s: float
     budget_s: float
@@ -279,14 +299,14 @@ class Deadline:
         return cls(math.inf, math.inf)
 
     def within(self, budget_s: float) -> Deadline:
-        """Returns a deadline `budget_s` seconds from now, or this one if that is earlier."""
+        """Returns a deadline `budget_s` seconds from now, or this one if it is earlier."""
         at_s = min(self.at_s, self._monotonic() + budget_s)
         return Deadline(at_s, min(self.budget_s, budget_s), self._monotonic)
 
     def left_s(self) -> float:
-        """Returns the seconds that are left; none or fewer where the time is up."""
+        """Returns the seconds that are left: 0 or less if the time is up."""
         return self.at_s - self._monotonic()
 
     def expired(self) -> bool:
         """Returns whether the time is up."""
-        return self._monotonic() >= self.at_s
+        return self.left_s() <= 0
