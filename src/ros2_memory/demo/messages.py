@@ -86,8 +86,8 @@ class MessageSchedule:
         first = 0 if stream.latched else -((self.t0 - self.start) // stream.period)
         for k in count(first):
             published = self.t0 + k * stream.period
-            heard = max(published, self.start) + _delay(stream, k)
-            yield Message(stream, heard, published, (published - self.t0) / NS_PER_S)
+            received = max(published, self.start) + _delay(stream, k)
+            yield Message(stream, received, published, (published - self.t0) / NS_PER_S)
             if stream.latched:
                 break
 
@@ -111,7 +111,7 @@ VISION_DEFINITIONS: Final = {
 }
 
 Body: TypeAlias = "dict[str, object]"
-"""Fields of a message by name; others are zero or empty."""
+"""The fields of a message by name; a missing field is zero or empty."""
 
 
 def payload(message: Message) -> bytes:
@@ -136,6 +136,7 @@ def _typestore() -> Typestore:
 
 
 def _ros_message(type_name: str, body: Mapping[str, object]) -> object:
+    """Returns a message object of rosbags with these fields."""
     store = _typestore()
     fields = store.fielddefs[type_name][1]
     build = cast("Callable[[*tuple[object, ...]], object]", store.types[type_name])
@@ -143,31 +144,29 @@ def _ros_message(type_name: str, body: Mapping[str, object]) -> object:
 
 
 def _field(form: FieldDesc, value: object) -> object:
-    """Returns a field of a message; zero or empty where there is no value."""
+    """Returns a field of a message object; None becomes zero or empty."""
     kind, detail = form
     if kind is Nodetype.NAME:
         return _ros_message(str(detail), cast("Body", value or {}))
     if kind is Nodetype.BASE:
         return value or ("" if detail[0] == "string" else 0)
-    inner, size = cast("tuple[FieldDesc, int]", detail)
-    if inner[0] is Nodetype.NAME:
-        return [_field(inner, item) for item in cast("list[Body]", value)]
-    return np.zeros(size, inner[1][0]) if value is None else np.array(value, inner[1][0])
+    (item_kind, item_detail), size = cast("tuple[FieldDesc, int]", detail)
+    if item_kind is Nodetype.NAME:
+        items = cast("list[Body]", value)
+        return [_ros_message(str(item_detail), item) for item in items]
+    dtype = item_detail[0]
+    return np.zeros(size, dtype) if value is None else np.array(value, dtype)
 
 
 def _detections(message: Message) -> Body:
     detections = [
-        {
-            "label": thing.label,
-            "score": thing.score,
-            "point": _xyz(*thing.point),
-        }
+        {"label": thing.label, "score": thing.score, "point": _xyz(*thing.point)}
         for thing in robot.seen(message.t)
     ]
-    return {**_headed(message, "base_link"), "skill": "scene", "detections": detections}
+    return {**_header(message, "base_link"), "skill": "scene", "detections": detections}
 
 
-def _headed(message: Message, frame_id: str) -> Body:
+def _header(message: Message, frame_id: str) -> Body:
     seconds, nanoseconds = divmod(message.publish_time, NS_PER_S)
     stamp = {"sec": seconds, "nanosec": nanoseconds}
     return {"header": {"stamp": stamp, "frame_id": frame_id}}
@@ -188,24 +187,24 @@ def _twist(message: Message) -> Body:
 
 def _transform(message: Message, parent: str, child: str, at: Planar, z: float = 0.0) -> Body:
     moved = {"translation": _xyz(at.x, at.y, z), "rotation": _rotation(at.yaw)}
-    return {**_headed(message, parent), "child_frame_id": child, "transform": moved}
+    return {**_header(message, parent), "child_frame_id": child, "transform": moved}
 
 
-def _fixed(message: Message) -> Body:
+def _static_transforms(message: Message) -> Body:
     transforms = [_transform(message, "map", "odom", robot.MAP_TO_ODOM)]
     for child, (x, y, z) in (("camera", robot.CAMERA), ("laser", robot.LASER)):
         transforms.append(_transform(message, "base_link", child, robot.Planar(x, y, 0.0), z))
     return {"transforms": transforms}
 
 
-def _moving(message: Message) -> Body:
+def _robot_transform(message: Message) -> Body:
     return {"transforms": [_transform(message, "odom", "base_link", robot.pose(message.t))]}
 
 
 def _odometry(message: Message) -> Body:
     x, y, yaw = robot.pose(message.t)
     return {
-        **_headed(message, "odom"),
+        **_header(message, "odom"),
         "child_frame_id": "base_link",
         "pose": {"pose": {"position": _xyz(x, y), "orientation": _rotation(yaw)}},
         "twist": {"twist": _twist(message)},
@@ -215,7 +214,7 @@ def _odometry(message: Message) -> Body:
 def _battery(message: Message) -> Body:
     unknown = ("temperature", "current", "charge", "capacity", "design_capacity")
     return {
-        **_headed(message, "base_link"),
+        **_header(message, "base_link"),
         **dict.fromkeys(unknown, math.nan),
         "voltage": 25.2,
         "percentage": robot.battery(message.t),
@@ -224,12 +223,12 @@ def _battery(message: Message) -> Body:
 
 
 _BODIES: Final[Mapping[str, Callable[[Message], Body]]] = {
-    TF_STATIC: _fixed,
+    TF_STATIC: _static_transforms,
     ODOM: _odometry,
-    TF: _moving,
+    TF: _robot_transform,
     CMD_VEL: _twist,
     PATH_CLEAR: lambda message: {"data": robot.path_clear(message.t)},
     SCENE_OBJECTS: _detections,
     BATTERY: _battery,
 }
-"""What the robot publishes in a message of each topic."""
+"""The functions that make the fields of a message, by topic."""

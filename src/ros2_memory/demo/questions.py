@@ -1,8 +1,7 @@
 """The questions of the demo: in words, as a tool call, and with the judge of the answer.
 
-A judge compares a reply with the robot's closed form at the reply's own time, checks that this time
-is one that was asked for, and returns the answer as a sentence. It raises `WrongAnswerError`
-otherwise.
+A judge checks that the reply's time is one that was asked for, and compares the reply with the
+robot's closed form at that time. It returns the answer as a sentence, or raises `WrongAnswerError`.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ if TYPE_CHECKING:
 NEAR_M: Final = 0.5
 """The radius of a place: the server's default `data.position_tolerance_m`."""
 _ROUNDED: Final = 1e-3
-"""Metres or m/s that a right number may be off by its rounding, with some room."""
+"""How much (m, m/s) a right number may be off: its rounding, with some room."""
 _LATE_S: Final = 1.5
-"""How much older the newest message at a moment may be: the battery reports once a second."""
+"""How much older a message may be than the asked time: the battery reports once a second."""
 _PERIODS: Final = {stream.topic: stream.period for stream in STREAMS}
 
 
@@ -46,28 +45,28 @@ class CallContext:
     after: Ns
 
     def robot_time(self, moment_s: float, topic: str) -> float:
-        """Returns the robot's time (s) that the message with a log time (Unix s) describes."""
+        """Returns the robot's time (s) that a message describes, by its log time (Unix s)."""
         period = _PERIODS[topic]
         return (ns_from_unix(moment_s) - self.t0) // period * period / NS_PER_S
 
     def age_s(self, moment_s: float) -> float:
-        """Returns the age of a time (Unix seconds) when the answer came."""
+        """Returns the age of a time (Unix s) when the answer came."""
         return unix_from_ns(self.after) - moment_s
 
     def require_ago(self, moment_s: float, seconds: float) -> None:
-        """Checks that a time (Unix s) lies so many seconds before now.
+        """Checks that a time (Unix s) lies `seconds` before the call.
 
         Raises:
             WrongAnswerError: it does not.
         """
-        first, last = (unix_from_ns(at) - seconds for at in (self.before, self.after))
-        if not first - _LATE_S <= moment_s <= last + _ROUNDED:
+        first_s, last_s = (unix_from_ns(at) - seconds for at in (self.before, self.after))
+        if not first_s - _LATE_S <= moment_s <= last_s + _ROUNDED:
             raise WrongAnswerError(f"expected a time {seconds:g} s ago, not {moment_s:.6f}")
 
 
 Judge: TypeAlias = "Callable[[JsonValue, CallContext], str]"
 Expected: TypeAlias = "Callable[[float], JsonObject]"
-"""What a reply has of the robot at a time t."""
+"""Returns the right reply at a time t of the robot (s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +81,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """One question and its answer: a sentence if it is right, else what was expected."""
+    """A question and its reply; `sentence` is the answer if it is right, else what was expected."""
 
     question: Question
     reply: str
@@ -103,10 +102,10 @@ def judge_reply(
 
 
 def _number(reply: JsonValue, key: str) -> float:
-    """Returns the number that a reply has at a key.
+    """Returns the number at a key of a reply.
 
     Raises:
-        WrongAnswerError: there is none.
+        WrongAnswerError: there is no number.
     """
     number = reply.get(key) if isinstance(reply, dict) else None
     if not isinstance(number, int | float):
@@ -121,32 +120,32 @@ def _require(
     off: float = _ROUNDED,
     off_deg: float = 0.05,
 ) -> None:
-    """Checks that a reply has what is expected; it may have more.
+    """Checks that a reply has the expected keys and values; it may have more keys.
 
-    A number may be `off`, an angle `off_deg`, in whatever turn.
+    A number may differ by `off`, an angle (a key in `_deg`) by `off_deg` and by whole turns.
 
     Raises:
-        WrongAnswerError: it has not.
+        WrongAnswerError: it has another value.
     """
     for key, right in expected.items():
         got = reply.get(key) if isinstance(reply, dict) else None
         if isinstance(right, dict):
             _require(got, right, off=off, off_deg=off_deg)
         elif isinstance(right, list) and isinstance(got, list) and len(got) == len(right):
-            for one, other in zip(got, right, strict=True):
-                _require({key: one}, {key: other}, off=off, off_deg=off_deg)
+            for item, right_item in zip(got, right, strict=True):
+                _require({key: item}, {key: right_item}, off=off, off_deg=off_deg)
         elif isinstance(right, float):
-            apart, may_be = _number(reply, key) - right, off
+            difference, tolerance = _number(reply, key) - right, off
             if key.endswith("_deg"):
-                apart, may_be = (apart + 180.0) % 360.0 - 180.0, off_deg
-            if not abs(apart) <= may_be:
+                difference, tolerance = (difference + 180.0) % 360.0 - 180.0, off_deg
+            if not abs(difference) <= tolerance:  # NaN is wrong, too
                 raise WrongAnswerError(f"expected {key} {right:.4f}, not {got}")
         elif got != right:
             raise WrongAnswerError(f"expected {key} {right}, not {got}")
 
 
-def _time_range(reply: JsonValue, call: CallContext) -> str:
-    """Judges the range: all that was recorded, without gaps or damage."""
+def _judge_time_range(reply: JsonValue, call: CallContext) -> str:
+    """Judges the range of the data: all that was recorded, without gaps or damage."""
     earliest, latest = _number(reply, "earliest"), _number(reply, "latest")
     _require(reply, {fault: [] for fault in ("gaps", "damaged", "incomplete", "unread")})
     return (
@@ -155,49 +154,57 @@ def _time_range(reply: JsonValue, call: CallContext) -> str:
     )
 
 
-def _at(
+def _message_judge(
     topic: str,
     expected: Expected,
     sentence: str,
     *,
     ago: float | None = None,
     holds: Callable[[float], bool] = lambda _: True,
-    then: str | None = None,
+    value_topic: str | None = None,
     off: float = _ROUNDED,
 ) -> Judge:
-    """Judges what a message of a topic holds: one so many seconds ago, or at which something holds.
+    """Returns a judge of a reply about one message.
 
-    `expected` and `sentence` are of that message, or of the one of the topic `then`; a number may
-    be `off`.
+    Args:
+        topic: of the message.
+        expected: the right reply at a time of the robot.
+        sentence: the answer, with the fields of `_sentence`.
+        ago: how many seconds before the call the message must be, if that was asked.
+        holds: whether the asked condition holds at a time of the robot.
+        value_topic: another topic, if the value is that of its message at the same time.
+        off: how much a number may be off.
     """
 
     def judge(reply: JsonValue, call: CallContext) -> str:
-        moment = _number(reply, "timestamp")
+        moment_s = _number(reply, "timestamp")
         if ago is not None:
-            call.require_ago(moment, ago)
-        t = call.robot_time(moment, topic)
+            call.require_ago(moment_s, ago)
+        t = call.robot_time(moment_s, topic)
         if not holds(t):
-            raise WrongAnswerError(f"expected a time at which it was so, not {moment:.6f}")
-        if then is not None:
-            t = call.robot_time(_number(reply, "value_timestamp"), then)
+            raise WrongAnswerError(f"expected a time at which it was so, not {moment_s:.6f}")
+        if value_topic is not None:
+            t = call.robot_time(_number(reply, "value_timestamp"), value_topic)
         _require(reply, expected(t), off=off)
-        return _said(sentence, t, moment, call)
+        return _sentence(sentence, t, moment_s, call)
 
     return judge
 
 
-def _said(sentence: str, t: float, moment: float, call: CallContext) -> str:
-    """Returns a sentence with what the robot does, and what there is, and when that was."""
-    local = datetime.fromtimestamp(moment, tz=UTC).astimezone()
+def _sentence(template: str, t: float, moment_s: float, call: CallContext) -> str:
+    """Fills a template with what the robot does and sees at its time t, and when (Unix s)."""
+    local = datetime.fromtimestamp(moment_s, tz=UTC).astimezone()
     x, y, yaw = robot.pose(t)
     forward, turning = robot.twist(t)
     way, rate = "backwards" if forward < 0 else "forwards", math.degrees(turning)
-    turn = f"turning {'left' if rate > 0 else 'right'} at {abs(rate):.0f} degrees/s"
-    text = sentence.format(
-        when=f"at {local:%H:%M:%S}, {call.age_s(moment):.1f} s ago",
+    turn = "straight on"
+    if abs(rate) >= 1:
+        turn = f"turning {'left' if rate > 0 else 'right'} at {abs(rate):.0f} degrees/s"
+    text = template.format(
+        when=f"at {local:%H:%M:%S}, {call.age_s(moment_s):.1f} s ago",
         place=f"in the {robot.place(t)}, at x {_metres(x)}, y {_metres(y)} in odom",
         facing=f"{math.degrees(yaw):.0f} degrees",
-        motion=f"{abs(forward):.2f} m/s {way}, {turn if abs(rate) >= 1 else 'straight on'}",
+        motion=f"{abs(forward):.2f} m/s {way}, {turn}",
         charge=f"{robot.battery(t):.1%}",
         objects=", ".join(thing.label for thing in robot.seen(t)) or "nothing",
     )
@@ -205,7 +212,7 @@ def _said(sentence: str, t: float, moment: float, call: CallContext) -> str:
 
 
 def _metres(value: float) -> str:
-    return f"{round(value, 2) + 0.0:.2f} m"  # nothing is -0.00 m
+    return f"{round(value, 2) + 0.0:.2f} m"  # adding 0.0 turns -0.0 into 0.0
 
 
 def _position(t: float) -> JsonObject:
@@ -231,45 +238,45 @@ def _objects(t: float) -> JsonObject:
     return {"value": {"detections": [{"label": thing.label} for thing in robot.seen(t)]}}
 
 
-def _driven(seconds: float) -> Judge:
-    """Judges the distance driven in the last seconds, as far as closed files have it."""
+def _distance_judge(seconds: float) -> Judge:
+    """Returns a judge of the distance driven in the last seconds, so far as files are closed."""
 
     def judge(reply: JsonValue, call: CallContext) -> str:
-        start, end = _number(reply, "start"), _number(reply, "end")
-        call.require_ago(start - _LATE_S, seconds)
-        metres = robot.driven(call.robot_time(end, ODOM)) - robot.driven(
-            call.robot_time(start, ODOM)
-        )
+        start_s, end_s = _number(reply, "start"), _number(reply, "end")
+        call.require_ago(start_s - _LATE_S, seconds)
+        before, after = (robot.driven(call.robot_time(at, ODOM)) for at in (start_s, end_s))
+        metres = after - before
         _require(reply, {"distance_m": metres}, off=0.01 * (1 + metres))
         return (
             f"{metres:.2f} m, at up to {_number(reply, 'max_speed'):.2f} m/s, in the "
-            f"{end - start:.1f} s of it that are in closed files."
+            f"{end_s - start_s:.1f} s of it that are in closed files."
         )
 
     return judge
 
 
-def _camera_in_map(seconds_ago: float) -> Judge:
-    """Judges the pose of the camera in `map` so long ago, through four frames."""
+def _camera_judge(seconds_ago: float) -> Judge:
+    """Returns a judge of the pose of the camera in `map` at a time, through four frames."""
 
     def judge(reply: JsonValue, call: CallContext) -> str:
-        moment = _number(reply, "timestamp")
-        call.require_ago(moment, seconds_ago)
-        t = (ns_from_unix(moment) - call.t0) / NS_PER_S
-        x, y, yaw = robot.pose_in_map(t).then(Planar(*robot.CAMERA[:2], 0.0))
-        where: JsonValue = {"x": x, "y": y, "z": robot.CAMERA[2]}
-        expected = {"translation": where, "yaw_deg": math.degrees(yaw)}
+        moment_s = _number(reply, "timestamp")
+        call.require_ago(moment_s, seconds_ago)
+        t = (ns_from_unix(moment_s) - call.t0) / NS_PER_S
+        ahead, aside, height = robot.CAMERA
+        x, y, yaw = robot.pose_in_map(t).then(Planar(ahead, aside, 0.0))
+        position: JsonValue = {"x": x, "y": y, "z": height}
+        expected = {"translation": position, "yaw_deg": math.degrees(yaw)}
         _require(reply, expected, off=5e-3, off_deg=0.2)  # between two transforms
         return (
             f"In the {room_at(x)}, {x:.2f} m east and {y:.2f} m north of the flat's corner, "
-            f"{robot.CAMERA[2]:.2f} m high."
+            f"{height:.2f} m high."
         )
 
     return judge
 
 
-def _nothing_on(topic: str) -> Judge:
-    """Judges the reply that a topic was never recorded, which is an answer, too."""
+def _not_recorded_judge(topic: str) -> Judge:
+    """Returns a judge of the reply that a topic was never recorded, which is an answer, too."""
 
     def judge(reply: JsonValue, _call: CallContext) -> str:
         _require(reply, {"error": "no_data", "reason": "topic_not_recorded"})
@@ -279,11 +286,12 @@ def _nothing_on(topic: str) -> Judge:
 
 
 def _is_near(place: Planar) -> Callable[[float], bool]:
-    spot = _in_odom(place)
+    """Returns a function that tells whether the robot is within `NEAR_M` of a place of the flat."""
+    centre = _in_odom(place)
 
     def holds(t: float) -> bool:
         pose = robot.pose(t)
-        return math.hypot(pose.x - spot.x, pose.y - spot.y) <= NEAR_M
+        return math.hypot(pose.x - centre.x, pose.y - centre.y) <= NEAR_M
 
     return holds
 
@@ -297,8 +305,8 @@ def _in_odom(place: Planar) -> Planar:
     return robot.MAP_TO_ODOM.inverse().then(place)
 
 
-def _near(place: Planar) -> Mapping[str, JsonValue]:
-    """Returns the condition that the robot is at a place."""
+def _near_condition(place: Planar) -> Mapping[str, JsonValue]:
+    """Returns the arguments of a tool for the condition that the robot is at a place."""
     x, y, _ = _in_odom(place)
     return {"condition_type": "near_position", "value": {"x": round(x, 3), "y": round(y, 3)}}
 
@@ -309,48 +317,54 @@ _CAMERA_TOPIC: Final = "/camera/image_raw"
 _SCISSORS: Final = {"condition_type": "contains", "value": "scissors"}
 
 QUESTIONS: Final = (
-    Question("How far back do you remember?", "data_time_range", {}, _time_range),
+    Question("How far back do you remember?", "data_time_range", {}, _judge_time_range),
     Question(
         "Where was I 10 s ago?",
         "get_position_seconds_ago",
         {"seconds_ago": 10},
-        _at(ODOM, _pose, "{place}, facing {facing}.", ago=10),
+        _message_judge(ODOM, _pose, "{place}, facing {facing}.", ago=10),
     ),
     Question(
         "And how fast?",
         "get_velocity_seconds_ago",
         {"seconds_ago": 10},
-        _at(ODOM, _twist, "{motion}.", ago=10),
+        _message_judge(ODOM, _twist, "{motion}.", ago=10),
     ),
     Question(
         "What objects did you see at the front door?",
         "get_value_when",
-        {"value_topic": SCENE_OBJECTS, "condition_topic": ODOM, **_near(robot.FRONT_DOOR)},
-        _at(
+        {
+            "value_topic": SCENE_OBJECTS,
+            "condition_topic": ODOM,
+            **_near_condition(robot.FRONT_DOOR),
+        },
+        _message_judge(
             ODOM,
             _objects,
             "{objects}, {when}.",
             holds=_is_near(robot.FRONT_DOOR),
-            then=SCENE_OBJECTS,
+            value_topic=SCENE_OBJECTS,
         ),
     ),
     Question(
         "When was the path last clear?",
         "find_last_match",
         {"topic": PATH_CLEAR, "condition_type": "equals", "value": True},
-        _at(PATH_CLEAR, lambda _: {"value": {"value": True}}, "{when}.", holds=robot.path_clear),
+        _message_judge(
+            PATH_CLEAR, lambda _: {"value": {"value": True}}, "{when}.", holds=robot.path_clear
+        ),
     ),
     Question(
         "How far have I driven in the last minute?",
         "recent_trajectory_summary",
         {"seconds": LOOK_BACK_S},
-        _driven(LOOK_BACK_S),
+        _distance_judge(LOOK_BACK_S),
     ),
     Question(
         "When did you last see scissors?",
         "find_last_match",
         {"topic": "/vision/*/scene_objects", **_SCISSORS},
-        _at(
+        _message_judge(
             SCENE_OBJECTS,
             lambda t: {"topic": SCENE_OBJECTS, **_objects(t)},
             "{when}; in view: {objects}.",
@@ -361,25 +375,31 @@ QUESTIONS: Final = (
         "And where were you then?",
         "get_value_when",
         {"value_topic": ODOM, "condition_topic": SCENE_OBJECTS, **_SCISSORS},
-        _at(SCENE_OBJECTS, _at_position, "{place}, {when}.", holds=_sees("scissors"), then=ODOM),
+        _message_judge(
+            SCENE_OBJECTS,
+            _at_position,
+            "{place}, {when}.",
+            holds=_sees("scissors"),
+            value_topic=ODOM,
+        ),
     ),
     Question(
         "When were you last at the kitchen counter?",
         "find_last_match",
-        {"topic": ODOM, **_near(robot.KITCHEN_COUNTER)},
-        _at(ODOM, _at_position, "{when}.", holds=_is_near(robot.KITCHEN_COUNTER)),
+        {"topic": ODOM, **_near_condition(robot.KITCHEN_COUNTER)},
+        _message_judge(ODOM, _at_position, "{when}.", holds=_is_near(robot.KITCHEN_COUNTER)),
     ),
     Question(
         "Where in the flat was the camera 10 s ago?",
         "get_transform_seconds_ago",
         {"parent": "map", "child": "camera", "seconds_ago": 10},
-        _camera_in_map(10),
+        _camera_judge(10),
     ),
     Question(
         "How full was the battery half a minute ago?",
         "get_topic_seconds_ago",
         {"topic": BATTERY, "seconds_ago": 30, "tolerance_s": 1.5, "fields": ["percentage"]},
-        _at(
+        _message_judge(
             BATTERY,
             lambda t: {"value": {"percentage": robot.battery(t)}},
             "{charge}.",
@@ -391,6 +411,6 @@ QUESTIONS: Final = (
         "What did the camera's pictures show?",
         "get_topic_seconds_ago",
         {"topic": _CAMERA_TOPIC, "seconds_ago": 10},
-        _nothing_on(_CAMERA_TOPIC),
+        _not_recorded_judge(_CAMERA_TOPIC),
     ),
 )

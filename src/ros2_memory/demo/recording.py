@@ -27,39 +27,42 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.reply import JsonObject
 
-_FOR_EVER: Final[JsonObject] = {"sec": 9223372036, "nsec": 854775807}
+_FOR_EVER: Final[JsonObject] = {
+    "sec": 9223372036,
+    "nsec": 854775807,
+}  # the largest duration of 64 bits
 _STOP_WITHIN_S: Final = 10.0
 
 
 class DemoRecorder(AbstractContextManager["DemoRecorder"]):
-    """Writes a `MessageSchedule` into `directory`, each message when it is received.
+    """Writes the messages of a `MessageSchedule` into a directory, each when it is received.
 
-    Those of before now are written at once. The directory must not exist (as with
-    `ros2 bag record`); its name is the recording's. It records in a thread of its own, from its
-    beginning to `stop`, and as a context manager to the end of the block.
+    Messages of the past are written at once. The directory must not exist (as with
+    `ros2 bag record`); its name is the recording's. A thread records from the constructor until
+    `stop`, or until the block of the context manager ends.
 
     Attributes:
-        splits: the number of files; all but the last are closed, and `stop` closes that.
+        directory: the recording.
+        splits: the number of files; the last one is open until `stop`.
         failure: the error that ended the recording early, such as a full disk.
     """
 
     def __init__(
         self,
         directory: Path,
-        timeline: MessageSchedule,
+        schedule: MessageSchedule,
         *,
         split_duration_s: float = 5.0,
         clock: Clock | None = None,
     ) -> None:
         directory.mkdir(parents=True)
         self.directory = directory
-        self.timeline = timeline
         self.splits = 0
         self.failure: BagError | None = None
         self._duration = ns_from_unix(split_duration_s)
         self._clock = clock or WallClock()
-        self._due = timeline.everything()
-        self._next = next(self._due)
+        self._messages = schedule.everything()
+        self._next = next(self._messages)
         self._caught_up, self._ending = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._record, name="demo-recorder", daemon=True)
         self._thread.start()
@@ -88,23 +91,23 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
     def _split(self) -> Iterator[Record]:
         """Yields the messages of one split, each when it is received."""
         first = self._next.log_time
-        while self._next.log_time - first <= self._duration and not self._is_over():
-            message, self._next = self._next, next(self._due)
+        while self._next.log_time - first <= self._duration and self._wait_for_next():
+            message, self._next = self._next, next(self._messages)
             channel = _channel(message.stream)
             yield Record(channel, message.log_time, message.publish_time, payload(message))
 
-    def _is_over(self) -> bool:
-        """Waits until the next message is received; returns whether the recording ends instead."""
+    def _wait_for_next(self) -> bool:
+        """Waits until the next message is received; returns False if the recording ends before."""
         while (ahead := self._next.log_time - self._clock.now()) > 0:
             self._caught_up.set()
             if self._ending.wait(unix_from_ns(ahead)):
-                return True
-        return False
+                return False
+        return True
 
 
 @cache
 def _channel(stream: Stream) -> Channel:
-    """Returns the channel of a stream, with the QoS that the publisher offers."""
+    """Returns the channel of a stream, with the QoS that its publisher offers."""
     schema = Schema(stream.type, "ros2msg", definition(stream.type).encode())
     qos = {
         "history": "unknown",

@@ -47,12 +47,15 @@ ROOMS: Final[Mapping[str, tuple[float, float, float, float]]] = {
     "hall": (5.0, 7.0, 0.0, 4.0),
     "kitchen": (7.0, 11.0, 0.0, 4.0),
 }
-"""The rooms: from and to which x, and from and to which y (m)."""
+"""The rooms, from west to east: the least and greatest x, and the least and greatest y (m)."""
 
 
 def room_at(x: float) -> str:
-    """Returns the name of the room at `x` (the rooms lie in a row from west to east)."""
-    return next((name for name, (_, end, *_) in ROOMS.items() if x < end), "kitchen")
+    """Returns the name of the room at `x` in `map`; all rooms have the same y."""
+    for name, (_, east, _, _) in ROOMS.items():
+        if x < east:
+            return name
+    return "kitchen"
 
 
 class Planar(NamedTuple):
@@ -135,6 +138,7 @@ LAP_S: Final = sum(leg.duration for leg in LAP)
 LAP_M: Final = sum(abs(leg.length) for leg in LAP)
 _CHARGING_S: Final = LAP[-1].duration
 _STARTS: Final = tuple(accumulate((leg.duration for leg in LAP), initial=0.0))
+"""When each leg starts (s), the pose there, and the distance driven before it (m)."""
 _POSES: Final = tuple(
     accumulate(LAP, lambda pose, leg: pose.then(leg.after(1.0)), initial=Planar(0.0, 0.0, 0.0))
 )
@@ -183,34 +187,39 @@ def seen(t: float) -> tuple[SimulatedThing, ...]:
     for label, (x, y, z) in THINGS.items():
         forward, left, _ = to_camera.then(Planar(x, y, 0.0))
         bearing, distance = math.atan2(left, forward), math.hypot(forward, left)
-        if distance <= SIGHT_M and abs(bearing) <= SIGHT_HALF_ANGLE:
-            score = round(0.97 - 0.1 * distance, 2)
-            things.append(
-                (distance, SimulatedThing(label, score, (forward + ahead, left + aside, z)))
-            )
+        if distance > SIGHT_M or abs(bearing) > SIGHT_HALF_ANGLE:
+            continue
+        score = round(0.97 - 0.1 * distance, 2)  # detectors are less sure of what is far away
+        thing = SimulatedThing(label, score, (forward + ahead, left + aside, z))
+        things.append((distance, thing))
     return tuple(thing for _, thing in sorted(things))
 
 
 def path_clear(t: float) -> bool:
-    """Returns whether what is `CLEAR_M` straight ahead of the laser is in a room."""
-    x, y, _ = pose_in_map(t).then(Planar(LASER[0] + CLEAR_M, 0.0, 0.0))
+    """Returns whether the point `CLEAR_M` straight ahead of the laser is in a room."""
+    ahead, *_ = LASER
+    x, y, _ = pose_in_map(t).then(Planar(ahead + CLEAR_M, 0.0, 0.0))
     return any(west < x < east and south < y < north for west, east, south, north in ROOMS.values())
 
 
 def battery(t: float) -> float:
-    """Returns the charge, 0 to 1: it falls evenly while driving, and rises on the dock."""
+    """Returns the charge (0 to 1), which falls evenly while driving, and rises on the dock."""
     phase = t % LAP_S
-    driving = LAP_S - _CHARGING_S
-    spent = phase / driving if phase < driving else (LAP_S - phase) / _CHARGING_S
+    driving_s = LAP_S - _CHARGING_S
+    if phase < driving_s:
+        spent = phase / driving_s
+    else:
+        spent = (LAP_S - phase) / _CHARGING_S
     return 0.90 - 0.08 * spent
 
 
 def _leg(t: float) -> tuple[int, float]:
-    """Returns the current leg and the share of its duration that has passed, in [0, 1]."""
+    """Returns the index of the current leg, and the share of its duration that has passed."""
     phase = t % LAP_S
     index = bisect_right(_STARTS, phase, hi=len(LAP)) - 1
     return index, (phase - _STARTS[index]) / LAP[index].duration
 
 
 def _eased(share: float) -> float:
+    """Returns the progress e(u) of a leg (see above) at a share u of its duration."""
     return share - math.sin(2.0 * math.pi * share) / (2.0 * math.pi)

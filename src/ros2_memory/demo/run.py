@@ -11,7 +11,6 @@ import sys
 import textwrap
 import time
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -23,7 +22,7 @@ from mcp.client.sse import sse_client
 from mcp.types import TextContent
 
 from ros2_memory.core.errors import ConfigError, EpisodicError
-from ros2_memory.core.timebase import NS_PER_S, WallClock, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_S, Ns, WallClock, ns_from_unix
 from ros2_memory.demo.messages import MessageSchedule
 from ros2_memory.demo.questions import QUESTIONS, CallContext, Exchange, Question, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
@@ -42,28 +41,32 @@ _JSON_LINES: Final = 4
 
 
 def format_exchange(number: int, exchange: Exchange) -> str:
-    """Returns the question, the tool call, the answer in words, and the reply as received.
-
-    An empty line follows.
-    """
+    """Returns the question, the tool call, the answer in words, the reply, and an empty line."""
     question, mark = exchange.question, "" if exchange.right else "WRONG: "
     arguments = ", ".join(
         f"{name}={json.dumps(value)}" for name, value in question.arguments.items()
     )
-    filled = partial(textwrap.fill, width=WIDTH, break_on_hyphens=False)
-    call = filled(
-        f"{question.tool}({arguments})", initial_indent=_INDENT, subsequent_indent=_INDENT * 2
+    call = _filled(f"{question.tool}({arguments})", _INDENT, _INDENT * 2)
+    answer = _filled(f"{mark}{exchange.sentence}", f"{_INDENT}=> ", f"{_INDENT}   ")
+    reply = textwrap.wrap(exchange.reply, WIDTH - len(_INDENT), break_on_hyphens=False)
+    lines = [f"{_INDENT}{line}" for line in reply[:_JSON_LINES]]
+    if len(reply) > _JSON_LINES:
+        lines.append(f"{_INDENT}... ({len(exchange.reply):,} characters in all)")
+    return "\n".join([f"{number:>2}. {question.words}", call, answer, *lines, ""])
+
+
+def _filled(text: str, first_indent: str, indent: str) -> str:
+    return textwrap.fill(
+        text,
+        width=WIDTH,
+        break_on_hyphens=False,
+        initial_indent=first_indent,
+        subsequent_indent=indent,
     )
-    answer = filled(
-        f"{mark}{exchange.sentence}",
-        initial_indent=f"{_INDENT}=> ",
-        subsequent_indent=f"{_INDENT}   ",
-    )
-    return "\n".join([f"{number:>2}. {question.words}", call, answer, *_reply(exchange.reply), ""])
 
 
 def exchange_as_json(number: int, exchange: Exchange) -> str:
-    """Returns the same in one line, for programs."""
+    """Returns the question, the call, the answer and the reply as a line of JSON."""
     question = exchange.question
     return json.dumps(
         {
@@ -79,7 +82,7 @@ def exchange_as_json(number: int, exchange: Exchange) -> str:
 
 
 def connection_hints(url: str) -> str:
-    """Returns where the page is and how a client connects, while the robot drives on."""
+    """Returns how to open the page and how to connect a client, while the robot drives on."""
     return "\n".join(
         [
             "The robot drives on, and the server stays up until Ctrl-C. Look at it, or ask it:",
@@ -95,30 +98,23 @@ def connection_hints(url: str) -> str:
     )
 
 
-def _reply(text: str) -> Iterator[str]:
-    """Yields the JSON as received, in lines; of a long one the start and its length."""
-    lines = textwrap.wrap(text, WIDTH - len(_INDENT), break_on_hyphens=False)
-    for line in lines[:_JSON_LINES]:
-        yield _INDENT + line
-    if len(lines) > _JSON_LINES:
-        yield f"{_INDENT}... ({len(text):,} characters in all)"
-
-
 HOST: Final = "127.0.0.1"
 PLACES_NAME: Final = "places.yaml"
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH", "CREDENTIALS_DIRECTORY")
 _UP_WITHIN_S: Final = 300.0
-"""As long as it may take on a machine with much else to do; one that fails ends at once."""
+"""A busy machine may take so long; a server that fails ends at once."""
+_POLL_S: Final = 0.05
 _LOOKED_AT_S: Final = 0.5
+"""How often the server and the recording are checked."""
 _LOG_LINES_SHOWN: Final = 8
 
 
 def server_environment(
     environment: Mapping[str, str], bag_dir: Path, port: int, cache: str
 ) -> dict[str, str]:
-    """Returns the environment of a server of `bag_dir`, without the caller's settings."""
-    kept = {name: value for name, value in environment.items() if not name.startswith(_OURS)}
-    return kept | {
+    """Returns the environment of a server of `bag_dir`, without the settings in `environment`."""
+    others = {name: value for name, value in environment.items() if not name.startswith(_OURS)}
+    return others | {
         "MCP_TRANSPORT": "sse",
         "MCP_HOST": HOST,
         "MCP_PORT": str(port),
@@ -134,11 +130,11 @@ def server_environment(
 
 @contextmanager
 def running_server(bag_dir: Path, port: int, *, verbose: bool) -> Iterator[tuple[Child, str]]:
-    """Yields a server that answers, with its address, and ends it after the block.
+    """Starts a server, yields it with its address when it answers, and ends it after the block.
 
-    Its log goes to stderr where `verbose`; its columns into a folder that is removed at the end: no
-    one else uses it. The rooms of the flat are written to `places.yaml` in the bag directory. It
-    ends with this program, also where that is killed.
+    Writes the rooms of the flat to `places.yaml` in the bag directory. The server's log goes to
+    stderr if `verbose`, its columns into a temporary folder. The server also ends if this program
+    is killed.
 
     Raises:
         EpisodicError: it did not come up; the sentence ends with the last lines of its log.
@@ -155,15 +151,19 @@ def running_server(bag_dir: Path, port: int, *, verbose: bool) -> Iterator[tuple
             stderr=None if verbose else subprocess.STDOUT,
         )
         try:
-            yield server, _address_of(server)
+            yield server, _wait_for_address(server)
         finally:
             end_all([server])
 
 
-def _address_of(server: Child) -> str:
-    """Waits until a server has printed its address, and returns that."""
+def _wait_for_address(server: Child) -> str:
+    """Waits until a server has printed its address, and returns the address.
+
+    Raises:
+        EpisodicError: the server ended, or did not answer in time.
+    """
     begun, lines = time.monotonic(), list[str]()
-    while not (printed := re.search(rf"http://{HOST}:\d+", "\n".join(lines))):
+    while not (address := re.search(rf"http://{HOST}:\d+", "\n".join(lines))):
         status, waited_s, failed = server.exit_status(), time.monotonic() - begun, ""
         lines += server.take_lines()
         if status is not None:
@@ -173,15 +173,15 @@ def _address_of(server: Child) -> str:
         if failed:
             words = [": its last words are", *lines[-_LOG_LINES_SHOWN:]] if lines else []
             raise EpisodicError("\n  ".join([failed, *words]))
-        time.sleep(0.05)
-    return printed[0]
+        time.sleep(_POLL_S)
+    return address[0]
 
 
 SPLIT_DURATION_S: Final = 5.0
 SHORTEST_S: Final = LAP_S + 2 * SPLIT_DURATION_S
 LONGEST_S: Final = 86_400.0
 _UNDERWAY_S: Final = 22
-"""How long the robot has been driving when its recording begins (it leaves the front door)."""
+"""Seconds that the robot has been driving when its recording begins: it leaves the front door."""
 
 _CONNECTED_WITHIN_S: Final = 60.0
 
@@ -197,14 +197,20 @@ def run_demo(
     verbose: bool = False,
     as_json: bool = False,
 ) -> int:
-    """Records, serves, asks, and (unless `once`) continues until it is interrupted.
+    """Records, serves, asks, and then continues until it is interrupted.
 
-    `once`: leave after the answers. `port`: 0 for any that is free. `bag_dir`: an empty or new
-    folder for the bags, kept; None for a temporary one. `duration_s`: length of the history that
-    exists when the questions are asked. `as_json`: a line of JSON for each question, and no more.
+    Args:
+        say: prints a line.
+        questions: what is asked.
+        once: whether to leave after the answers.
+        port: the server's; 0 for any free one.
+        bag_dir: an empty or new folder for the bags; None for a temporary one.
+        duration_s: the length of the history when the questions are asked.
+        verbose: whether the server's log goes to stderr.
+        as_json: whether to print only a line of JSON for each question.
 
     Returns:
-        0 where every answer was right, otherwise 1.
+        0 if every answer was right, otherwise 1.
 
     Raises:
         ConfigError: the options cannot be followed.
@@ -219,7 +225,14 @@ def run_demo(
         )
     if bag_dir and bag_dir.exists() and (not bag_dir.is_dir() or any(bag_dir.iterdir())):
         raise ConfigError(f"--bag-dir {bag_dir} is not an empty folder; give a new or an empty one")
-    tell: Callable[[str], object] = str if as_json else say
+
+    def show(number: int, exchange: Exchange) -> None:
+        say((exchange_as_json if as_json else format_exchange)(number, exchange))
+
+    def tell(text: str) -> None:
+        if not as_json:
+            say(text)
+
     with ExitStack() as stack:
         if bag_dir is None:
             temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
@@ -242,18 +255,7 @@ def run_demo(
             f"{SPLIT_DURATION_S:g} s, the last one being written\n"
             f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
         )
-        show = exchange_as_json if as_json else format_exchange
-        try:
-            right = anyio.run(
-                _ask_all, f"{url}/sse", recorder, lambda *asked: say(show(*asked)), questions
-            )
-        except ExceptionGroup as group:
-            # What the client raises, and what is raised while it is open, comes nested in groups.
-            cause: BaseException = group
-            while isinstance(cause, BaseExceptionGroup):
-                cause = cause.exceptions[0]
-            why = str(cause) or type(cause).__name__
-            raise EpisodicError(f"the questions broke off: {why}") from group
+        right = _ask_all(f"{url}/sse", schedule.t0, show, questions)
         tell(f"{right} of {len(questions)} answers are right.")
         if not once:
             tell(f"\n{connection_hints(url)}")
@@ -261,10 +263,26 @@ def run_demo(
     return int(right < len(questions))
 
 
-async def _ask_all(
-    url: str, recorder: DemoRecorder, show: _Show, questions: Sequence[Question]
+def _ask_all(url: str, t0: Ns, show: _Show, questions: Sequence[Question]) -> int:
+    """Asks every question; returns how many answers were right.
+
+    Raises:
+        EpisodicError: the connection breaks.
+    """
+    try:
+        return anyio.run(_ask_over_one_connection, url, t0, show, questions)
+    except ExceptionGroup as group:
+        # The client raises errors, also those of its block, in nested groups.
+        cause: BaseException = group
+        while isinstance(cause, BaseExceptionGroup):
+            cause = cause.exceptions[0]
+        why = str(cause) or type(cause).__name__
+        raise EpisodicError(f"the questions broke off: {why}") from group
+
+
+async def _ask_over_one_connection(
+    url: str, t0: Ns, show: _Show, questions: Sequence[Question]
 ) -> int:
-    """Asks every question over one connection; returns how many answers were right."""
     right, clock = 0, WallClock()
     async with Client(sse_client(url, timeout=_CONNECTED_WITHIN_S)) as client:
         for number, question in enumerate(questions, start=1):
@@ -275,7 +293,7 @@ async def _ask_all(
                 exchange = Exchange(question, "", f"the call failed: {error}", right=False)
             else:
                 texts = [part.text for part in result.content if isinstance(part, TextContent)]
-                call = CallContext(recorder.timeline.t0, before, clock.now())
+                call = CallContext(t0, before, clock.now())
                 exchange = judge_reply(question, "".join(texts), call, is_error=result.is_error)
             show(number, exchange)
             right += exchange.right
