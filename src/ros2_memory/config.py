@@ -66,12 +66,12 @@ _T = TypeVar("_T")
 
 EXIT_CODE: Final = 2
 _MOST: Final = 10**9
-"""The largest number: in seconds a thread can wait so long, in GB a file system counts so far."""
+"""The largest number: a thread can wait so many seconds, a file system can have so many GB."""
 _SECRET_WORDS: Final = ("secret", "password", "token", "credential", "access-key", "key-id", "auth")
-"""Settings of pyiceberg with one of these in their name are not shown, so not given openly."""
+"""A setting of pyiceberg whose name has one of these words is a secret."""
 
 
-def _home_expanded(path: Path) -> Path:
+def _expand_home(path: Path) -> Path:
     if path == Path():
         raise ValueError("must name a path")
     try:
@@ -81,36 +81,37 @@ def _home_expanded(path: Path) -> Path:
 
 
 def _in_config_dir(path: Path, info: ValidationInfo[Sequence[Path]]) -> Path:
-    """Resolves `config/x` against the first of the given folders that has it, or the last one."""
-    if path.parts[0] != "config":
+    """Resolves `config/x` against the first given folder that has x, or the last one."""
+    top, *rest = path.parts
+    if top != "config":
         return path
-    files = [folder.joinpath(*path.parts[1:]) for folder in info.context]
+    files = [folder.joinpath(*rest) for folder in info.context]
     return next((file for file in files if os.path.isfile(file)), files[-1])
 
 
-def _existing_folder(path: Path) -> Path:
+def _require_folder(path: Path) -> Path:
     if not os.path.isdir(path):
         raise ValueError("must be an existing folder")
     return path
 
 
-def _written_as(pattern: str, what: str) -> AfterValidator:
-    """Returns the check that a whole text matches a pattern; `what` says what it must be."""
+def _matching(pattern: str, rule: str) -> AfterValidator:
+    """Returns the check that a whole text matches a pattern: else it "must RULE"."""
 
-    def checked(text: str) -> str:
+    def check(text: str) -> str:
         if not re.fullmatch(pattern, text, re.DOTALL):
-            raise ValueError(f"must {what}")
+            raise ValueError(f"must {rule}")
         return text
 
-    return AfterValidator(checked)
+    return AfterValidator(check)
 
 
 def is_robot_name(name: str) -> bool:
-    """Returns whether a robot of a fleet may have a name: it could be no path."""
+    """Returns whether a name is one for a robot of a fleet: no name can be a path."""
     return bool(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name)) and ".." not in name
 
 
-def _robot_name(name: str) -> str:
+def _require_robot_name(name: str) -> str:
     if not is_robot_name(name):
         raise ValueError(
             f"must name each robot by up to 64 letters, digits, '-', '_' and '.', not {name[:80]!r}"
@@ -119,22 +120,22 @@ def _robot_name(name: str) -> str:
 
 
 def _may_be_folder(path: str) -> bool:
-    """Returns whether it is a folder, or the disk does not tell: a robot may be out of reach."""
+    """Returns False if a path is no folder; True also if the disk fails: a robot may be away."""
     try:
         return Path(path).is_dir()
     except OSError:
         return True
 
 
-def _robots_found(value: object) -> object:
-    """Returns the robots of a pattern such as `/data/*/bags`, by what its `*` stands for."""
+def _expand_robots(value: object) -> object:
+    """Replaces a pattern such as `/data/*/bags` by the folders it matches; `*` is the name."""
     if value is None:
         raise ValueError("must name robots: {r1: /data/r1/bags, ...}, or a pattern: /data/*/bags")
     if not isinstance(value, str):
         return value
     pattern = str(expand_home(value))
     before, star, after = pattern.partition("*")
-    if not star or any(mark in after for mark in "*?[") or any(mark in before for mark in "?["):
+    if not star or re.search(r"[*?[]", after) or re.search(r"[?[]", before):
         raise ValueError("must have one *, which stands for the robot's name, as /data/*/bags has")
     folders = [*filter(_may_be_folder, sorted(glob.glob(pattern)))]  # noqa: PTH207
     if not folders:
@@ -142,56 +143,58 @@ def _robots_found(value: object) -> object:
     return {folder[len(before) : len(folder) - len(after)]: folder for folder in folders}
 
 
-def _without_streamable(transport: object) -> object:
-    """Returns `http` for what the specification, and the SDK of MCP, call it."""
+def _transport_name(transport: object) -> object:
+    """Returns `http` for the names that the specification and MCP's SDK have for it."""
     return "http" if transport in ("streamable_http", "streamable-http") else transport
 
 
-def _without_password(uri: str) -> str:
+def _require_no_password(uri: str) -> str:
     if "@" in uri.partition("://")[2].partition("/")[0]:
         raise OpenSecretError("must name no user or password, which belong into lake.secrets_file")
     return uri
 
 
-def _without_secrets(properties: dict[str, str]) -> dict[str, str]:
+def _require_no_secrets(properties: dict[str, str]) -> dict[str, str]:
     for name, value in properties.items():
         if any(word in name.lower() for word in _SECRET_WORDS):
             raise OpenSecretError(f"must not contain {name}: put it into lake.secrets_file")
-        _without_password(value)
+        _require_no_password(value)
     return properties
 
 
-def _one_star(pattern: str) -> str:
+def _require_one_star(pattern: str) -> str:
     if pattern.count("*") != 1:
         raise ValueError("must have one *, which stands for the robot's name")
     return str(expand_home(pattern))
 
 
-def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Checks that no spelling leads to two names; case, spacing and plurals do not count."""
-    known: dict[str, tuple[str, str]] = {}
-    for name, spellings in labels.items():
-        for spelling in (name, *spellings):
+def _require_distinct_spellings(
+    labels: dict[str, tuple[str, ...]],
+) -> dict[str, tuple[str, ...]]:
+    """Checks that no spelling is under two labels; case, spacing and plurals do not count."""
+    known: dict[str, tuple[str, str]] = {}  # spelling and label, by the singular
+    for label, spellings in labels.items():
+        for spelling in (label, *spellings):
             key = singular(spelling)
             if not key:
-                raise ValueError(f"must not contain an empty spelling, as under {name!r}")
-            first, other = known.setdefault(key, (spelling, name))
-            if other != name:
-                also = "" if first == spelling else f" (as {first!r})"
+                raise ValueError(f"must not contain an empty spelling, as under {label!r}")
+            known_spelling, known_label = known.setdefault(key, (spelling, label))
+            if known_label != label:
+                also = "" if known_spelling == spelling else f" (as {known_spelling!r})"
                 raise ValueError(
-                    f"must list each spelling under one label: {spelling!r} is under {other!r}"
-                    f"{also} and {name!r}; case, spacing and plurals do not count"
+                    f"must list each spelling under one label: {spelling!r} is under "
+                    f"{known_label!r}{also} and {label!r}; case, spacing and plurals do not count"
                 )
     return labels
 
 
-def _engine_chosen(engine: object) -> object:
+def _require_chosen_engine(engine: object) -> object:
     if isinstance(engine, dict) and "_target_" not in engine:
         raise ValueError("must go with lake=duckdb: choose that, too, or leave this out")
     return engine
 
 
-def _listed(value: object) -> object:
+def _as_list(value: object) -> object:
     """Takes one path for a list of one."""
     return [value] if isinstance(value, str) and value else value
 
@@ -205,31 +208,31 @@ Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
 Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, le=_MOST, allow_inf_nan=False)]
 Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=_MOST, allow_inf_nan=False)]
 Span: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=3600)]
-AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
-Folder: TypeAlias = Annotated[AnyPath, AfterValidator(_existing_folder)]
+AnyPath: TypeAlias = Annotated[Path, AfterValidator(_expand_home)]
+Folder: TypeAlias = Annotated[AnyPath, AfterValidator(_require_folder)]
 ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
 MessageType: TypeAlias = Annotated[
-    Text, _written_as(r"\w+/msg/\w+", "be a message type such as nav_msgs/msg/Odometry")
+    Text, _matching(r"\w+/msg/\w+", "be a message type such as nav_msgs/msg/Odometry")
 ]
 BelowBagDir: TypeAlias = Annotated[
     Text,
-    _written_as(
+    _matching(
         r"(?!/|(.*/)?\.\.(/|$)).*[^/. ].*",
         "be a path below recording.bag_dir, such as rec_20261120T043000Z",
     ),
 ]
 TopicGlob: TypeAlias = Annotated[
-    Text, _written_as("[/*].*", "be a topic's name or a glob of such: it begins with / or *")
+    Text, _matching("[/*].*", "be a topic's name or a glob of such: it begins with / or *")
 ]
 DotPath: TypeAlias = Annotated[
-    Text, _written_as(r"\w+(\.\w+)*", "be a dot-path such as pose.pose.position")
+    Text, _matching(r"\w+(\.\w+)*", "be a dot-path such as pose.pose.position")
 ]
-RobotName: TypeAlias = Annotated[Text, AfterValidator(_robot_name)]
+RobotName: TypeAlias = Annotated[Text, AfterValidator(_require_robot_name)]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))
 def section(model: type[_T]) -> type[_T]:
-    """Makes a class plain frozen data, whose values are checked; unknown keys are refused."""
+    """Makes a class a frozen dataclass with checked values; unknown keys are refused."""
     checked = dataclass(
         frozen=True, slots=True, kw_only=True, config=ConfigDict(extra="forbid", defer_build=True)
     )
@@ -238,27 +241,29 @@ def section(model: type[_T]) -> type[_T]:
 
 @section
 class RequiredTopic:
-    """A name or a glob of topics without which recording counts as failed, and the least rate."""
+    """A name or a glob of topics that must be recorded, and their least rate."""
 
     topic: Text
     min_hz: Tolerance = 0.0
 
 
-def _topic_alone(value: object) -> object:
+def _as_required_topic(value: object) -> object:
     """Takes a name for an entry without a rate."""
     return {"topic": value} if isinstance(value, str) else value
 
 
-RequiredTopics: TypeAlias = tuple[Annotated[RequiredTopic, BeforeValidator(_topic_alone)], ...]
+RequiredTopics: TypeAlias = tuple[
+    Annotated[RequiredTopic, BeforeValidator(_as_required_topic)], ...
+]
 
 
 @section
 class RecordingSettings:
     """What is recorded, and where to.
 
-    `split_duration_s` is an integer because `ros2 bag record` takes whole seconds. `keep_when` is
-    the file of rules that keep what was recorded around an event, `exclude_when` that of rules by
-    which nothing recorded stays.
+    `split_duration_s` is an integer because `ros2 bag record` takes whole seconds. The file
+    `keep_when` has rules that keep recordings around events; the file `exclude_when` has rules
+    that remove recordings.
     """
 
     bag_dir: AnyPath
@@ -275,7 +280,7 @@ class RecordingSettings:
 
 @section
 class LatchedTopics:
-    """Names or globs of topics that count as latched whatever QoS is offered, or never do."""
+    """Names or globs of topics that count as latched, or do not, whatever QoS is offered."""
 
     include: tuple[TopicGlob, ...]
     exclude: tuple[TopicGlob, ...]
@@ -325,10 +330,10 @@ class ReaderSettings:
 
 @section
 class StoreSettings:
-    """How much of the bags is also stored as columns, which changes how long answers take alone.
+    """How much of the bags is also stored as columns, which changes only the time of answers.
 
-    `max_share` is of the bags' bytes. `max_gb` is for a store in a cache folder; beside the bags
-    retention bounds it.
+    `max_share` is a part of the bags' bytes. `max_gb` bounds a store in a cache folder; retention
+    bounds one beside the bags.
     """
 
     enabled: Flag
@@ -349,10 +354,9 @@ class RetentionSettings:
     """How much history is kept.
 
     `max_moments_gb` is the part of the total that saved moments may take, at most half of it.
-    `foreign`: whether bags of other programs are left alone, or counted and deleted as its own.
-    `require_shipped`: whether age deletes no bag before `ros2-memory ship` has confirmed it.
-    `topics` has, by a name or glob of topics, how old their messages may become; then they are cut
-    out of bags that stay.
+    `foreign`: whether bags of other programs stay, or count and are deleted like the recorder's.
+    `require_shipped`: whether age deletes only bags that `ros2-memory ship` has confirmed. `topics`
+    limits the age of messages, by name or glob of their topic: older ones are cut out of bags.
     """
 
     max_total_gb: Positive
@@ -366,10 +370,11 @@ class RetentionSettings:
 
 @section
 class MemorySettings:
-    """What stays of bags that retention deletes: nothing, unless `keep` is true.
+    """What stays after retention has deleted bags: nothing, unless `keep` is true.
 
-    `texts` are names or globs of topics of which texts stay, too; `labels` are the labels of people
-    that stay, `people` are more words for people. `max_share` is of `retention.max_total_gb`.
+    `texts` are names or globs of topics whose texts stay, too; `labels` are the labels of people
+    that stay; `people` are more words for people. `max_share` is a part of
+    `retention.max_total_gb`.
     """
 
     keep: Flag
@@ -384,13 +389,13 @@ class MemorySettings:
 class ServerSettings:
     """How the query server is reached, and what it offers. Port 0 is any free port.
 
-    `tools`: all, or those of the specification; `write_tools`: also those that write. `metrics` and
-    `traces` need the extra `observability`. `keep_questions`: how many of the latest calls are kept
-    in memory, with their replies, for the page; 0 for none. `page`: whether that is served.
+    `tools`: all tools, or those of the specification; `write_tools`: also tools that write.
+    `metrics` and `traces` need the extra `observability`. `page`: whether the page is served;
+    `keep_questions`: how many of the latest calls, with their replies, are kept for it in memory.
     """
 
     name: Text
-    transport: Annotated[Literal["stdio", "sse", "http"], BeforeValidator(_without_streamable)]
+    transport: Annotated[Literal["stdio", "sse", "http"], BeforeValidator(_transport_name)]
     host: Text
     port: Port
     call_timeout_s: Positive
@@ -407,13 +412,13 @@ class ServerSettings:
 class FleetSettings:
     """The robots that one server answers for; none where it answers for `recording.bag_dir`.
 
-    `robots` has the bag directory of each by its name; it may be given as a pattern. `places` is
-    the pattern of the robots' own files of named places. `shared_map`: whether coordinates mean the
-    same place for all. `tokens` has, by the file of a token, the robots that it may ask about.
+    `robots` has the bag directories by name; a pattern stands for them, too. `places` is the
+    pattern of the robots' own files of named places. `shared_map`: whether coordinates mean the
+    same place for all robots. `tokens` has, by the file of a token, the robots that it is for.
     """
 
-    robots: Annotated[dict[RobotName, AnyPath], BeforeValidator(_robots_found)]
-    places: Annotated[Text, AfterValidator(_one_star)] | None
+    robots: Annotated[dict[RobotName, AnyPath], BeforeValidator(_expand_robots)]
+    places: Annotated[Text, AfterValidator(_require_one_star)] | None
     shared_map: Flag
     tokens: dict[AnyPath, tuple[RobotName, ...]]
 
@@ -437,10 +442,10 @@ class LoggingSettings:
 
 @section
 class AdapterNode:
-    """An adapter's class, and the values for its constructor that only this adapter takes.
+    """An adapter's class, and the arguments of its constructor that only this adapter has.
 
-    Each adapter that may be built has a subclass. They are the allow-list, since Hydra would build
-    whatever a `_target_` names.
+    Each adapter has a subclass. The subclasses are the allow-list: Hydra would build whatever a
+    `_target_` names.
     """
 
     target: Text = Field(alias="_target_")
@@ -471,7 +476,7 @@ class Ros2BagNode(AdapterNode):
     """`recorder=ros2bag`: a supervised `ros2 bag record`."""
 
     target: Literal["ros2_memory.recorder.ros2bag.Ros2BagRecorder"] = Field(alias="_target_")
-    setup_files: Annotated[tuple[AnyPath, ...], BeforeValidator(_listed)]
+    setup_files: Annotated[tuple[AnyPath, ...], BeforeValidator(_as_list)]
     repeat_latched: tuple[Text, ...]
     chunk_bytes: Annotated[int, Field(strict=True, ge=1024, le=_MOST)]
 
@@ -496,16 +501,16 @@ class DuckdbNode(AdapterNode):
 class LakeSettings:
     """Where `ros2-memory ship` writes the bags of the fleet's robots; needs the extra `lake`.
 
-    `engine` is what a fleet's server asks it with; None for a server that asks no lake.
-    Secrets are in a file of their own, or where the store's own client looks for them (AWS_*).
+    `engine` answers a fleet's server; None for a server that asks no lake. Secrets are in a file of
+    their own, or where the store's own client looks for them (AWS_*).
     """
 
-    engine: Annotated[DuckdbNode | None, BeforeValidator(_engine_chosen)]
-    warehouse: Annotated[Text, AfterValidator(_without_password)] | None
+    engine: Annotated[DuckdbNode | None, BeforeValidator(_require_chosen_engine)]
+    warehouse: Annotated[Text, AfterValidator(_require_no_password)] | None
     catalog: Literal["sql", "rest"]
-    uri: Annotated[Text, AfterValidator(_without_password)] | None
+    uri: Annotated[Text, AfterValidator(_require_no_password)] | None
     state_dir: AnyPath | None
-    properties: Annotated[dict[Text, Text], AfterValidator(_without_secrets)]
+    properties: Annotated[dict[Text, Text], AfterValidator(_require_no_secrets)]
     secrets_file: AnyPath | None
     messages: tuple[Text, ...]
     commit_interval_s: Tolerance
@@ -528,7 +533,7 @@ class MessageSchemas:
 class LabelsFile:
     """Other spellings of labels: for each name that is to be shown, what detectors write for it."""
 
-    labels: Annotated[dict[Text, tuple[Text, ...]], AfterValidator(_each_spelling_once)]
+    labels: Annotated[dict[Text, tuple[Text, ...]], AfterValidator(_require_distinct_spellings)]
 
 
 @section
@@ -546,14 +551,13 @@ class PlaceShape:
 
     def __post_init__(self) -> None:
         """Refuses what is not exactly one of the three shapes."""
-        x, y = self.x, self.y
-        circle = isinstance(x, float) and isinstance(y, float) and self.radius_m is not None
-        box = isinstance(x, tuple) and isinstance(y, tuple) and x[0] < x[1] and y[0] < y[1]
-        alone = x is None and y is None
+        x, y, radius_m = self.x, self.y, self.radius_m
         if self.polygon is not None:
-            is_shape = alone and self.radius_m is None and not _lie_in_a_line(self.polygon)
+            is_shape = (x, y, radius_m) == (None, None, None) and not _lie_in_a_line(self.polygon)
+        elif isinstance(x, tuple) and isinstance(y, tuple):
+            is_shape = radius_m is None and x[0] < x[1] and y[0] < y[1]
         else:
-            is_shape = circle or (box and self.radius_m is None)
+            is_shape = isinstance(x, float) and isinstance(y, float) and radius_m is not None
         if not is_shape:
             raise ValueError(
                 "must be a circle (x, y, radius_m), a rectangle (x: [from, to], y: [from, to]) "
@@ -562,7 +566,10 @@ class PlaceShape:
 
 
 def _lie_in_a_line(corners: Sequence[tuple[float, float]]) -> bool:
-    (x, y), *others = corners or [(0.0, 0.0)]
+    """Returns whether all corners lie in a line, as none, one or two do."""
+    if not corners:
+        return True
+    (x, y), *others = corners
     return all(
         (bx - x) * (cy - y) == (by - y) * (cx - x) for (bx, by), (cx, cy) in combinations(others, 2)
     )
@@ -577,7 +584,7 @@ class PlacesFile:
 
 @section
 class KeepRule:
-    """When what was recorded is kept as a moment, and how much of it.
+    """When recordings are kept as a moment, and how much of them.
 
     `topic`, `condition_type`, `value`, `field` and `min_score` as in `find_matches`; `for_s` is how
     long the condition, or a silence, must hold. A moment has `before_s` before the match began and
@@ -598,15 +605,15 @@ class KeepRule:
     max_per_hour: Count = 6
 
     def __post_init__(self) -> None:
-        """Refuses a rule that lacks what its kind needs, or has what it does not know."""
-        tests = self.condition_type is not None and self.value is not None
-        has_test = tests or self.field is not None or self.min_score is not None
+        """Refuses a rule that lacks a key that its kind needs, or has one that it does not know."""
+        has_condition = self.condition_type is not None and self.value is not None
         if self.kind == "message":
-            if self.topic is None or not tests:
+            if self.topic is None or not has_condition:
                 raise ValueError("must have topic, condition_type and value, as find_matches has")
-        elif has_test:
+            return
+        if has_condition or self.field is not None or self.min_score is not None:
             raise ValueError(f"must not have a condition: its kind is {self.kind}")
-        elif self.kind == "silent":
+        if self.kind == "silent":
             if self.topic is None or not self.for_s:
                 raise ValueError("must have topic and for_s: its kind is silent")
         elif self.topic is not None or self.for_s:
@@ -622,14 +629,14 @@ class TriggersFile:
 
 @section
 class ExcludeRule:
-    """When nothing recorded stays, nor what was within `margin_s` of it.
+    """When recordings are removed, and `margin_s` before and after.
 
     `topic`, `condition_type`, `value`, `field` and `min_score` as in `find_matches`, of one topic.
-    A message of it holds until the next one, for `stale_s` at most where the topic is not latched.
-    `on_unknown`: what becomes of a time in which it is not known whether the condition holds.
+    A message counts until the next one; but only for `stale_s`, unless the topic is latched.
+    `on_unknown`: what becomes of times at which it is unknown whether the condition holds.
     """
 
-    topic: Annotated[Text, _written_as(r"[^*?\[]*", "name one topic; make a rule for each")]
+    topic: Annotated[Text, _matching(r"[^*?\[]*", "name one topic; make a rule for each")]
     condition_type: Text
     value: bool | int | float | str | dict[str, float]
     field: Text | None = None
@@ -676,12 +683,13 @@ def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None =
 
     Args:
         overrides: assignments in Hydra's grammar (`server.port=9300`, `recorder=none`).
-        env: the environment; the process's own where None.
+        env: the environment; that of this process by default.
 
     Raises:
         ConfigError: a file, a variable or an override is refused.
     """
-    return load_explained(overrides, env)[0]
+    settings, _ = load_explained(overrides, env)
+    return settings
 
 
 def load_explained(
@@ -694,12 +702,10 @@ def load_explained(
     """
     given = given_variables(os.environ if env is None else env)
     folder = config_dir(given)
-    appended = {"reader.custom_msg_paths": INTERFACES_VARIABLE}
-    sources = Sources(
-        folder,
-        parse_overrides(overrides, given, folder),
-        appended if INTERFACES_VARIABLE in given else {},
-    )
+    appended = {}
+    if INTERFACES_VARIABLE in given:
+        appended["reader.custom_msg_paths"] = INTERFACES_VARIABLE
+    sources = Sources(folder, parse_overrides(overrides, given, folder), appended)
     with foreign_errors_as_config_error(str(folder), sources):
         with initialize_config_dir(version_base="1.3", config_dir=str(folder)):
             composed = compose(
@@ -707,16 +713,14 @@ def load_explained(
             )
         _append_interface_folder(composed, given)
         data = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
-    # What users keep beside them wins over what is shipped, unless they chose a folder.
+    # The user's own files win over the shipped ones, unless the user chose a folder.
     folders = [folder] if "MEMORY_CONFIG_DIR" in given else [Path("config").absolute(), folder]
     settings = validated(Settings, data, config_dirs=folders, source=sources, adapters=_NODES)
     return settings, sources
 
 
 def is_deployment_chosen(overrides: Sequence[str]) -> bool:
-    """Returns whether someone chose a configuration directory, or an option of a group.
-
-    It composes nothing.
+    """Returns whether a configuration directory, or an option of a group, was chosen.
 
     Raises:
         ConfigError: a variable or an override is refused.
@@ -733,12 +737,12 @@ def plain_values(settings: Settings) -> JsonObject:
 
 
 def config_dir(env: Mapping[str, str]) -> Path:
-    """Returns the absolute path of the folder that holds `config.yaml` and its groups.
+    """Returns the absolute path of the folder with `config.yaml` and its groups.
 
     It is `MEMORY_CONFIG_DIR`, else the copy in an installed package, else the checkout's `config/`.
 
     Raises:
-        ConfigError: there is no `config.yaml` in it.
+        ConfigError: the folder has no `config.yaml`.
     """
     package = Path(__file__).resolve().parent
     chosen = env.get("MEMORY_CONFIG_DIR")
@@ -757,9 +761,9 @@ def config_dir(env: Mapping[str, str]) -> Path:
 
 
 def files_in_use(settings: Settings) -> list[str]:
-    """Returns the paths of the configuration's files, with those that its keys name."""
+    """Returns the paths of `config.yaml` and of the files that its keys name."""
     recording, data = settings.recording, settings.data
-    named = (
+    files = (
         config_dir(os.environ) / "config.yaml",
         recording.topics_file,
         recording.keep_when,
@@ -768,14 +772,13 @@ def files_in_use(settings: Settings) -> list[str]:
         data.places_file,
         settings.reader.schemas_file,
     )
-    return [str(path.absolute()) for path in named if path is not None]
+    return [str(path.absolute()) for path in files if path is not None]
 
 
 def unused_config() -> str | None:
-    """Returns that a `config/config.yaml` of the working directory is not used, if it is there.
+    """Returns a sentence on a `config/config.yaml` of the working directory that is not used.
 
-    It may be another program's, and what it names is run (`recorder.setup_files`): one has to
-    choose it.
+    It may be another program's, and its `recorder.setup_files` are run: so it has to be chosen.
     """
     used, beside = config_dir(os.environ) / "config.yaml", Path("config/config.yaml").absolute()
     if os.environ.get("MEMORY_CONFIG_DIR") or not beside.is_file():
@@ -796,7 +799,7 @@ def load_message_schemas(settings: Settings) -> Mapping[str, Mapping[str, str]]:
 
 
 def load_labels(settings: Settings) -> Mapping[str, Sequence[str]]:
-    """Returns the spellings of `data.labels_file` by the name to show; none where it is null.
+    """Returns the spellings of `data.labels_file` by the name to show; empty if the key is null.
 
     Raises:
         ConfigError: the file is missing, is not YAML, or its content is refused.
@@ -844,7 +847,7 @@ def load_exclusions(settings: Settings) -> Mapping[str, ExcludeRule]:
 
 
 def _load_file(model: type[_T], key: str, path: Path) -> _T:
-    """Returns the content of a YAML file that a key names, as an instance of a model."""
+    """Returns the content of a YAML file, which a key of the configuration names, as a model."""
 
     def source(fault: str) -> str:
         line = line_of(path, fault)
@@ -857,7 +860,7 @@ def _load_file(model: type[_T], key: str, path: Path) -> _T:
 
 @contextmanager
 def exit_on_config_error(program: str) -> Iterator[None]:
-    """Ends the program with exit code 2 and an explanation on stderr on a `ConfigError`."""
+    """Turns a `ConfigError` of the block into exit code 2, with an explanation on stderr."""
     try:
         yield
     except ConfigError as error:
@@ -868,7 +871,8 @@ def exit_on_config_error(program: str) -> Iterator[None]:
 def _append_interface_folder(composed: DictConfig, given: Mapping[str, str]) -> None:
     """Appends `ROS_VISION_INTERFACES_PATH` to the folders of message definitions.
 
-    Where the key does not hold a list, validation refuses it afterwards.
+    Raises:
+        ConfigError: it is not an existing folder.
     """
     folder = given.get(INTERFACES_VARIABLE)
     if not folder:
@@ -879,5 +883,5 @@ def _append_interface_folder(composed: DictConfig, given: Mapping[str, str]) -> 
             "of message packages (or one package, with msg/*.msg)"
         )
     paths = OmegaConf.select(composed, "reader.custom_msg_paths")
-    if isinstance(paths, ListConfig):
+    if isinstance(paths, ListConfig):  # anything else is refused by the validation
         paths.append(folder)

@@ -206,10 +206,7 @@ def battery(t: float) -> float:
     """Returns the charge (0 to 1), which falls evenly while driving, and rises on the dock."""
     phase = t % LAP_S
     driving_s = LAP_S - _CHARGING_S
-    if phase < driving_s:
-        spent = phase / driving_s
-    else:
-        spent = (LAP_S - phase) / _CHARGING_S
+    spent = phase / driving_s if phase < driving_s else (LAP_S - phase) / _CHARGING_S
     return 0.90 - 0.08 * spent
 
 
