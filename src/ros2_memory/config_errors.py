@@ -50,7 +50,7 @@ _WITHOUT_KEYS: Final = {
     "records: unset MEMORY_DEPLOYMENT if it is replay or query_only",
     "storage": "storage=mcap has no such setting; leave it out, or choose storage=rosbag2",
 }
-"""By section, why a key is refused where the chosen adapter has none."""
+"""Why a key is refused if the chosen adapter has no keys, by section."""
 
 
 class OpenSecretError(ValueError):
@@ -78,52 +78,59 @@ def validated(
         ConfigError: one line for each fault.
     """
     nodes = adapters or {}
+    lines: list[str] = []
     try:
         return TypeAdapter(model).validate_python(data, context=config_dirs)
     except ValidationError as error:
-        faults = [(_dot_path(fault, nodes), fault) for fault in error.errors(include_url=False)]
-    lines = [f"{_sentence(model, key, fault, nodes)} (set {source(key)})" for key, fault in faults]
+        for fault in error.errors(include_url=False):
+            key = _dot_path(fault, nodes)
+            lines.append(f"{_sentence(model, key, fault, nodes)} (set {source(key)})")
     raise ConfigError("\n".join(lines))
 
 
 @contextmanager
 def foreign_errors_as_config_error(where: str, source: Callable[[str], str]) -> Iterator[None]:
-    """Translates what Hydra, OmegaConf, YAML and the file system raise into `ConfigError`.
+    """Translates errors of Hydra, OmegaConf, YAML and the file system into `ConfigError`.
 
-    `where` names what was read, for an error that names no key.
+    Args:
+        where: names what is read, for an error that names no key.
+        source: as for `validated`.
     """
     try:
         yield
     except _FOREIGN as error:
         key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
-        reason = reason_of(error)
+        reason = _reason_of(error)
         sentence = f"{key}: {reason} (set {source(key)})" if key else f"{where}: {reason}"
         raise ConfigError(sentence) from error
 
 
 def line_of(path: Path, key: str) -> int | None:
-    """Returns the line (from 1) of a dot-path's key in a YAML file, or of the nearest one above it.
+    """Returns the line (from 1) of a dot-path's key in a YAML file, or of the nearest key above it.
 
-    None where the file has none of its keys, or cannot be read.
+    None if the file has none of these keys, or cannot be read.
     """
-    line, rest = None, key
+    line, rest = None, f"{key}."
     with suppress(OSError, ValueError, YAMLError, RecursionError):
         node = yaml.compose(path.read_text(encoding="utf-8"), yaml.SafeLoader)
         while isinstance(node, yaml.MappingNode):
-            leading = [entry for entry in node.value if f"{rest}.".startswith(f"{entry[0].value}.")]
-            if not leading:
+            # The name of a key may have dots itself.
+            leading = (entry for entry in node.value if rest.startswith(f"{entry[0].value}."))
+            entry = next(leading, None)
+            if entry is None:
                 break
-            name, node = leading[0]
-            line, rest = name.start_mark.line + 1, rest[len(name.value) + 1 :]
+            name, node = entry
+            line, rest = name.start_mark.line + 1, rest.removeprefix(f"{name.value}.")
     return line
 
 
-def reason_of(error: Exception) -> str:
-    """Returns an error's reason alone, without search paths, links to manuals and dumps."""
+def _reason_of(error: Exception) -> str:
+    """Returns an error's reason without search paths, links to manuals and dumps."""
     text = (error.strerror if isinstance(error, OSError) else None) or str(error)
     if text in {"", "None"} and error.__cause__ is not None:
         text = str(error.__cause__)
-    return " ".join(re.split(r"\n *(?:full_key:|Config search path:|See https:)", text)[0].split())
+    first, *_ = re.split(r"\n *(?:full_key:|Config search path:|See https:)", text)
+    return " ".join(first.split())
 
 
 def _dot_path(fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
@@ -133,45 +140,47 @@ def _dot_path(fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
 
 
 def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
-    """Returns what is wrong, and what is allowed instead."""
+    """Returns what is wrong with a key, and what is allowed instead."""
     kind, context = fault["type"], fault.get("ctx", {})
     if kind == "unexpected_keyword_argument":
         keys = _known_keys(model, fault, nodes)
+        section = key.partition(".")[0]
+        is_without_keys = keys == ["_target_"]
         known = f"unknown key; use one of: {', '.join(keys)}"
-        has_none = keys == ["_target_"]
-        return f"{key}: {_WITHOUT_KEYS[key.partition('.')[0]] if has_none else known}"
+        return f"{key}: {_WITHOUT_KEYS[section] if is_without_keys else known}"
     if kind in {"missing", "union_tag_not_found"}:
         return f"{key}: missing; give it a value"
     if kind in {"dataclass_type", "model_attributes_type", "dict_type"}:
-        return f"{key or 'the file'}: {_shown(fault['input'])} is not allowed; must hold keys"
+        return f"{key or 'the file'}: {_cut_repr(fault['input'])} is not allowed; must hold keys"
     choices = context.get("expected") or context.get("expected_tags")
     if choices:
         refused = context.get("tag", fault["input"])
         allowed = ", ".join(re.findall(r"'([^']*)'", choices))
-        return f"{key}: {_shown(refused)} is not allowed; use one of: {allowed}"
-    rule = _RULES.get(kind) or re.sub(r"^(Input|String|Value) should ", "must ", fault["msg"])
-    rule = rule.removeprefix("Value error, ")
+        return f"{key}: {_cut_repr(refused)} is not allowed; use one of: {allowed}"
     if kind == "float_type" and key.endswith("_gb"):
         rule = "must be a number in GB, such as 2"
+    else:
+        rule = _RULES.get(kind) or re.sub(r"^(Input|String|Value) should ", "must ", fault["msg"])
+        rule = rule.removeprefix("Value error, ")
     if isinstance(context.get("error"), OpenSecretError):
         return f"{key}: its value is not allowed, and not shown; {rule}"
-    return f"{key}: {_shown(fault['input'])} is not allowed; {rule}"
+    return f"{key}: {_cut_repr(fault['input'])} is not allowed; {rule}"
 
 
 def _known_keys(model: type, fault: ErrorDetails, nodes: Mapping[str, type]) -> list[str]:
-    """Returns the keys that exist in the section of a fault's unknown key."""
+    """Returns the keys that the section of an unknown key knows."""
     *sections, _unknown = fault["loc"]
     for section in sections:
-        if get_origin(model) is dict:  # the section is any of its keys
+        if get_origin(model) is dict:  # any key: the section is one of them
             model = get_args(model)[1]
         else:
             model = nodes.get(str(section)) or get_type_hints(model)[str(section)]
             if type(None) in get_args(model):
                 model = get_args(model)[0]
-    names = (field.name for field in fields(model) if is_dataclass(model))
+    names = [field.name for field in fields(model)] if is_dataclass(model) else []
     return ["_target_" if name == "target" else name for name in names]
 
 
-def _shown(value: object) -> str:
+def _cut_repr(value: object) -> str:
     text = repr(value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

@@ -1,6 +1,6 @@
 """Where the values of the configuration come from: variables, overrides, and files.
 
-Variables and overrides become assignments in Hydra's grammar. `Sources` finds out which of them, or
+Variables and overrides become assignments in Hydra's grammar. `Sources` tells which assignment, or
 which file of the configuration directory, set a key.
 """
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from hydra._internal.defaults_list import DefaultsList  # Hydra has no public name for it
 
 GROUPS: Final = ("deployment", "storage", "recorder", "lake")
-"""The config groups: folders of files of which one each is chosen."""
+"""The config groups: folders with options, of which one is chosen."""
 INTERFACES_VARIABLE: Final = "ROS_VISION_INTERFACES_PATH"
 
 _LAST_ROS_DOMAIN: Final = 232  # the highest whose DDS ports are below 65536
@@ -54,11 +54,12 @@ class Override:
 
 @dataclass(frozen=True)
 class Sources:
-    """Returns, called with a key such as `server.port`, who set it: a phrase that follows "set".
+    """Tells who set a key, such as `server.port`, as a phrase that follows "set".
 
-    Args:
+    Attributes:
+        folder: the configuration directory.
         overrides: the assignments of variables and overrides; later wins.
-        appended: by key, the variable that appends to what is set otherwise.
+        appended: the variables that append to the value of a key, by key.
     """
 
     folder: Path
@@ -73,7 +74,7 @@ class Sources:
             if override.key not in GROUPS and is_related:
                 return override.source
         variable = self.appended.get(key)
-        return f"{self._file(key)}{f', and by {variable}' if variable else ''}"
+        return f"{self._file_of(key)}{f', and by {variable}' if variable else ''}"
 
     def choice(self, group: str) -> tuple[str | None, str]:
         """Returns the option of a group, and who chose it."""
@@ -86,7 +87,7 @@ class Sources:
         file = chosen.containing_config_path if chosen else "config"
         return option, f"in {self.folder / f'{file}.yaml'}"
 
-    def _file(self, key: str) -> str:
+    def _file_of(self, key: str) -> str:
         for default in reversed(self._composed.defaults if self._composed else ()):
             path = self.folder / f"{default.config_path}.yaml"
             if _sets(path, default.package or "", key):
@@ -95,7 +96,7 @@ class Sources:
 
     @cached_property
     def _composed(self) -> DefaultsList | None:
-        """Returns the files that Hydra composes, later wins; None where it cannot."""
+        """The files that Hydra composes, later wins; None if it cannot compose them."""
         folder = initialize_config_dir(version_base="1.3", config_dir=str(self.folder))
         texts = [override.text for override in self.overrides]
         with suppress(HydraException, YAMLError, ValueError, RecursionError), folder:
@@ -106,12 +107,12 @@ class Sources:
 
 
 def quoted(value: str) -> str:
-    """Returns a text as a value in Hydra's grammar, whatever characters it has."""
+    """Returns a text as a value in Hydra's grammar, with any characters."""
     return str(QuotedString(text=value, quote=Quote.single).with_quotes())
 
 
-def _whole(value: str) -> str:
-    """Returns an int as Hydra reads it. Other text is quoted, and validation refuses it."""
+def _whole_number(value: str) -> str:
+    """Returns a whole number in Hydra's grammar; quotes other text, which validation refuses."""
     try:
         return str(int(value))
     except ValueError:
@@ -122,7 +123,7 @@ _VARIABLES: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "MEMORY_BAG_DIR": ("recording.bag_dir", quoted),
     "MCP_TRANSPORT": ("server.transport", quoted),
     "MCP_HOST": ("server.host", quoted),
-    "MCP_PORT": ("server.port", _whole),
+    "MCP_PORT": ("server.port", _whole_number),
 }
 
 
@@ -150,7 +151,7 @@ def given_variables(env: Mapping[str, str]) -> dict[str, str]:
 
 
 def expand_home(text: str) -> Path:
-    """Returns the path with `~` expanded, where that names a home."""
+    """Returns a path with `~` expanded; unchanged if no such home is known."""
     with suppress(RuntimeError):
         return Path(text).expanduser()
     return Path(text)
@@ -167,48 +168,56 @@ def parse_overrides(
     options = {
         group: sorted(option.stem for option in (folder / group).glob("*.yaml")) for group in GROUPS
     }
-    preset = given.get("MEMORY_DEPLOYMENT")
-    assignments = [(f"deployment={quoted(preset)}", "by MEMORY_DEPLOYMENT")] if preset else []
-    assignments += [
-        (f"{key}={written(given[name])}", f"by {name}")
-        for name, (key, written) in _VARIABLES.items()
-        if name in given
-    ]
-    assignments += [(text, "by MEMORY_CONFIG_OVERRIDES") for text in _split_variable(given)]
-    assignments += [(text, "on the command line") for text in command_line]
-    return [_override_of(text, source, options) for text, source in assignments]
+    texts: list[tuple[str, str]] = []  # each with who gave it
+    if preset := given.get("MEMORY_DEPLOYMENT"):
+        texts.append((f"deployment={quoted(preset)}", "by MEMORY_DEPLOYMENT"))
+    for name, (key, as_value) in _VARIABLES.items():
+        if name in given:
+            texts.append((f"{key}={as_value(given[name])}", f"by {name}"))
+    texts += [(text, "by MEMORY_CONFIG_OVERRIDES") for text in _split_overrides(given)]
+    texts += [(text, "on the command line") for text in command_line]
+    return [_parse_override(text, source, options) for text, source in texts]
 
 
-def _split_variable(given: Mapping[str, str]) -> list[str]:
+def _split_overrides(given: Mapping[str, str]) -> list[str]:
+    """Returns the assignments in MEMORY_CONFIG_OVERRIDES."""
     text = given.get("MEMORY_CONFIG_OVERRIDES", "")
     try:
         return shlex.split(text)
     except ValueError as error:
-        shown = "what it holds" if _may_hold_secret(text) else repr(text)
+        is_secret = _may_hold_secret(text)
+        shown = "what it holds" if is_secret else repr(text)
         raise ConfigError(
             f"MEMORY_CONFIG_OVERRIDES: {shown} is not allowed ({error}); "
             "write assignments as for a shell, separated by spaces"
-        ) from (None if _may_hold_secret(text) else error)
+        ) from (None if is_secret else error)
 
 
 def _names_token(text: str) -> bool:
-    """Returns whether a text sets a token as if it were a setting; it must not be shown then."""
+    """Returns whether a text sets a token as if it were a setting: it must not be shown."""
     # `fleet.tokens` has the names of files.
     return re.search(r"(?<!\bfleet\.)token\w*\s*=", text, re.IGNORECASE) is not None
 
 
 def _may_hold_secret(text: str) -> bool:
-    """Returns whether a text that is no setting has something that must not be shown."""
+    """Returns whether a text that is not a setting may hold a secret: it must not be shown."""
     named = r"(token|secret|password|access.?key)[\w.-]*\W*[=:]"
     return re.search(named, text, re.IGNORECASE) is not None
 
 
-def _override_of(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Override:
+def _parse_override(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Override:
+    """Parses an assignment; `source` says who gave it, `options` has the options of each group.
+
+    Raises:
+        ConfigError: as `parse_overrides`.
+    """
     if _names_token(text):
         raise ConfigError(
             f"a token has no place among the settings (set {source}), where others can read it; "
             "give the one that clients must show as MEMORY_API_TOKEN"
         )
+    is_secret = _may_hold_secret(text)
+    shown = "what may hold a secret" if is_secret else repr(text)
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
@@ -216,31 +225,29 @@ def _override_of(text: str, source: str, options: Mapping[str, Sequence[str]]) -
         spaces = "; if it has a space, it needs quotes as a whole" if is_cut else ""
         is_path = "/" in text and "=" not in text
         folder = f" (a folder of bags: recording.bag_dir={text})" if is_path else ""
-        is_secret = _may_hold_secret(text)
-        shown = "what may hold a secret" if is_secret else repr(text)
         raise ConfigError(
             f"{shown} is not a setting (given {source}); write key=value, such as "
             f"server.port=9300{folder}, and key='value' where special characters are in it{spaces}"
         ) from (None if is_secret else error)
     key = override.key_or_group
-    is_group = key in options
     if not key or override.is_sweep_override():
-        shown = "what may hold a secret" if _may_hold_secret(text) else repr(text)
         raise ConfigError(
             f"{shown} is not one value for one key (set {source}); a list is written key=[a,b]"
         )
-    changes = override.type is OverrideType.CHANGE
-    if is_group and changes and override.value() not in options[key]:
+    is_change = override.type is OverrideType.CHANGE
+    if key not in options:
+        # Added by force, an unknown key reaches the validation, which names the known ones.
+        return Override(key, f"++{text}" if is_change else text, source)
+    if is_change and override.value() not in options[key]:
         raise ConfigError(
             f"{key}: {override.value()!r} is not allowed; use one of: {', '.join(options[key])} "
             f"(set {source})"
         )
-    # Added by force, an unknown key reaches the validation, which names the known ones.
-    return Override(key, f"++{text}" if changes and not is_group else text, source)
+    return Override(key, text, source)
 
 
 def _sets(path: Path, section: str, key: str) -> bool:
-    """Returns whether a file, which holds the keys of a section, sets a key."""
+    """Returns whether a file sets a key; all keys of the file are in `section`, if not empty."""
     try:
         content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, YAMLError, RecursionError):
