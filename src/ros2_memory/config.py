@@ -20,6 +20,7 @@ import sys
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from itertools import combinations
+from operator import attrgetter
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -795,7 +796,7 @@ def load_message_schemas(settings: Settings) -> Mapping[str, Mapping[str, str]]:
     Raises:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
-    return _load_file(MessageSchemas, "reader.schemas_file", settings.reader.schemas_file).schemas
+    return _load_file(MessageSchemas, settings, "reader.schemas_file").schemas
 
 
 def load_labels(settings: Settings) -> Mapping[str, Sequence[str]]:
@@ -804,8 +805,9 @@ def load_labels(settings: Settings) -> Mapping[str, Sequence[str]]:
     Raises:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
-    path = settings.data.labels_file
-    return {} if path is None else _load_file(LabelsFile, "data.labels_file", path).labels
+    if settings.data.labels_file is None:
+        return {}
+    return _load_file(LabelsFile, settings, "data.labels_file").labels
 
 
 def load_places(settings: Settings) -> Mapping[str, PlaceShape]:
@@ -814,7 +816,7 @@ def load_places(settings: Settings) -> Mapping[str, PlaceShape]:
     Raises:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
-    return _load_file(PlacesFile, "data.places_file", settings.data.places_file).places
+    return _load_file(PlacesFile, settings, "data.places_file").places
 
 
 def load_rules(settings: Settings) -> Mapping[str, KeepRule]:
@@ -823,7 +825,7 @@ def load_rules(settings: Settings) -> Mapping[str, KeepRule]:
     Raises:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
-    return _load_file(TriggersFile, "recording.keep_when", settings.recording.keep_when).rules
+    return _load_file(TriggersFile, settings, "recording.keep_when").rules
 
 
 _FAILS_CLOSED: Final = (
@@ -839,15 +841,15 @@ def load_exclusions(settings: Settings) -> Mapping[str, ExcludeRule]:
     Raises:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
-    path = settings.recording.exclude_when
     try:
-        return _load_file(ExclusionsFile, "recording.exclude_when", path).rules
+        return _load_file(ExclusionsFile, settings, "recording.exclude_when").rules
     except ConfigError as error:
         raise ConfigError(f"{error}\n{_FAILS_CLOSED}") from error
 
 
-def _load_file(model: type[_T], key: str, path: Path) -> _T:
-    """Returns the content of a YAML file, which a key of the configuration names, as a model."""
+def _load_file(model: type[_T], settings: Settings, key: str) -> _T:
+    """Returns the content of the YAML file that a key of the settings names, as a model."""
+    path: Path = attrgetter(key)(settings)
 
     def source(fault: str) -> str:
         line = line_of(path, fault)

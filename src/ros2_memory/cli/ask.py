@@ -27,7 +27,7 @@ from ros2_memory.cli.options import (
     present_time,
     with_date,
 )
-from ros2_memory.cli.output import cut_lists, print_line, print_reply, spinner
+from ros2_memory.cli.output import cut_lists, print_json, print_line, print_reply, spinner
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -138,7 +138,7 @@ def _print_tools(tools: Iterable[Tool], *, as_json: bool) -> None:
         arguments = ", ".join(_argument_names(tool))
         rows.append({"tool": tool.name, "purpose": purpose, "arguments": arguments})
     if as_json:
-        print_line(json.dumps(rows))
+        print_json(rows)
     else:
         print_reply(rows)
         print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")

@@ -82,7 +82,9 @@ def export(
     messages = chain(earlier, first, within)
     with spinner("exporting"):
         if mcap is not None:
-            done = _export_to_mcap(mcap, messages, memory.reader)
+            definitions = Definitions(memory.reader)
+            count = write_mcap(mcap, definitions.add_to(messages))
+            done = Exported(str(mcap), count, 1, definitions.describe_undefined())
         elif parquet is not None:
             done = _export_to_parquet(parquet, messages, memory, robot)
     if done.fault:
@@ -197,12 +199,6 @@ class Definitions:
             "reader.custom_msg_paths or among the standard types, and none in the file: other "
             "programs cannot read such messages"
         )
-
-
-def _export_to_mcap(path: Path, messages: Iterable[StoredMessage], reader: BagReader) -> Exported:
-    definitions = Definitions(reader)
-    count = write_mcap(path, definitions.add_to(messages))
-    return Exported(str(path), count, 1, definitions.describe_undefined())
 
 
 def write_mcap(path: Path, messages: Iterator[StoredMessage]) -> int:

@@ -49,13 +49,11 @@ _GROUP_ROWS: Final = 20_000
 """Rows of a row group: some megabytes."""
 _AS_JSON: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
 _DAY_NS: Final = 86_400 * NS_PER_S
-_NO_ORIENTATION: Final = (None,) * 4
-_NO_POSE: Final = (None,) * 7
 _MAX_OPEN_FILES: Final = 16
 """Messages come in time order, so few recordings are written at a time."""
 
-Row = tuple[object, ...]
-"""The values of a message, in the order of the columns."""
+Row = dict[str, object]
+"""The values of a message by column; a column that is missing is null."""
 
 
 class _PartFile:
@@ -78,8 +76,7 @@ class _PartFile:
         self._writer.close()
 
     def _write_group(self) -> None:
-        columns = dict(zip(SCHEMA.names, zip(*self._rows, strict=True), strict=True))
-        self._writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
+        self._writer.write_table(pa.Table.from_pylist(self._rows, schema=SCHEMA))
         self._rows.clear()
 
 
@@ -161,22 +158,26 @@ class Dataset:
 
     def _row(self, record: Record) -> Row:
         channel = record.channel
-        row = (channel.topic, channel.type, record.log_time, record.publish_time)
+        row: Row = {
+            "topic": channel.topic,
+            "type": channel.type,
+            "log_time": record.log_time,
+            "publish_time": record.publish_time,
+        }
         try:
             message = self._reader.decode(record)
         except UndecodableError as error:
             self.undecoded.add(channel.type)
-            return (*row, None, error.reason, None, *_NO_POSE, None)
+            return row | {"undecodable": error.reason}
         shown = self._extractor.shown(message, channel.type)
         # The text for replies is ASCII with escapes; a column of UTF-8 has the letters themselves.
-        text = encodable(_AS_JSON(shown.value) if "\\" in shown.text else shown.text)
-        stamp = self._extractor.stamp(message)
-        pose = self._extractor.pose(message, channel.type)
-        if pose is None:
-            return (*row, text, None, None, *_NO_POSE, stamp)
-        frame = encodable(pose.frame_id) or None
-        orientation = pose.orientation or _NO_ORIENTATION
-        return (*row, text, None, frame, *pose.position, *orientation, stamp)
+        row["value"] = encodable(_AS_JSON(shown.value) if "\\" in shown.text else shown.text)
+        row["header_stamp"] = self._extractor.stamp(message)
+        if pose := self._extractor.pose(message, channel.type):
+            row["frame_id"] = encodable(pose.frame_id) or None
+            row |= zip(("x", "y", "z"), pose.position, strict=True)
+            row |= zip(("qx", "qy", "qz", "qw"), pose.orientation or (), strict=False)
+        return row
 
 
 def _new_file(folder: Path, recording: str, day: int, others: Collection[Path]) -> Path:
