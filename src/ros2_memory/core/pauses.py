@@ -60,8 +60,8 @@ def pauses_among(
 def noteworthy(pauses: Sequence[CountedPause], counts: Sequence[int], length: Ns) -> Pauses:
     """Returns the pauses of a bag that may be more than the time between messages of slow topics.
 
-    While frequent topics are off, the slow ones go on: one pause follows the other, with few
-    messages in between. Of such a chain only pauses that are much longer than its median count.
+    While frequent topics are off, the slow ones go on: their pauses follow each other, as a chain.
+    Of a chain only pauses that are much longer than its median count.
 
     Args:
         pauses: of the bag, in order.
@@ -72,24 +72,31 @@ def noteworthy(pauses: Sequence[CountedPause], counts: Sequence[int], length: Ns
         return ()
     *_, second_most = sorted(counts, reverse=True)[:2]
     slow_period = _PERIODS * length / second_most
-    chains: list[list[CountedPause]] = []
-    chain_end, sent_before = MIN_NS, 0
-    for start, end, sent in pauses:
-        if end - start <= slow_period:
-            continue
-        # Between two chains frequent topics come back, with more messages than slow ones send.
-        expected = max(len(counts), (start - chain_end) / slow_period)
-        if not chains or sent - sent_before > expected:
-            chains.append([])
-        chains[-1].append((start, end, sent))
-        chain_end, sent_before = end, sent
+    slow_pauses = [pause for pause in pauses if _length(pause) > slow_period]
     long: list[CountedPause] = []
-    for chain in chains:
-        lengths = sorted(end - start for start, end, _ in chain)
-        median = lengths[(len(chain) - 1) // 2]
+    for chain in _chains(slow_pauses, len(counts), slow_period):
+        median = sorted(map(_length, chain))[(len(chain) - 1) // 2]
         limit = _CHAINED * median if len(chain) > 1 else 0
         long += (pause for pause in chain if _length(pause) > limit)
     return tuple((start, end) for start, end, _ in _longest(long))
+
+
+def _chains(
+    pauses: Sequence[CountedPause], topics: int, slow_period: float
+) -> list[list[CountedPause]]:
+    """Divides pauses where frequent topics came back: with more messages than slow ones send.
+
+    Slow topics send one message each, or one in each `slow_period` (ns), between two pauses.
+    """
+    chains: list[list[CountedPause]] = []
+    last_end, sent_before = MIN_NS, 0
+    for start, end, sent in pauses:
+        by_slow_topics = max(topics, (start - last_end) / slow_period)
+        if not chains or sent - sent_before > by_slow_topics:
+            chains.append([])
+        chains[-1].append((start, end, sent))
+        last_end, sent_before = end, sent
+    return chains
 
 
 def absences_of(pauses: Sequence[CountedPause], count: int, length: Ns) -> tuple[CountedPause, ...]:
