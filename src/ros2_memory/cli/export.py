@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -166,16 +167,13 @@ class Definitions:
     def __init__(self, reader: BagReader) -> None:
         self.undefined: list[str] = []
         self._reader = reader
-        self._channels: dict[Channel, Channel] = {}
+        self._defined = cache(self._with_definition)
 
     def add_to(self, messages: Iterable[StoredMessage]) -> Iterator[StoredMessage]:
         """Yields the messages, each with the definition of its type if there is one."""
         for stored in messages:
             record = stored.record
-            if record.channel not in self._channels:
-                self._channels[record.channel] = self._with_definition(record.channel)
-            channel = self._channels[record.channel]
-            yield stored._replace(record=record._replace(channel=channel))
+            yield stored._replace(record=record._replace(channel=self._defined(record.channel)))
 
     def _with_definition(self, channel: Channel) -> Channel:
         schema = channel.schema
