@@ -684,7 +684,7 @@ def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None =
 
     Args:
         overrides: assignments in Hydra's grammar (`server.port=9300`, `recorder=none`).
-        env: the environment; that of this process by default.
+        env: the environment; by default `os.environ`.
 
     Raises:
         ConfigError: a file, a variable or an override is refused.

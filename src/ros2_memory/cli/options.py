@@ -277,7 +277,7 @@ def open_memory(
 
     Raises:
         ConfigError: an adapter cannot be built.
-        InvalidArgumentsError: the configuration is that of a fleet, or lacks `data.recording`.
+        InvalidArgumentsError: a fleet is configured, or `data.recording` does not exist.
     """
     robots = settings.fleet.robots
     if robots and scans:

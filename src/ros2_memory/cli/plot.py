@@ -314,12 +314,10 @@ def _draw_rows(axes: "Axes", rows: Rows, span: Seconds) -> None:
 
 
 def _label_times(axis: "Axis", start: float, end: float) -> None:
-    """Labels an axis of days since 1970 by this machine's clock; its offset is that of the middle.
-
-    `start` and `end` are Unix seconds.
-    """
+    """Labels an axis of days since 1970 with local times; `start` and `end` are Unix seconds."""
     from matplotlib.dates import AutoDateLocator, DateFormatter  # noqa: PLC0415 - as above
 
+    # One offset from UTC for the whole axis: the one in its middle.
     zone = datetime.fromtimestamp((start + end) / 2).astimezone().tzinfo
     axis.set_major_locator(AutoDateLocator(tz=zone, maxticks=8))
     form = "%H:%M:%S" if end - start < _DAY_S else "%d %b %H:%M"

@@ -99,16 +99,28 @@ def prove(
         print_line(f"{counted(count, 'message')} in {output}")
     if differing.of_files:
         print_notes([f"only the bags themselves give the same {listed(differing.of_files)}"])
-    verdict = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
-    if differing.of_answer:
-        verdict = f"over {output} the answer differs in {listed(differing.of_answer)}"
-        if len(parts) > 1 and output.suffix == ".mcap":
-            verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
-    print(verdict, file=sys.stderr)
+    print(_verdict(differing, words, output, len(parts)), file=sys.stderr)
     if definitions.undefined:
         print_notes([definitions.describe_undefined()])
     types = {name for topic in read for name in view.timeline.types_of(topic)}
     return bool(differing.of_answer or not types.isdisjoint(definitions.undefined))
+
+
+class _DifferingKeys(NamedTuple):
+    """The keys in which two replies differ: those on what lies in which file, and all others."""
+
+    of_files: list[str]
+    of_answer: list[str]
+
+
+def _verdict(differing: _DifferingKeys, words: Sequence[str], output: Path, parts: int) -> str:
+    """Returns a sentence on whether the copy gives the same answer, and what to do if not."""
+    if not differing.of_answer:
+        return f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
+    verdict = f"over {output} the answer differs in {listed(differing.of_answer)}"
+    if parts > 1 and output.suffix == ".mcap":
+        verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
+    return verdict
 
 
 class _ReadLog:
@@ -282,13 +294,6 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
     if reply.is_error and isinstance(answer, dict):
         raise InvalidArgumentsError(str(answer["detail"]))
     return answer
-
-
-class _DifferingKeys(NamedTuple):
-    """The keys in which two replies differ: those on what lies in which file, and all others."""
-
-    of_files: list[str]
-    of_answer: list[str]
 
 
 def _differing_keys(expected: JsonValue, repeated: JsonValue) -> _DifferingKeys:

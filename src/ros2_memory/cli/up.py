@@ -43,7 +43,7 @@ from ros2_memory.cli.proposal import (
     select,
     topics_yaml,
 )
-from ros2_memory.config import NullRecorderNode, config_dir, is_deployment_chosen
+from ros2_memory.config import NullRecorderNode, Settings, config_dir, is_deployment_chosen
 from ros2_memory.config_sources import given_variables, quoted
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.model import TimeWindow
@@ -153,15 +153,7 @@ def up(
     print_line(f"{robot.ros.ros2}, {robot.where}, bags in {robot.bag_dir}")
     with spinner("looking which topics there are, and measuring them"):
         survey = survey_topics(robot.ros, build_reader(settings), settings.recorder.chunk_bytes)
-    disk = Disk(
-        ratio=survey.ratio,
-        fixed_bytes=survey.fixed_bytes,
-        split_s=settings.recording.split_duration_s,
-        session_s=settings.recording.session_duration_s,
-        columns_share=settings.store.max_share if settings.store.enabled else 0.0,
-        budget_bytes=settings.retention.max_total_gb * GB,
-        keep_days=settings.retention.max_age_h / 24,
-    )
+    disk = _disk_of(settings, survey)
     if robot.list_file.exists():
         _show_list(robot, survey, disk)
     else:
@@ -175,6 +167,18 @@ def up(
     if script is not None:
         _become_installer(script, robot)
     return _run_programs(robot.words, robot.bag_dir)
+
+
+def _disk_of(settings: Settings, survey: Survey) -> Disk:
+    return Disk(
+        ratio=survey.ratio,
+        fixed_bytes=survey.fixed_bytes,
+        split_s=settings.recording.split_duration_s,
+        session_s=settings.recording.session_duration_s,
+        columns_share=settings.store.max_share if settings.store.enabled else 0.0,
+        budget_bytes=settings.retention.max_total_gb * GB,
+        keep_days=settings.retention.max_age_h / 24,
+    )
 
 
 def _find_robot(

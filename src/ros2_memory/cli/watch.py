@@ -30,7 +30,7 @@ WINDOW_NS: Final[Ns] = 10 * NS_PER_S
 AS_USUAL: Final = "as usual"
 LIVE_SPLITS: Final = 3
 LIVE_NS: Final[Ns] = 60 * NS_PER_S
-"""The newest data is live up to this age, or to that of `LIVE_SPLITS` splits if they are longer."""
+"""The newest data is live up to this age, or up to `LIVE_SPLITS` splits if these are longer."""
 _MIN_MESSAGES: Final = 5
 """Fewer messages give no rate."""
 _SILENT_PERIODS: Final = 10

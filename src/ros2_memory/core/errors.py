@@ -62,7 +62,7 @@ class NoDataReason(StrEnum):
 class NoDataError(EpisodicError):
     """There is no data; `detail` says what exists instead and what to ask.
 
-    `notes` are sentences on what could not be read, and may contain what was asked for.
+    `notes` are sentences on data that could not be read, and may be what was asked for.
     """
 
     code = "no_data"
@@ -77,8 +77,8 @@ class NoDataError(EpisodicError):
 class QueryTimeoutError(EpisodicError):
     """The query passed its deadline.
 
-    `searched_back_to` (log time in ns) is how far back a search got without a match; None where it
-    cannot be continued.
+    `searched_back_to` is the log time (ns) down to which a search found no match; None if the
+    search cannot be continued.
     """
 
     code = "timeout"
@@ -97,8 +97,8 @@ class BusyError(EpisodicError):
 class BagError(EpisodicError):
     """A bag file that cannot be read: its `path`, and the `reason`.
 
-    `lost` are the first and last log time (inclusive) of the messages that cannot be read, where
-    others can.
+    `lost` are the first and last log time (inclusive) of the messages that cannot be read, if other
+    messages of the file can be read.
     """
 
     code = "bag_unreadable"
@@ -117,7 +117,7 @@ class BagVanishedError(BagError):
 class BagContradictionError(BagError):
     """A bag file whose indexes contradict its messages, which are read without the indexes.
 
-    `lost` is the window of the query: reading goes on behind it, and no message of it is lost.
+    `lost` is the window of the query: reading goes on after it, and none of its messages is lost.
     """
 
 

@@ -22,10 +22,10 @@ class Answered:
 
     Attributes:
         tool: a tool of this server, or `UNKNOWN_TOOL`.
-        outcome: `ok`, `cancelled`, `internal` or the code of an error; with `no_data` its reason
-            behind a colon, as in `no_data: gap`.
+        outcome: `ok`, `cancelled`, `internal` or the code of an error; `no_data` is followed by its
+            reason, as in `no_data: gap`.
         duration_s: from arguments to reply, including the wait in the queue.
-        stages_ms: milliseconds spent in `index`, `read` and `extract`, of those that occurred.
+        stages_ms: milliseconds spent in `index`, `read` and `extract`; no stage that was skipped.
         chars: length of the reply.
         correlation_id: of the log events of the call.
     """

@@ -172,7 +172,7 @@ def _message_judge(
         sentence: the answer, with the fields of `_sentence`.
         ago: how many seconds before the call the message must be, if that was asked.
         holds: whether the asked condition holds at a time of the robot.
-        value_topic: another topic, if the value is that of its message at the same time.
+        value_topic: the topic whose value was asked for, if it is another one.
         off: how much a number may be off.
     """
 

@@ -320,7 +320,7 @@ class _Forget:
         return snapshot.unread_bounds[aside]
 
     def _bags_as_on_disk(self, snapshot: Snapshot) -> Iterator[BagFile]:
-        """Yields the bags with all messages in their files, also with those that do not count."""
+        """Yields the bags with all messages in their files, whether the messages count or not."""
         handover_of = cache(read_handover)
         for bag in (*snapshot.bags, *snapshot.copies):
             if not bag.sidecar_ns or not handover_of(bag.recording).handover.rule(bag.path.name):
