@@ -147,14 +147,15 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
 
 
 def _newest_static_transforms(view: View, topic: str, window: TimeWindow) -> list[StoredMessage]:
-    """Returns the messages that are the newest of a window for one child frame or several."""
+    """Returns the newest message of a window for each child frame, each message once."""
     newest: dict[str, StoredMessage] = {}
     for stored in view.stream.messages([topic], window):
         with suppress(UndecodableError):
             message = view.memory.reader.decode(stored.record)
             for edge in view.extractor.transforms(message, stored.time, static=True):
                 newest[edge.child] = stored
-    return [*{id(stored): stored for stored in newest.values()}.values()]
+    once = {id(stored): stored for stored in newest.values()}  # a message may have several frames
+    return [*once.values()]
 
 
 class Definitions:

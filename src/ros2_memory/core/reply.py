@@ -332,7 +332,10 @@ def keys(*declared: str | Key, span: tuple[Source, Source] | None = None) -> Key
     `span` are the sources of the oldest and the newest time of the reply.
     """
     all_keys = tuple(PLAIN(key) if isinstance(key, str) else key for key in declared)
-    return Keys(all_keys, None if span is None else PLAIN("span", *span).get)
+    if span is None:
+        return Keys(all_keys)
+    # The two times are read as the value of a key with two sources.
+    return Keys(all_keys, PLAIN("span", *span).get)
 
 
 @dataclass_transform(frozen_default=True)

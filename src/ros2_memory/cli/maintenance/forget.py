@@ -462,10 +462,10 @@ class _Forget:
         for bag in bags:
             for path in (bag.path, Path(other_form(bag.file))):
                 try:
-                    with suppress(FileNotFoundError):
-                        status = path.lstat()
-                        inode = status.st_dev, status.st_ino
-                        freed += remove_bag(self._bag_dir, path, inode)
+                    status = path.lstat()
+                    freed += remove_bag(self._bag_dir, path, (status.st_dev, status.st_ino))
+                except FileNotFoundError:
+                    continue
                 except OSError as error:
                     failures.append(f"{self._name(path)}: {error.strerror or error}")
                     staying.add(path)
