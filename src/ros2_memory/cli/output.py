@@ -256,13 +256,12 @@ def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> No
     if len(_all_keys(flattened)) > _MAX_COLUMNS:
         flattened = [{**row} for row in rows]
     endless = console.options.update_width(_ENDLESS)
-    table = _table(flattened, breaks_times=False)
-    if Measurement.get(console, endless, table).maximum <= console.width:
-        console.print(table)
+    wide, narrow = (_table(flattened, breaks_times=breaks) for breaks in (False, True))
+    if Measurement.get(console, endless, wide).maximum <= console.width:
+        console.print(wide)
         return
-    table = _table(flattened, breaks_times=True)
-    if Measurement.get(console, endless, table).minimum <= console.width:
-        console.print(table)
+    if Measurement.get(console, endless, narrow).minimum <= console.width:
+        console.print(narrow)
         return
     for row in rows:
         console.print()
