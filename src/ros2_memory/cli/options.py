@@ -263,7 +263,6 @@ def open_memory(
     verbose: bool,
     scans: bool = True,
     setting: str | None = None,
-    cache_mb: int | None = None,
 ) -> "Memory":
     """Opens the memory of the configured bags, and indexes the directory as it is now.
 
@@ -273,7 +272,6 @@ def open_memory(
             `reported_errors` prints the count when the command ends.
         scans: False leaves out the index, for a command that asks the robots of a fleet.
         setting: the setting that names the bags, if it is not `recording.bag_dir`.
-        cache_mb: as in `shared_parts`.
 
     Raises:
         ConfigError: an adapter cannot be built.
@@ -292,7 +290,7 @@ def open_memory(
     configure_logging(settings.logging.level if verbose else "warning", settings.logging.format)
     if not verbose:
         withhold_warnings()
-    memory = build_memory(settings, shared_parts(settings, cache_mb=cache_mb), setting=setting)
+    memory = build_memory(settings, shared_parts(settings), setting=setting)
     if not scans:
         return memory
     with spinner(f"looking through {settings.recording.bag_dir}"):
@@ -306,19 +304,17 @@ def open_memory(
     return memory
 
 
-def open_robot(
-    settings: Settings, name: str, *, verbose: bool, cache_mb: int | None = None
-) -> "tuple[Settings, Memory]":
+def open_robot(settings: Settings, name: str, *, verbose: bool) -> "tuple[Settings, Memory]":
     """Opens the memory of a robot of the fleet; without a fleet the name is empty.
 
     Returns the settings of that robot, and its memory.
     """
     if not name:
-        return settings, open_memory(settings, verbose=verbose, cache_mb=cache_mb)
+        return settings, open_memory(settings, verbose=verbose)
     from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings  # noqa: PLC0415 - as above
 
     own = robot_settings(settings, name)
-    return own, open_memory(own, verbose=verbose, setting=ROBOTS_SETTING, cache_mb=cache_mb)
+    return own, open_memory(own, verbose=verbose, setting=ROBOTS_SETTING)
 
 
 def present_time(memory: "Memory") -> Ns:

@@ -63,6 +63,10 @@ def index(
     keep_freed()
     gc.set_threshold(*_RARELY)
     settings, _ = load_given(bag_dir, words)
+    # Filling reads the columns of ten minutes together: small caches do.
+    cache_mb = min(_CACHE_MB, settings.store.cache_mb)
+    reader = replace(settings.reader, chunk_cache_mb=cache_mb)
+    settings = replace(settings, reader=reader, store=replace(settings.store, cache_mb=cache_mb))
     if for_server is not None:
         _fill_for_server(settings, for_server)
         return
@@ -98,7 +102,7 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
         ConfigError: no columns are stored, or nowhere can they be.
         RecorderError: the bag directory cannot be read.
     """
-    settings, memory = open_robot(settings, robot, verbose=verbose, cache_mb=_cache_mb(settings))
+    settings, memory = open_robot(settings, robot, verbose=verbose)
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
     backfill = build_backfill(settings, memory)
@@ -121,13 +125,8 @@ def _fill_for_server(settings: Settings, server: int) -> None:
     configure_logging(logged.level, logged.format, arguments=logged.arguments)
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
-    shared = shared_parts(settings, cache_mb=_cache_mb(settings))
-    _fill_and_close(build_backfill(settings, build_memory(settings, shared)))
-
-
-def _cache_mb(settings: Settings) -> int:
-    """Returns the size of the cache in MiB: filling reads the columns of ten minutes together."""
-    return min(_CACHE_MB, settings.store.cache_mb)
+    memory = build_memory(settings, shared_parts(settings))
+    _fill_and_close(build_backfill(settings, memory))
 
 
 def _fill_and_close(
