@@ -103,7 +103,7 @@ def export(
 
 
 class Exported(NamedTuple):
-    """What was written, and a sentence on types that the copy does not let anyone decode, or ''."""
+    """What an export wrote; `fault` names types that others cannot decode, or is empty."""
 
     where: str
     messages: int
@@ -162,7 +162,7 @@ class Definitions:
     """Gives messages the definitions that their bags lack.
 
     Attributes:
-        undefined: the types that no bag, configured folder or standard type defines.
+        undefined: the types without a definition in the bags, the folders or the standard types.
     """
 
     def __init__(self, reader: BagReader) -> None:
