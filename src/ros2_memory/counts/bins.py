@@ -1,12 +1,13 @@
-"""The bins of a window, and what is counted in them: local days, hours and weekdays, or places.
+"""A window cut into bins (local days, hours, weekdays, or places), and tables of what they hold.
 
-A window is cut where local days (or hours) begin; each piece belongs to one bin. Where clocks are
-changed, a day has 23 or 25 hours, the hour that is skipped has no piece, and the one that occurs
-twice is one piece of two hours: the pieces always cover the window exactly, so sums over bins are
-those of the window.
+A window is cut into pieces where local days (or hours) begin. Each piece belongs to one bin. Pieces
+cover the window exactly, so the values of all bins add up to the value of the window. When clocks
+change, a day has 23 or 25 hours, the hour that is skipped has no piece, and the hour that occurs
+twice is one piece of two hours.
 
-Bins of places are the named ones, or those of a question; elsewhere; and where that is not known.
-A place that lies in another one counts to both, so they may add up to more than the window.
+Bins of places are the named places or those of the question, "(elsewhere)", and "(unknown)" for
+when it is not known where the robot was. Time in overlapping places counts to each of them, so
+these bins may add up to more than the window.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import time
 from dataclasses import dataclass
 from datetime import date
 from itertools import compress, groupby
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -50,13 +51,29 @@ if TYPE_CHECKING:
 
 
 ClockBin: TypeAlias = Literal["day", "hour", "weekday"]
+By: TypeAlias = Literal["day", "hour", "weekday", "place"]
+Values: TypeAlias = "Sequence[float | None]"
+"""The values of a column, one for each bin; None if a bin has none."""
 Offset: TypeAlias = "Callable[[int], int]"
 """Returns how many seconds local time is ahead of UTC at a Unix second."""
 
 MOST_BINS: Final = 62
-"""Days that one answer lists: two months."""
+"""A reply by day lists at most two months."""
 MOST_DAYS: Final = 1_000
-"""Days that are counted by hour or by weekday."""
+"""The longest window, in days, that is counted by hour or by weekday."""
+MOST_CELLS: Final = 124
+"""Fields (or places) times bins that one reply has room for."""
+_MOST_SPANS: Final = 6
+"""How many empty times a note names."""
+HELD_COLUMNS: Final[tuple[tuple[str, BinColumn], ...]] = (
+    ("count", "count"),
+    ("seconds", "duration"),
+    ("first", "time"),
+    ("last", "time"),
+)
+"""How often something held, how long, when it first began, and when it last ended."""
+ELSEWHERE: Final = "(elsewhere)"
+UNKNOWN: Final = "(unknown)"
 
 _HOUR_S: Final = 3_600
 _DAY_S: Final = 86_400
@@ -73,7 +90,10 @@ _WEEKDAYS: Final = (
 
 
 def local_offset(at_s: int) -> int:
-    """Returns the offset of this machine's zone (or of TZ); 0 for years without a calendar."""
+    """Returns how many seconds local time (of TZ, or of this machine) is ahead of UTC.
+
+    0 if the year is out of the calendar's range.
+    """
     try:
         return time.localtime(at_s).tm_gmtoff
     except (OverflowError, ValueError, OSError):
@@ -82,14 +102,14 @@ def local_offset(at_s: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class TimeBins:
-    """A window cut into pieces, each of which belongs to a bin, or to several.
+    """A window cut into pieces. Each piece belongs to one bin, or to several overlapping places.
 
     Attributes:
-        names: of the bins, in order.
-        edges: where pieces begin, and where the last one ends; they ascend.
-        member: for each piece and each bin, whether the piece belongs to the bin.
-        day_of: for each piece, the number of its local day since the epoch; None where pieces may
-            lie in several days.
+        names: the names of the bins, in order.
+        edges: log times (ns), ascending: the begin of each piece, and the end of the last.
+        member: a row for each piece and a column for each bin: whether the piece belongs to it.
+        day_of: for each piece, its local day since the epoch; None for bins of places, whose
+            pieces may last several days.
     """
 
     names: tuple[str, ...]
@@ -98,15 +118,12 @@ class TimeBins:
     day_of: Ints | None
 
     def pieces(self, times: ArrayLike) -> NDArray[np.intp]:
-        """Returns the piece of each time; times outside of the window count to its ends."""
+        """Returns the piece of each log time; times outside of the window go to its ends."""
         pieces = np.searchsorted(self.edges, np.asarray(times, np.int64), side="right") - 1
         return np.clip(pieces, 0, len(self.member) - 1)
 
     def lengths(self, starts: ArrayLike, stops: ArrayLike) -> Ints:
-        """Returns how much (ns) of half-open spans falls into each piece, all spans together.
-
-        What lies outside of the window does not count.
-        """
+        """Returns the length (ns) of all half-open spans together in each piece."""
         start_times = np.asarray(starts, np.int64)
         elapsed_until_edges = _summed_ages(self.edges, start_times) - _summed_ages(
             self.edges, np.maximum(start_times, np.asarray(stops, np.int64))
@@ -115,9 +132,9 @@ class TimeBins:
 
 
 def _summed_ages(edges: Ints, times: Ints) -> Ints:
-    """Returns for each edge the sum (ns) of how long before it each of the earlier times was.
+    """Returns, for each edge, the sum of `edge - time` (ns) over all earlier times.
 
-    Sums may wrap around; so do their differences, which are what is wanted.
+    A sum may wrap around. The difference of two sums, which is what callers use, is right.
     """
     ordered = np.sort(times)
     counts_before = np.searchsorted(ordered, edges)
@@ -126,10 +143,10 @@ def _summed_ages(edges: Ints, times: Ints) -> Ints:
 
 
 def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -> TimeBins:
-    """Returns the bins of a window, which must not be empty.
+    """Returns the bins of a window that is not empty.
 
     Raises:
-        InvalidArgumentsError: there would be too many.
+        InvalidArgumentsError: there would be too many bins.
     """
     days_long = (window.stop - window.start) // (_DAY_S * NS_PER_S)
     most_days = MOST_BINS if by == "day" else MOST_DAYS
@@ -145,7 +162,8 @@ def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -
     else:
         bin_of_piece = [local_s % _DAY_S // _HOUR_S for local_s in locals_s]
     bins = sorted(set(bin_of_piece))
-    if len(bins) > MOST_BINS + 1:  # a window of so many days touches one day more
+    # A window of so many days may touch one more.
+    if len(bins) > MOST_BINS + 1:
         raise _too_long(by, MOST_BINS)
     return TimeBins(
         names=tuple(_bin_name(number, by) for number in bins),
@@ -156,7 +174,7 @@ def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -
 
 
 def _piece_starts(window: TimeWindow, unit_s: int, offset: Offset) -> list[Ns]:
-    """Returns the window's start, and where local days (or hours) begin in it."""
+    """Returns the window's start, and the times at which a local day (or hour) begins in it."""
     starts = [window.start]
     last_s = (window.stop - 1) // NS_PER_S
     edge_s = _next_edge(window.start // NS_PER_S, unit_s, offset)
@@ -174,20 +192,33 @@ def _too_long(by: ClockBin, most: int) -> InvalidArgumentsError:
 
 
 def _next_edge(at_s: int, unit_s: int, offset: Offset) -> int:
-    """Returns the first Unix second after this one in which another local day (or hour) begins."""
+    """Returns the next Unix second in which another local day (or hour) begins."""
     while True:
-        ahead = offset(at_s)
-        following = at_s - (at_s + ahead) % unit_s + unit_s
-        if offset(following) == ahead:
-            return following
-        # Clocks are changed on the way: the first second of the new time.
-        low, high = at_s, following
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if offset(middle) == ahead else (low, middle)
-        if (high + offset(high)) // unit_s != (high - 1 + ahead) // unit_s:
-            return high
-        at_s = high
+        ahead_s = offset(at_s)
+        following_s = at_s - (at_s + ahead_s) % unit_s + unit_s
+        if offset(following_s) == ahead_s:
+            return following_s
+        changed_s = _clock_change(at_s, following_s, offset)
+        if (changed_s + offset(changed_s)) // unit_s != (changed_s - 1 + ahead_s) // unit_s:
+            return changed_s
+        at_s = changed_s
+
+
+def _clock_change(before_s: int, after_s: int, offset: Offset) -> int:
+    """Returns the first Unix second between two at which local time has another offset."""
+    old = offset(before_s)
+    while after_s - before_s > 1:
+        middle_s = (before_s + after_s) // 2
+        if offset(middle_s) == old:
+            before_s = middle_s
+        else:
+            after_s = middle_s
+    return after_s
+
+
+def _time_of_day(at_s: int) -> int:
+    """Returns the seconds since local midnight at a Unix second."""
+    return (at_s + local_offset(at_s)) % _DAY_S
 
 
 def _bin_name(number: int, by: ClockBin) -> str:
@@ -196,39 +227,20 @@ def _bin_name(number: int, by: ClockBin) -> str:
     return _WEEKDAYS[number] if by == "weekday" else f"{number:02d}:00"
 
 
-def first_of_days(bins: TimeBins, times: ArrayLike) -> list[tuple[int, Ns]]:
-    """Returns the local days that have some of these times, in order, each with its first one.
-
-    None of bins whose pieces may lie in several days.
-    """
-    if bins.day_of is None:
-        return []
-    ordered = np.sort(np.asarray(times, np.int64))
-    days, first = np.unique(bins.day_of[bins.pieces(ordered)], return_index=True)
-    return list(zip(days.tolist(), ordered[first].tolist(), strict=True))
-
-
-def usual_time(times: Sequence[Ns], of_days: int, offset: Offset = local_offset) -> Usual:
-    """Returns the usual time of day of one time from each of several days, of so many recorded."""
-    clock = sorted((at // NS_PER_S + offset(at // NS_PER_S)) % _DAY_S for at in times)
-    median = (clock[(len(clock) - 1) // 2] + clock[len(clock) // 2]) // 2
-    return Usual(median, clock[0], clock[-1], len(clock), of_days)
-
-
-ELSEWHERE: Final = "(elsewhere)"
-UNKNOWN: Final = "(unknown)"
-
-
 def place_bins(
     view: View, window: TimeWindow, counted: TimeWindow, where: Where | None
 ) -> TimeBins:
-    """Returns places as bins: when the robot was in each, by its track in what is counted.
+    """Returns a bin for each place, and the pieces in which the robot was there.
 
-    Notes list unknown times.
+    Args:
+        view: the view of this call.
+        window: the window that the pieces cover.
+        counted: the window in which the robot's track is read.
+        where: the places; None for all named places.
 
     Raises:
-        InvalidArgumentsError: no place is named in the frame of places, or those of the question
-            are in a frame that no transforms lead to.
+        InvalidArgumentsError: no place is named in the frame of places, or no transforms lead to
+            the frame of the places that are asked for.
         NoDataError: there are no poses.
         QueryTimeoutError: the call's time runs out before any result.
     """
@@ -260,45 +272,49 @@ def place_bins(
 
 
 def _edges_at_spans(window: TimeWindow, span_lists: Sequence[Sequence[Span]]) -> Ints:
-    """Returns the bounds of a window, and those of spans that lie in it, in order."""
+    """Returns the ends of a window, and the ends of spans that lie in it, ascending."""
     bounds = {at for spans in span_lists for span in spans for at in span}
     inner = sorted(at for at in bounds if window.start < at < window.stop)
     return np.array([window.start, *inner, window.stop], np.int64)
 
 
 def _lies_in_spans(edges: Ints, spans: Sequence[Span]) -> Flags:
-    """Returns for each piece between two edges whether it lies in one of some half-open spans."""
+    """Returns, for each piece between two edges, whether it lies in one of the half-open spans."""
     starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
     begun = np.searchsorted(starts, edges[:-1], side="right")
     ended = np.searchsorted(stops, edges[:-1], side="right")
     return begun > ended
 
 
-By: TypeAlias = Literal["day", "hour", "weekday", "place"]
-Values: TypeAlias = "Sequence[float | None]"
+class _Column(NamedTuple):
+    """A column of a table of bins; `whole` is its value for all bins together."""
 
-
-_MOST_SPANS: Final = 6
-"""Times without a row that are named."""
-MOST_CELLS: Final = 124
-"""Fields, or places, of all bins together that one reply has room for."""
+    name: str
+    kind: BinColumn
+    values: Values
+    whole: float | None
 
 
 class BinnedWindow:
     """A window of the memory, cut into bins, to which columns of values are added.
 
-    `where` are the places of bins of places; None for all named ones.
+    Args:
+        view: the view of this call.
+        asked: the window that the client asked for.
+        by: the kind of the bins.
+        topics: the topics that the reply is about.
+        where: the places of bins of places; None for all named ones.
 
     Attributes:
-        asked: the whole window.
-        counted: what of it is counted: what the memory reaches, without bags that a wrong clock
-            dated unless it has nothing else, and since when there was time to count.
-        window: the same without the tolerance of its bounds.
-        bins: its bins.
-        gaps: when nothing was recorded in it.
-        elapsed: how much time passed between moments of it.
-        usual: when something usually began first in a day, if that is counted.
-        usual_exit: when the robot usually left first in a day, likewise.
+        asked: the window that the client asked for.
+        counted: the part of it that is counted: what the memory reaches, and what there was time
+            for. Bags with a wrong clock do not widen it, unless there are no others.
+        window: the part that the memory reaches, without the tolerance of its bounds.
+        bins: the bins of `window`.
+        gaps: the spans of `window` in which nothing was recorded.
+        elapsed: how much time passed between log times of `window`.
+        usual: the usual time of day of the first begin, if that is counted.
+        usual_exit: the usual time of day of the first exit, if that is counted.
 
     Raises:
         InvalidArgumentsError: there are too many bins, or there is no named place.
@@ -321,16 +337,14 @@ class BinnedWindow:
         if end < start:
             raise no_data_between(view, self._topics, asked)
         self.counted = reached(view.snapshot, asked)
-        # Up to midnight is no part of the next day; what is at the very end counts to the last bin.
+        # The end is left out: a window until midnight has no bin of the next day. `TimeBins.pieces`
+        # takes what happens at the very end into the last bin.
         self.window = TimeWindow(start, max(end, start + 1))
-        self.bins: TimeBins = (
-            place_bins(view, self.window, self.counted, where)
-            if by == "place"
-            else time_bins(self.window, by)
-        )
-        self._columns: list[tuple[str, BinColumn]] = []
-        self._values: list[Values] = []
-        self._all: list[float | None] = []
+        if by == "place":
+            self.bins = place_bins(view, self.window, self.counted, where)
+        else:
+            self.bins = time_bins(self.window, by)
+        self._columns: list[_Column] = []
         self.usual: Usual | None = None
         self.usual_exit: Usual | None = None
         self.gaps = list(recording_gaps(view, self.window))
@@ -338,58 +352,54 @@ class BinnedWindow:
         self._since: Ns | None = None
 
     def add(self, name: str, kind: BinColumn, values: Values, whole: float | None) -> None:
-        """Adds a column, and its value for all bins together."""
-        self._columns.append((name, kind))
-        self._values.append(values)
-        self._all.append(whole)
+        """Adds a column: a value for each bin, and the value for all bins together."""
+        self._columns.append(_Column(name, kind, values, whole))
 
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
-        """Adds how long topics had messages, without pauses far longer than usual on them."""
+        """Adds how long topics had messages, without gaps and pauses of more than two splits."""
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
         firsts, lasts = pieces_of(*self.bounds(topics), pause)
         heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
         self.add_lengths(column, "duration", without(heard, self.gaps))
 
     def bounds(self, topics: Sequence[str]) -> tuple[Ints, Ints]:
-        """Returns first and last log times (ns) of topics: one for each topic and bag counted."""
+        """Returns the first and the last log times (ns) of each topic in each counted bag."""
         bounds = [self.view.bounds(topic, self.counted) for topic in topics]
         firsts, lasts = np.concatenate(bounds, axis=1)
         is_inside = (firsts < self.counted.stop) & (lasts >= self.counted.start)
         return firsts[is_inside], lasts[is_inside]
 
     def add_unknown(self, spans: Spans) -> None:
-        """Adds for how long the answer is not known, if there are such times."""
+        """Adds how long the answer is not known, if there are such times."""
         if spans:
             self.add_lengths("unknown_s", "duration", spans)
 
     def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[Span]) -> None:
-        """Adds how much (ns) of half-open spans, which do not overlap, falls into each bin."""
+        """Adds the time that passed in half-open spans, which do not overlap, for each bin."""
         self.add_sums(column, kind, self._time_in_pieces(spans))
 
     def add_counts(self, column: str, times: Ints) -> None:
-        """Adds how many of these times each bin has."""
+        """Adds how many of the log times each bin has."""
         pieces = self.bins.pieces(times)
         self.add_sums(column, "count", np.bincount(pieces, minlength=len(self.bins.member)))
 
-    def add_sums(self, column: str, kind: BinColumn, of_pieces: Ints) -> None:
-        """Adds what the pieces of each bin have together."""
-        self.add(column, kind, (of_pieces @ self.bins.member).tolist(), int(of_pieces.sum()))
+    def add_sums(self, column: str, kind: BinColumn, piece_values: Ints) -> None:
+        """Adds, for each bin, the sum of the values of its pieces."""
+        self.add(column, kind, (piece_values @ self.bins.member).tolist(), int(piece_values.sum()))
 
     def add_held(self, held: Ints) -> None:
-        """Adds how often something began, its first and last time, and how long it held.
-
-        That is without gaps, in which it may have held on, or begun and ended.
+        """Adds `HELD_COLUMNS`. Time in gaps does not count: what happened then is not known.
 
         Args:
-            held: from when to when, and whether it is known to have begun then; else it held
-                before, or that is not known (N x 3).
+            held: rows of a start and a stop (ns, inclusive), and 1 if it is known to begin at the
+                start, 0 if it may have begun before.
         """
         starts, stops, begun = held.T
         inside = (stops >= self.counted.start) & (starts < self.counted.stop)
         starts, stops = (times[inside].clip(*self._counted_bounds) for times in (starts, stops))
         begins = starts[begun[inside] > 0]
         self.add_counts("count", begins)
-        is_long = starts < stops  # what happened at a moment took no time
+        is_long = starts < stops
         lasting = united(zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True))
         self.add_lengths("seconds", "duration", without(lasting, self.gaps))
         self.add_first("first", begins)
@@ -397,20 +407,20 @@ class BinnedWindow:
         self.usual = self.usual_of(begins)
 
     def add_first(self, column: str, times: Ints) -> None:
-        """Adds the first of these times in each bin."""
+        """Adds the first of the log times in each bin."""
         firsts = np.full(len(self.bins.member), MAX_NS)
         np.minimum.at(firsts, self.bins.pieces(times), times)
-        of_bins = (int(firsts[in_bin].min(initial=MAX_NS)) for in_bin in self.bins.member.T)
-        first = [None if at == MAX_NS else at for at in of_bins]
-        self.add(column, "time", first, min(times.tolist(), default=None))
+        bin_firsts = (int(firsts[in_bin].min(initial=MAX_NS)) for in_bin in self.bins.member.T)
+        values = [None if at == MAX_NS else at for at in bin_firsts]
+        self.add(column, "time", values, min(times.tolist(), default=None))
 
-    def add_last(self, of_pieces: Ints, whole: Ns | None) -> None:
-        """Adds the last time in each bin, by those in pieces; `MIN_NS` where there is none."""
-        of_bins = (int(of_pieces[in_bin].max(initial=MIN_NS)) for in_bin in self.bins.member.T)
-        self.add("last", "time", [None if at == MIN_NS else at for at in of_bins], whole)
+    def add_last(self, piece_lasts: Ints, whole: Ns | None) -> None:
+        """Adds the last log time in each bin; `piece_lasts` has `MIN_NS` for a piece without."""
+        bin_lasts = (int(piece_lasts[in_bin].max(initial=MIN_NS)) for in_bin in self.bins.member.T)
+        self.add("last", "time", [None if at == MIN_NS else at for at in bin_lasts], whole)
 
     def _last_held(self, starts: Ints, stops: Ints) -> Ints:
-        """Returns for each piece when something held there for the last time; `MIN_NS`: never."""
+        """Returns the last time in each piece that lies in a span (inclusive); else `MIN_NS`."""
         piece_ends = self.bins.edges[1:] - 1
         first_pieces, last_pieces = self.bins.pieces(starts), self.bins.pieces(stops)
         newest = np.full(len(piece_ends), MIN_NS)
@@ -421,19 +431,32 @@ class BinnedWindow:
         return newest
 
     def usual_of(self, times: Ints) -> Usual | None:
-        """Returns the usual time of day of the first of these times in each day.
+        """Returns the usual local time of day of the first of the log times in a day.
 
-        Of a day that is not counted from its begin, the first is not known.
+        Only days count that are counted from midnight and have something recorded. None for bins
+        of places, and if no such day has one of the times.
         """
-        days = self._days_recorded()
-        firsts = [at for day, at in first_of_days(self.bins, times) if day in days]
-        return usual_time(firsts, len(days)) if firsts else None
-
-    def _days_recorded(self) -> set[int]:
-        """Returns the local days that have something recorded, and are counted from their begin."""
         if self.bins.day_of is None:
-            return set()
-        edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
+            return None
+        ordered = np.sort(times)
+        days, firsts = np.unique(self.bins.day_of[self.bins.pieces(ordered)], return_index=True)
+        whole_days = self._whole_days(self.bins.day_of.tolist())
+        clock_s = sorted(
+            _time_of_day(at // NS_PER_S)
+            for day, at in zip(days.tolist(), ordered[firsts].tolist(), strict=True)
+            if day in whole_days
+        )
+        if not clock_s:
+            return None
+        median_s = (clock_s[(len(clock_s) - 1) // 2] + clock_s[len(clock_s) // 2]) // 2
+        return Usual(median_s, clock_s[0], clock_s[-1], len(clock_s), len(whole_days))
+
+    def _whole_days(self, days: Sequence[int]) -> set[int]:
+        """Returns the local days that have something recorded and are counted from midnight.
+
+        `days` has the local day of each piece.
+        """
+        edges = self.bins.edges.tolist()
         recorded_days, cut_days = set(), set(days[:1] if self._is_first_day_cut() else ())
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
             if length_in(self.gaps, start, stop) < stop - start:
@@ -443,17 +466,17 @@ class BinnedWindow:
         return recorded_days - cut_days
 
     def _is_first_day_cut(self) -> bool:
-        """Returns whether something was recorded in the first local day before the window."""
+        """Returns whether the first local day has something recorded before the window."""
         start = self.window.start
         start_s = start // NS_PER_S
-        midnight_s = start_s - (start_s + local_offset(start_s)) % _DAY_S
-        before = TimeWindow(midnight_s * NS_PER_S, start)
+        before = TimeWindow((start_s - _time_of_day(start_s)) * NS_PER_S, start)
         first, last = shown_span(self.view.snapshot, before)
         unrecorded = length_in([*recording_gaps(self.view, before)], first, last)
-        return last - first - unrecorded > NS_PER_S  # a start that is the memory's own is rounded
+        # The memory's own start was rounded to be asked for: up to a second is not recorded.
+        return last - first - unrecorded > NS_PER_S
 
     def _time_in_pieces(self, spans: Sequence[Span]) -> Ints:
-        """Returns how much time (ns) of half-open spans passed in each piece."""
+        """Returns the time (ns) of half-open spans that passed in each piece, and is counted."""
         starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._counted_bounds)
         lengths = self.bins.lengths(starts, stops)
         for skipped in self.elapsed.skipped:
@@ -462,15 +485,15 @@ class BinnedWindow:
 
     @property
     def _counted_bounds(self) -> Span:
-        """Begin and end (ns) of the part of the window that is counted."""
+        """The begin and the end (ns) of the part of `window` that is counted."""
         start = self.window.start if self._since is None else max(self.window.start, self._since)
         return start, max(start, self.window.stop)
 
     def count_since(self, since: Ns | None, too_many: str = "") -> None:
-        """Leaves out what is before a moment, and notes that it was not counted, if there is one.
+        """Leaves out everything before a log time, with a note; does nothing if it is None.
 
-        To be called before columns are added. `too_many` names what there is too much of to count,
-        where the call's time was not over.
+        To be called before columns are added. The note gives `too_many` as the reason ("more than
+        10,000 episodes"), or else that time ran out.
         """
         if since is None:
             return
@@ -482,13 +505,18 @@ class BinnedWindow:
         )
 
     def answer(self) -> Bins:
-        """Returns the answer, with notes on what could not be read."""
+        """Returns the table of all columns, with notes on what could not be read."""
         start, end = bounds = self._counted_bounds
         recorded = self._time_in_pieces([bounds]) - self._time_in_pieces(self.gaps)
+        recorded_s = (recorded @ self.bins.member).tolist()
+        columns = [
+            _Column("recorded_s", "duration", recorded_s, int(recorded.sum())),
+            *self._columns,
+        ]
         note_unread(self.view, self.asked)
         note_edges(self.view, self.asked)
-        columns = zip((recorded @ self.bins.member).tolist(), *self._values, strict=True)
-        rows = [*zip(self.bins.names, columns, strict=True)]
+        cells = zip(*(column.values for column in columns), strict=True)
+        rows = [*zip(self.bins.names, cells, strict=True)]
         if self._since is not None:
             is_late = self.bins.edges[1:] > self._since
             rows = [*compress(rows, np.any(self.bins.member[is_late], axis=0))]
@@ -500,16 +528,16 @@ class BinnedWindow:
             about=self._topics,
             start=start,
             end=end,
-            columns=(("recorded_s", "duration"), *self._columns),
+            columns=tuple((column.name, column.kind) for column in columns),
             rows=tuple(rows),
-            all=(int(recorded.sum()), *self._all),
+            all=tuple(column.whole for column in columns),
             usual=self.usual,
             usual_exit=self.usual_exit,
             notes=self.view.notes.sentences(),
         )
 
     def _note_empty(self, rows: Sequence[tuple[str, Values]]) -> None:
-        """Notes the bins in which nothing was recorded: several in a row by the first and last."""
+        """Notes in which bins nothing was recorded; a run of such bins by its first and last."""
         spans: list[str] = []
         for has_values, group in groupby(rows, lambda row: any(row[1])):
             first, *later = (name for name, _ in group)

@@ -1,8 +1,8 @@
-"""What numbers a topic held in each bin of a window: how many messages, least, greatest, mean.
+"""The numbers of a topic in each bin of a window: how many messages, least, greatest, mean.
 
-By its columns, newest first, so that what is counted when the time is over is all that is newer
-than a moment. Stored numbers may be off by the error of their column: what they add up to is too,
-and where the least and the greatest lie is settled in the bags that may hold them.
+Columns are read newest first. When time runs out, everything after some moment has been counted.
+A stored number may be off by the error of its column, and so may a sum of them. Which number is
+the least or the greatest is decided exactly, by the bags that may hold it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import sys
 from bisect import bisect_right
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,9 @@ from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
-from ros2_memory.counts.matches import count_values
+from ros2_memory.counts.values import count_values
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import note_no_fix, note_summarised
@@ -37,32 +37,32 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.results import BinColumn, Bins
     from ros2_memory.storage.base import Definition, IntArray
-
-    _Cell: TypeAlias = tuple[float, Ns, float, Ns, float]
 
 
 _LARGEST: Final = sys.float_info.max
 SUM_SCALE: Final = 2.0**-64
-"""What sums are scaled by: those of the largest floats are finite then, and no digit is lost."""
+"""Sums are scaled by this power of two: sums of the largest floats stay finite, and no digit is
+lost."""
 LEAST: Final = 1
 GREATEST: Final = -1
-"""The greatest number is the least one of their negatives."""
+"""Numbers are multiplied by one of these signs, so that the greatest is found as a least one."""
 
 
 class TooManyError(Exception):
-    """More messages than the caller wants would have to be read from bags."""
+    """Bags hold more messages to read than the caller allows."""
 
 
 class Extreme(NamedTuple):
-    """The least (or greatest) number in a part of a piece.
+    """The least (or greatest) number in a part of a piece, as far as columns decide it.
 
     Attributes:
-        low: no number of the part, times the sign, is less.
-        high: one is no greater. Equal to `low` where the number is known.
-        first: log time of the first message that may hold it.
-        last: of the last; equal to `first` where the message is known.
+        low: a lower bound on the number times its sign (`LEAST`, `GREATEST`).
+        high: an upper bound; equal to `low` if the number is known.
+        first: log time of the first message that may hold the number.
+        last: log time of the last such message; equal to `first` if the message is known.
     """
 
     low: float
@@ -72,7 +72,7 @@ class Extreme(NamedTuple):
 
     @classmethod
     def known(cls, number: float, at: Ns) -> Extreme:
-        """Returns a number that is known, times the sign, and so is its message."""
+        """Returns the extreme of a known number (times its sign) at a known log time."""
         return cls(number, number, at, at)
 
     @property
@@ -82,20 +82,20 @@ class Extreme(NamedTuple):
 
     @property
     def middle(self) -> float:
-        """The number, off by no more than its column is."""
+        """The number times its sign, off by at most the error of its column."""
         return (self.low + self.high) / 2
 
 
 class Part(NamedTuple):
-    """The numbers of a field in some messages of one piece.
+    """A summary of the numbers of one field in consecutive messages of one piece.
 
     Attributes:
-        first: log time of the first of the messages.
-        last: of the last.
-        size: how many numbers.
-        total: their sum, times `SUM_SCALE`.
-        least: the least of them.
-        greatest: the greatest, as the least one of their negatives.
+        first: log time of the first message.
+        last: log time of the last message.
+        size: how many numbers there are.
+        total: their sum times `SUM_SCALE`.
+        least: the least number.
+        greatest: the greatest number, negated.
     """
 
     first: Ns
@@ -109,19 +109,27 @@ class Part(NamedTuple):
 _NO_NUMBER: Final = Extreme.known(math.inf, MAX_NS)
 
 
+class _PieceRows(NamedTuple):
+    """The rows of a table, from `start` to before `stop`, that lie in one piece."""
+
+    piece: int
+    start: int
+    stop: int
+
+
 class PieceNumbers:
-    """Collects the numbers of some fields of a topic in pieces of a window.
+    """Summarises the numbers in fields of a topic, for each piece of a window.
 
     Args:
-        view: the call's.
-        topic: its name.
-        fields: dot-paths.
-        edges: where pieces begin (ns), ascending; what is before the first is piece 0.
-        most_read: messages that may be read from bags where columns do not hold a field.
+        view: the view of this call.
+        topic: the name of the topic.
+        fields: dot-paths of the fields.
+        edges: log times (ns), ascending, at which piece 1, 2, ... begin; piece 0 lies before.
+        most_read: how many messages may be read from bags if columns lack a field.
 
     Attributes:
-        since: what is before this log time is not among the parts, for lack of time; or None.
-        failures: of messages that cannot be decoded.
+        since: log time before which nothing was counted because time ran out; else None.
+        failures: one error for each message that cannot be decoded.
     """
 
     def __init__(
@@ -149,11 +157,11 @@ class PieceNumbers:
         self._columns: dict[tuple[Definition, str, str], str | None] = {}
 
     def collect(self, window: TimeWindow) -> None:
-        """Collects the numbers of a window, for as long as there is time.
+        """Summarises the numbers of a window, newest first, until time runs out.
 
         Raises:
             QueryTimeoutError: the call's time runs out before any result.
-            TooManyError: too many messages would have to be read.
+            TooManyError: bags hold more than `most_read` messages to read.
         """
         try:
             for rows in scan(
@@ -170,14 +178,14 @@ class PieceNumbers:
         note_summarised(self._view, self._topic, self._fields, window)
 
     def parts(self, field: int, piece: int) -> Sequence[Part]:
-        """Returns the parts of a piece that hold numbers of a field, in any order."""
+        """Returns the parts of a piece, in any order; `field` is an index into `fields`."""
         return self._parts.get((field, piece), ())
 
     def extreme(self, field: int, pieces: Iterable[int], sign: int) -> tuple[float, Ns] | None:
-        """Returns the least (or greatest) number in some pieces, and when it was first.
+        """Returns the least (or greatest) number in pieces, and the log time of its first message.
 
-        What the columns do not decide is read from bags; if the time for that is over, the number
-        may be off by the error of its column.
+        Bags are read if columns do not decide which number it is. If there is no time left for
+        that, the number may be off by the error of its column. None if there is no number.
         """
         candidates = sorted(
             part.least if sign == LEAST else part.greatest
@@ -193,7 +201,11 @@ class PieceNumbers:
         return (least.low * sign, least.first) if candidates else None
 
     def _add_newer_than(self, at: Ns) -> None:
-        """Adds what no table that is left overlaps; ends the scan where the time is over."""
+        """Adds the pending tables after `at`: no table still to be scanned overlaps them.
+
+        Raises:
+            QueryTimeoutError: time for reading is over, and something has been counted.
+        """
         complete = [rows for rows in self._pending if rows.span[0] > at]
         self._pending = [rows for rows in self._pending if rows.span[0] <= at]
         for rows in complete:
@@ -202,22 +214,26 @@ class PieceNumbers:
         if self._reading.expired() and self._parts:
             raise QueryTimeoutError("the rest is left out")
 
-    def _add_totals(self, rows: Rows, since: Ns) -> bool:
-        """Adds the numbers of a part, if all are of one piece and its outline tells them."""
+    def _add(self, rows: Rows, since: Ns) -> None:
+        """Adds the numbers in a table's messages from log time `since` on."""
         piece = bisect_right(self._edges, rows.first)
-        is_cut = piece != bisect_right(self._edges, rows.last)
-        if rows.index is not None or is_cut or rows.first < since:
-            return False
-        outlines = [self._outlined(rows, field) for field in range(len(self._fields))]
-        stated = [part for part in outlines if part is not None]
-        if len(stated) < len(outlines):
-            return False
-        for field, part in enumerate(stated):
-            self._parts[field, piece].append(part)
-        return True
+        is_in_piece = rows.first >= since and piece == bisect_right(self._edges, rows.last)
+        if rows.index is None and is_in_piece:
+            outlines = [self._outlined(rows, field) for field in range(len(self._fields))]
+            parts = [part for part in outlines if part is not None]
+            if len(parts) == len(outlines):
+                for field, part in enumerate(parts):
+                    self._parts[field, piece].append(part)
+                return
+        stored = of_columns(self._view, rows, self._numbers_of_fields)
+        if stored is None:
+            self._add_from_messages(rows, since)
+            return
+        for stored_rows, numbers_of_fields in stored:
+            self._add_to_pieces(stored_rows, numbers_of_fields, since)
 
     def _outlined(self, rows: Rows, field: int) -> Part | None:
-        """Returns the numbers of a field by the outline of a table; None where it has none."""
+        """Returns the numbers of a field as the table's outline has them; None without one."""
         table = rows.table
         if not isinstance(table, StoredTable) or table.definition is None:
             return None
@@ -235,96 +251,94 @@ class PieceNumbers:
         greatest = Extreme(-zone.high, -zone.high, *totals.greatest)
         return Part(rows.first, rows.last, totals.size, totals.total * SUM_SCALE, least, greatest)
 
-    def _add(self, rows: Rows, since: Ns) -> None:
-        """Adds the numbers of a table from a log time on."""
-        if self._add_totals(rows, since):
-            return
-        stored = of_columns(self._view, rows, self._numbers_of_fields)
-        if stored is None:
-            self._add_from_messages(rows, since)
-        for part_of_rows, numbers_of_fields in stored or ():
-            self._add_to_pieces(part_of_rows, numbers_of_fields, self._pieces(part_of_rows, since))
-
     def _numbers_of_fields(self, rows: Rows) -> tuple[Rows, list[FieldNumbers]] | None:
-        """Returns rows with the numbers of all fields in them; None where columns lack some."""
+        """Returns the rows with the numbers of every field; None if columns lack a field."""
         numbers_of_fields = []
         for field in range(len(self._fields)):
-            numbers_of_field = self._numbers(rows, field)
-            if numbers_of_field is None:
+            field_numbers = self._numbers(rows, field)
+            if field_numbers is None:
                 return None
-            numbers_of_fields.append(numbers_of_field)
+            numbers_of_fields.append(field_numbers)
         return rows, numbers_of_fields
 
     def _numbers(self, rows: Rows, field: int) -> FieldNumbers | None:
-        """Returns the numbers of the rows that count, by their positions among these."""
+        """Returns the numbers of a field; their `rows` count the rows that are not left out."""
         stored = numbers(rows.table, self._fields[field], self._view.extractor)
         if stored is None or rows.index is None:
             return stored
-        counting = _some(stored, np.flatnonzero(rows.mask()[stored.rows]))
+        counting = _numbers_at(stored, np.flatnonzero(rows.mask()[stored.rows]))
         return counting._replace(rows=np.searchsorted(rows.index, counting.rows))
 
     def _add_to_pieces(
-        self,
-        rows: Rows,
-        numbers_of_fields: Sequence[FieldNumbers],
-        pieces: Iterable[tuple[int, int, int]],
+        self, rows: Rows, numbers_of_fields: Sequence[FieldNumbers], since: Ns
     ) -> None:
-        """Adds the numbers of each field in some rows to pieces, which are as `_pieces` yields."""
+        """Adds the numbers of each field in the rows from log time `since` on."""
         outlines = [
             self._outlined(rows, field) if rows.index is None else None
             for field in range(len(numbers_of_fields))
         ]
-        for piece, start, stop in pieces:
+        for piece, start, stop in self._pieces(rows, since):
             is_whole = stop - start == len(rows)
             first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()
-            for field, (numbers_of_field, outline) in enumerate(
-                zip(numbers_of_fields, outlines, strict=True)
-            ):
-                begin, end = np.searchsorted(numbers_of_field.rows, [start, stop]).tolist()
+            for field, field_numbers in enumerate(numbers_of_fields):
+                begin, end = np.searchsorted(field_numbers.rows, [start, stop]).tolist()
                 if begin < end:
-                    some = _some(numbers_of_field, np.arange(begin, end))
-                    part = _part_of(rows, some, (first, last), outline)
+                    piece_numbers = _numbers_at(field_numbers, np.arange(begin, end))
+                    part = _part_of(rows, piece_numbers, first, last, outlines[field])
                     self._parts[field, piece].append(part)
 
-    def _pieces(self, rows: Rows, since: Ns) -> Iterator[tuple[int, int, int]]:
-        """Yields the number of each piece of some rows, with its first row and the one after it."""
+    def _pieces(self, rows: Rows, since: Ns) -> Iterator[_PieceRows]:
+        """Yields the pieces that rows from log time `since` on lie in."""
         first, last = rows.span
         begin, end = (bisect_right(self._edges, at) for at in (first, last))
         if begin == end and since <= first:
-            yield begin, 0, len(rows)
+            yield _PieceRows(begin, 0, len(rows))
             return
         edges = np.append(since, self._edges[begin:end])
         least, *bounds = np.searchsorted(rows.times, edges).tolist()
         starts, stops = [0, *bounds], [*bounds, len(rows)]
         for piece, (start, stop) in enumerate(zip(starts, stops, strict=True), begin):
             if max(start, least) < stop:
-                yield piece, max(start, least), stop
+                yield _PieceRows(piece, max(start, least), stop)
 
     def _add_from_messages(self, rows: Rows, since: Ns) -> None:
-        """Does as `_add`, by the messages: columns do not hold all fields."""
+        """Adds the numbers by decoding the messages, since columns lack a field.
+
+        Raises:
+            TooManyError: bags hold more than `most_read` messages to read.
+        """
         self._read += len(rows)
         if self._most_read is not None and self._read > self._most_read:
             raise TooManyError
         for bag, positions in rows.bag_rows():
-            decoded_times: list[Ns] = []
-            samples: list[list[list[float]]] = [[] for _ in self._fields]
-            for stored in messages_of(self._view, rows.some(positions)):
-                message = self._view.bags.decode(stored, self.failures)
-                if message is None:
-                    continue
-                decoded_times.append(stored.time)
-                for field, of_field in zip(self._fields, samples, strict=True):
-                    value = self._view.extractor.exact_at(message, stored.type, field)
-                    of_field.append([*numbers_in(value)])
-            if decoded_times:
-                times = np.array(decoded_times, np.int64)
+            messages = messages_of(self._view, rows.some(positions))
+            times, numbers_of_fields = self._decoded_numbers(messages)
+            if times.size:
                 table = Table(rows.table.channel, times, times, times)
-                read = Rows(BagUnit(bag, table, 0), lambda: None)
-                numbers_of_fields = [*map(_numbers_of_samples, samples)]
-                self._add_to_pieces(read, numbers_of_fields, self._pieces(read, since))
+                decoded = Rows(BagUnit(bag, table, 0), lambda: None)
+                self._add_to_pieces(decoded, numbers_of_fields, since)
+
+    def _decoded_numbers(
+        self, messages: Iterable[StoredMessage]
+    ) -> tuple[IntArray, list[FieldNumbers]]:
+        """Returns the log times of decodable messages, and the numbers of each field in them."""
+        times: list[Ns] = []
+        samples: list[list[list[float]]] = [[] for _ in self._fields]
+        for stored in messages:
+            message = self._view.bags.decode(stored, self.failures)
+            if message is None:
+                continue
+            times.append(stored.time)
+            for field, field_samples in zip(self._fields, samples, strict=True):
+                value = self._view.extractor.exact_at(message, stored.type, field)
+                field_samples.append([*numbers_in(value)])
+        return np.array(times, np.int64), [*map(_numbers_of_samples, samples)]
 
     def _exact_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme:
-        """Returns an extreme with its number and message known; by the bags where it is open."""
+        """Returns the extreme with its number and message known, from bags if columns cannot say.
+
+        A note says if time runs out; then the number is the middle of its bounds.
+        """
         if extreme.is_settled:
             return extreme
         key = (field, sign, extreme)
@@ -341,11 +355,15 @@ class PieceNumbers:
         return self._exact_extremes[key]
 
     def _extreme_in_bags(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
-        """Returns an extreme by the bags that may hold it; None where these cannot be read."""
+        """Returns the exact extreme from the bags that may hold it; None if none can be read.
+
+        Raises:
+            QueryTimeoutError: time for reading is over.
+        """
         least, undecided = self._least_in_columns(field, sign, extreme)
-        is_number_known = extreme.low == extreme.high and least.first == MAX_NS
-        if is_number_known and len(undecided) == 1 == len(undecided[0]):
-            # Of all messages only this one can have the number.
+        is_number_known = extreme.low == extreme.high and least == _NO_NUMBER
+        if is_number_known and len(undecided) == 1 and len(undecided[0]) == 1:
+            # No other message can have the number.
             return Extreme.known(extreme.low, int(undecided[0].times[0]))
         for rows in sorted(undecided, key=lambda rows: int(rows.times[0])):
             if least.low <= extreme.low and least.first <= int(rows.times[0]):
@@ -353,76 +371,81 @@ class PieceNumbers:
             if self._reading.expired():
                 raise QueryTimeoutError("the rest is left out")
             for _, decoded in decoded_rows(self._view, rows):
-                found = self._numbers(decoded, field)
-                if found is not None:
-                    least = min(least, _least(decoded, found, sign))
+                field_numbers = self._numbers(decoded, field)
+                if field_numbers is not None:
+                    least = min(least, _exact_least(decoded, field_numbers, sign))
         return None if least == _NO_NUMBER else least
 
     def _least_in_columns(
         self, field: int, sign: int, extreme: Extreme
     ) -> tuple[Extreme, list[Rows]]:
-        """Returns an extreme as far as columns have exact numbers, and rows that bags decide."""
+        """Returns the least exact number of the columns, and the rows that only bags can decide."""
         least = _NO_NUMBER
         undecided: list[Rows] = []
         for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):
-            found, may_hold = self._numbers(rows, field), np.arange(len(rows))
-            if found is not None:
-                if not found.error or found.exactly is not None:
-                    least = min(least, _least(rows, found, sign))
+            field_numbers, candidates = self._numbers(rows, field), np.arange(len(rows))
+            if field_numbers is not None:
+                if not field_numbers.error or field_numbers.exactly is not None:
+                    least = min(least, _exact_least(rows, field_numbers, sign))
                     continue
-                lows, _ = _bounds(found, sign)
-                may_hold = found.rows[lows <= extreme.high]
-            for _, of_bag in rows.bag_rows():
-                positions = np.intersect1d(of_bag, may_hold)
+                lows, _ = _bounds(field_numbers, sign)
+                candidates = field_numbers.rows[lows <= extreme.high]
+            for _, bag_positions in rows.bag_rows():
+                positions = np.intersect1d(bag_positions, candidates)
                 if positions.size:
                     undecided.append(rows.some(positions))
         return least, undecided
 
 
-def _some(of_field: FieldNumbers, kept: IntArray) -> FieldNumbers:
-    """Returns some of the numbers of a field, in their order."""
-    exactly = of_field.exactly
-    return of_field._replace(
-        rows=of_field.rows[kept],
-        numbers=of_field.numbers[kept],
-        errors=None if of_field.errors is None else of_field.errors[kept],
-        exactly=None if exactly is None else lambda among: exactly(kept[among]),
+def _numbers_at(field_numbers: FieldNumbers, positions: IntArray) -> FieldNumbers:
+    """Returns the numbers at ascending positions."""
+    errors, exactly = field_numbers.errors, field_numbers.exactly
+    return field_numbers._replace(
+        rows=field_numbers.rows[positions],
+        numbers=field_numbers.numbers[positions],
+        errors=None if errors is None else errors[positions],
+        exactly=None if exactly is None else lambda among: exactly(positions[among]),
     )
 
 
-def _bounds(of_field: FieldNumbers, sign: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the least and the greatest that each number, times the sign, may be."""
-    signed = sign * of_field.numbers.astype(np.float64)
-    off = of_field.error if of_field.errors is None else of_field.errors
-    return signed - off, signed + off
+def _bounds(
+    field_numbers: FieldNumbers, sign: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns a lower and an upper bound on each number times the sign."""
+    signed = sign * field_numbers.numbers.astype(np.float64)
+    errors = field_numbers.error if field_numbers.errors is None else field_numbers.errors
+    return signed - errors, signed + errors
 
 
-def _extreme_of_column(rows: Rows, of_field: FieldNumbers, sign: int) -> Extreme:
-    """Returns the extreme of numbers, as the column decides it."""
-    if not of_field.error or of_field.exactly is not None:
-        return _least(rows, of_field, sign)
-    lows, highs = _bounds(of_field, sign)
+def _column_extreme(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extreme:
+    """Returns the extreme, as closely as the column decides it."""
+    if not field_numbers.error or field_numbers.exactly is not None:
+        return _exact_least(rows, field_numbers, sign)
+    lows, highs = _bounds(field_numbers, sign)
     low, high = float(lows.min()), float(highs.min())
-    candidates = np.flatnonzero(lows <= high)[[0, -1]]
-    return Extreme(low, high, *rows.times[of_field.rows[candidates]].tolist())
+    first_and_last = np.flatnonzero(lows <= high)[[0, -1]]
+    return Extreme(low, high, *rows.times[field_numbers.rows[first_and_last]].tolist())
 
 
-def _part_of(rows: Rows, of_field: FieldNumbers, span: Span, outline: Part | None) -> Part:
-    """Returns numbers of a field, in messages of a span (ns, inclusive), as a part."""
-    first, last = span
-    total = float((of_field.numbers * SUM_SCALE).sum())
-    extremes = [_extreme_of_column(rows, of_field, sign) for sign in (LEAST, GREATEST)]
+def _part_of(
+    rows: Rows, field_numbers: FieldNumbers, first: Ns, last: Ns, outline: Part | None
+) -> Part:
+    """Returns the summary of numbers in messages from `first` to `last` (inclusive).
+
+    `outline` summarises the whole table. Its extremes are exact, so they are used if they lie here.
+    """
+    least, greatest = (_column_extreme(rows, field_numbers, sign) for sign in (LEAST, GREATEST))
     if outline is not None:
-        # Those of the whole table are exact, where they lie here.
-        extremes = [
-            stated if first <= stated.first <= stated.last <= last else computed
-            for computed, stated in zip(extremes, (outline.least, outline.greatest), strict=True)
-        ]
-    return Part(first, last, of_field.rows.size, total, *extremes)
+        if first <= outline.least.first <= outline.least.last <= last:
+            least = outline.least
+        if first <= outline.greatest.first <= outline.greatest.last <= last:
+            greatest = outline.greatest
+    total = float((field_numbers.numbers * SUM_SCALE).sum())
+    return Part(first, last, field_numbers.rows.size, total, least, greatest)
 
 
 def _numbers_of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
-    """Returns the numbers of one field, of which each message has some."""
+    """Returns the numbers of one field; each sample has the numbers of one message."""
     values = np.array([number for sample in samples for number in sample])
     if values.dtype.kind not in "iu":
         values = values.astype(np.float64)
@@ -430,7 +453,7 @@ def _numbers_of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
 
 
 def numbers_in(value: JsonValue) -> Iterator[float]:
-    """Yields the numbers of a field; not those of a summary in place of an array."""
+    """Yields the finite numbers in a field's value: no booleans, and no sizes of a summary."""
     for leaf in leaves(value):
         if isinstance(leaf, bool) or not isinstance(leaf, int | float):
             continue
@@ -438,29 +461,38 @@ def numbers_in(value: JsonValue) -> Iterator[float]:
             yield leaf
 
 
-def _least(rows: Rows, of_field: FieldNumbers, sign: int) -> Extreme:
-    """Returns the least exact number."""
-    positions, values = np.arange(of_field.rows.size), of_field.numbers
+def _exact_least(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extreme:
+    """Returns the least number times the sign, and the first message that has it.
+
+    Numbers that are stored rounded are read exactly if they may be the least.
+    """
+    positions, values = np.arange(field_numbers.rows.size), field_numbers.numbers
     if not positions.size:
         return _NO_NUMBER
-    if of_field.error and of_field.exactly is not None:
-        lows, highs = _bounds(of_field, sign)
+    if field_numbers.error and field_numbers.exactly is not None:
+        lows, highs = _bounds(field_numbers, sign)
         positions = np.flatnonzero(lows <= highs.min())
-        values = of_field.exactly(positions)
+        values = field_numbers.exactly(positions)
     nth = int(values.argmin() if sign == LEAST else values.argmax())
-    return Extreme.known(sign * values[nth].item(), int(rows.times[of_field.rows[positions[nth]]]))
+    row = field_numbers.rows[positions[nth]]
+    return Extreme.known(sign * values[nth].item(), int(rows.times[row]))
 
 
-_CELL: Final[tuple[tuple[str, BinColumn], ...]] = (
-    ("min", "number"),
-    ("min_at", "time"),
-    ("max", "number"),
-    ("max_at", "time"),
-    ("mean", "number"),
-)
-"""The columns of a field."""
+class _FieldCell(NamedTuple):
+    """The numbers of a field in a bin: its columns in the reply. Times are log times (ns)."""
+
+    min: float
+    min_at: Ns
+    max: float
+    max_at: Ns
+    mean: float
+
+
+_CELL_KINDS: Final[tuple[BinColumn, ...]] = ("number", "time", "number", "time", "number")
+"""The kinds of the columns of `_FieldCell`."""
 _MEAN_DIGITS: Final = 12
-"""What rounding of sums cannot change, however a window is cut into bags."""
+"""So many digits do not depend on how a window is cut into bags: rounding of sums does not reach
+them."""
 
 
 def count_range(
@@ -472,9 +504,9 @@ def count_range(
     *,
     fields: Sequence[str],
 ) -> Bins:
-    """Returns how many messages of a topic each bin holds, and the numbers of fields in them.
+    """Returns how many messages of a topic each bin has, and the numbers of fields in them.
 
-    By value how often and how long it held each (`count_values`).
+    With `by` "value", returns how often and how long the topic held each value (`count_values`).
 
     Raises:
         InvalidArgumentsError: there are too many bins, or too many fields for them.
@@ -502,23 +534,23 @@ def count_range(
     binned.add_sums("count", "count", counts)
     binned.add_first("first", first[counts > 0])
     binned.add_last(last, int(last.max()))
-    for field, cells in zip(names, cells_of_fields, strict=True):
-        if cells[-1] is None:
+    for field, (cells, window_cell) in zip(names, cells_of_fields, strict=True):
+        if window_cell is None:
             _require_field(view, name, field, binned.counted.stop)
             view.notes.add(f"{field} holds no number in the window")
             continue
-        for nth, (column, kind) in enumerate(_CELL):
-            *of_bins, of_window = [None if cell is None else cell[nth] for cell in cells]
-            binned.add(f"{field}.{column}", kind, of_bins, of_window)
+        for nth, (column, kind) in enumerate(zip(_FieldCell._fields, _CELL_KINDS, strict=True)):
+            values = [None if cell is None else cell[nth] for cell in cells]
+            binned.add(f"{field}.{column}", kind, values, window_cell[nth])
     note_robots(view, name, binned.counted)
     return binned.answer()
 
 
 def _require_field(view: View, topic: str, field: str, until: Ns) -> None:
-    """Checks that messages of a topic have a field, by the newest one before a moment.
+    """Checks that the newest message of a topic before a log time has a field.
 
     Raises:
-        InvalidArgumentsError: it has none.
+        InvalidArgumentsError: the message lacks the field.
     """
     newest = view.stream.last(topic, until)
     message = None if newest is None else view.bags.decode(newest)
@@ -528,8 +560,8 @@ def _require_field(view: View, topic: str, field: str, until: Ns) -> None:
 
 def _cells_of_fields(
     view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]
-) -> list[Sequence[_Cell | None]]:
-    """Returns for each field the cell of each bin, and last that of all of them together."""
+) -> list[tuple[list[_FieldCell | None], _FieldCell | None]]:
+    """Returns the cells of each field: one for every bin, and one for the whole window."""
     collected = PieceNumbers(view, topic, fields, binned.bins.edges[1:-1])
     collected.collect(binned.counted)
     binned.count_since(collected.since)
@@ -537,15 +569,18 @@ def _cells_of_fields(
         reason = collected.failures[0].reason
         view.notes.add_lack(f"messages left out, since they cannot be decoded: {reason}")
     pieces_of_bins = [np.flatnonzero(member).tolist() for member in binned.bins.member.T]
-    pieces_of_bins.append([*range(len(binned.bins.member))])
+    all_pieces = range(len(binned.bins.member))
     return [
-        [_cell(collected, field, pieces) for pieces in pieces_of_bins]
+        (
+            [_cell(collected, field, pieces) for pieces in pieces_of_bins],
+            _cell(collected, field, all_pieces),
+        )
         for field in range(len(fields))
     ]
 
 
-def _cell(collected: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | None:
-    """Returns the numbers of a field in some pieces; None if there are none."""
+def _cell(collected: PieceNumbers, field: int, pieces: Sequence[int]) -> _FieldCell | None:
+    """Returns the numbers of a field in pieces together; None if there are none."""
     parts = [part for piece in pieces for part in collected.parts(field, piece)]
     least = collected.extreme(field, pieces, LEAST)
     greatest = collected.extreme(field, pieces, GREATEST)
@@ -554,6 +589,7 @@ def _cell(collected: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell |
     (least_number, least_at), (greatest_number, greatest_at) = least, greatest
     total = math.fsum(part.total for part in parts)
     mean = float(f"{total / sum(part.size for part in parts) / SUM_SCALE:.{_MEAN_DIGITS}g}")
-    # The extremes are exact; what columns add up to is not. Plus 0: no reply says -0.0.
-    mean = min(max(mean, least_number), greatest_number) + 0.0
-    return least_number + 0, least_at, greatest_number + 0, greatest_at, mean
+    # A sum of rounded numbers may put the mean beside the exact extremes.
+    mean = min(max(mean, least_number), greatest_number)
+    # Plus 0 makes -0.0 positive, which replies show as 0.
+    return _FieldCell(least_number + 0, least_at, greatest_number + 0, greatest_at, mean + 0.0)

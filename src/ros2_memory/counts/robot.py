@@ -1,7 +1,7 @@
-"""How far the robot drove, and how often and long it was in places, in each bin of a window.
+"""How far the robot drove, and how often and how long it was in places, in each bin of a window.
 
-The metres between two log times are those of the drawn path, whose corners have times and the
-metres driven up to them: the metres of all bins add up to those of the window.
+Metres come from the drawn path: each of its vertices has a log time and the metres driven so far.
+So the metres of all bins add up to the metres of the window.
 """
 
 from __future__ import annotations
@@ -52,9 +52,10 @@ def count_path(
     topic: str | None = None,
     where: JsonValue = None,
 ) -> Bins:
-    """Returns how many metres were driven in each bin of a window; with `where` in that place.
+    """Returns how many metres the robot drove in each bin of a window, or only inside of `where`.
 
-    `by` place, the places of `where` have the rows, and what was driven elsewhere counts there.
+    With `by` "place" the places of `where` are the bins instead, and what was driven elsewhere is
+    counted, too.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position, there are too many
@@ -79,7 +80,7 @@ def count_path(
         metres_before = _metres_before(path.line, inside, edges)
     else:
         metres_before = path.line.metres_at(edges) if len(path.line) else np.zeros(len(edges))
-    # Sums of floats differ by less than a micrometre where nothing was driven.
+    # Rounded to a micrometre: differences of sums may be off from 0 by less.
     metres = np.diff([0.0, *metres_before.tolist(), total_m]).round(6)
     binned.add("metres", "metres", (metres @ binned.bins.member).tolist(), total_m)
     require_one_robot(view, name, asked)
@@ -87,7 +88,7 @@ def count_path(
 
 
 def _metres_before(line: Line, inside: Sequence[Stay], edges: Ints) -> NDArray[np.float64]:
-    """Returns how many metres were driven in some times before each edge."""
+    """Returns how many metres were driven during the stays before each edge (ns)."""
     metres = np.zeros(len(edges))
     for stay in inside:
         bounds = np.append(edges.clip(stay.start, stay.stop), stay.start)
@@ -109,11 +110,11 @@ def count_visits(
     start_s: float | None = None,
     end_s: float | None = None,
 ) -> Bins:
-    """Returns entries, exits and minutes in a place for each bin; of no place, of all named ones.
+    """Returns entries, exits and minutes in a place for each bin; without a place, in all named.
 
-    `by` place each of the places of `where` has a row. Of several places any counts otherwise.
-
-    `placed_s` is for how long it was known where the robot was, `unknown_s` for how long not.
+    The place is a circle around `x` and `y` (m), or `where`; being in any of several places counts.
+    With `by` "place" each of them is a bin. Column `placed_s` is how long it was known where the
+    robot was, `unknown_s` how long it was not.
 
     Raises:
         InvalidArgumentsError: the place is invalid, the frame is another one, there are too many
@@ -138,45 +139,47 @@ def count_visits(
     if place is not None:
         place = replace(place, frame_id=asked_frame)
     binned = BinnedWindow(view, asked, by, (topic,), place)
-    # All that asks about this window shares its track, and what there was time to know of it.
+    # `count_since` narrows what is counted. The call remembers the track of this wider window.
     window = binned.counted
-    joined = known_track(view, placement.frame_id, window)
-    binned.count_since(joined.since)
-    placed_spans = placed_times(joined.track, mixed_spans)
+    known = known_track(view, placement.frame_id, window)
+    binned.count_since(known.since)
+    placed_spans = placed_times(known.track, mixed_spans)
     binned.add_lengths("placed_s", "duration", placed_spans)
     unknown = unknown_times(view, binned.counted, placed_spans, WHEREABOUTS, mixed=mixed_spans)
     binned.add_unknown(unknown)
     if place is not None and by != "place":
-        stayed = _stays(view, placement.frame_id, place.region, window)
-        if not stayed and asked_frame is None:
+        stays = _stays(view, placement.frame_id, place.region, window)
+        if not stays and asked_frame is None:
             ask = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, ask)
-        _add_visits(binned, stayed)
+        _add_visits(binned, stays)
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)
-    places = places_in(view, named, placement, window)
-    stays_of_places = [_stays(view, place.frame_id, place.region, window) for place, _ in places]
+    stays_of_places = [
+        (place, _stays(view, place.frame_id, place.region, window))
+        for place, _ in places_in(view, named, placement, window)
+    ]
     if by == "place":
-        _add_visits_by_place(binned, stays_of_places)
+        _add_visits_by_place(binned, [stays for _, stays in stays_of_places])
         return binned.answer()
-    if len(places) * len(binned.bins.names) > MOST_CELLS:
+    if len(stays_of_places) * len(binned.bins.names) > MOST_CELLS:
         raise InvalidArgumentsError(
-            f"{len(places)} places by {by} in {len(binned.bins.names)} bins are too many for one "
-            "reply: name one in where, or ask about a shorter window"
+            f"{len(stays_of_places)} places by {by} in {len(binned.bins.names)} bins are too many "
+            "for one reply: name one in where, or ask about a shorter window"
         )
-    for (named_place, _), stays in zip(places, stays_of_places, strict=True):
+    for named_place, stays in stays_of_places:
         binned.add_counts(f"{named_place.name}.entries", _entry_times(stays))
         binned.add_lengths(f"{named_place.name}.minutes", "minutes", _stay_spans(stays))
     return binned.answer()
 
 
 def _stays(view: View, frame_id: str, region: Region, window: TimeWindow) -> list[Stay]:
-    """Returns when robots were in a region, as `visits` counts them, in order."""
+    """Returns when robots were in a region, in order, as the tool `visits` counts them."""
     return sorted(visit.inside for visit in ConfirmedStays(view, frame_id, region, window).every)
 
 
 def _add_visits(binned: BinnedWindow, stays: Sequence[Stay]) -> None:
-    """Adds the visits to one place."""
+    """Adds the columns of visits to one place."""
     entries = _entry_times(stays)
     exits = np.array([stay.stop for stay in stays if stay.left], np.int64)
     binned.add_counts("entries", entries)
@@ -189,15 +192,14 @@ def _add_visits(binned: BinnedWindow, stays: Sequence[Stay]) -> None:
 
 
 def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequence[Stay]]) -> None:
-    """Adds the visits to each named place in the bin of that place."""
-    rest: list[None] = [None] * (len(binned.bins.names) - len(stays_of_places))
-    entries = [sum(stay.entered for stay in stays) for stays in stays_of_places]
-    exits = [sum(stay.left for stay in stays) for stays in stays_of_places]
-    between = binned.elapsed.between
-    lengths = [sum(between(stay.start, stay.stop) for stay in stays) for stays in stays_of_places]
-    binned.add("entries", "count", [*entries, *rest], sum(entries))
-    binned.add("exits", "count", [*exits, *rest], sum(exits))
-    binned.add("minutes", "minutes", [*lengths, *rest], sum(lengths))
+    """Adds the columns of visits for bins of places; there are no visits to "(elsewhere)"."""
+    entries = [len(_entry_times(stays)) for stays in stays_of_places]
+    exits = [len([stay for stay in stays if stay.left]) for stays in stays_of_places]
+    lengths = [binned.elapsed.among(_stay_spans(stays)) for stays in stays_of_places]
+    no_visits: list[None] = [None] * (len(binned.bins.names) - len(stays_of_places))
+    binned.add("entries", "count", [*entries, *no_visits], sum(entries))
+    binned.add("exits", "count", [*exits, *no_visits], sum(exits))
+    binned.add("minutes", "minutes", [*lengths, *no_visits], sum(lengths))
 
 
 def _entry_times(stays: Sequence[Stay]) -> Ints:

@@ -1,0 +1,291 @@
+"""How often and how long each label of detections was in view, and how many were seen at once.
+
+A thing is in view as in a recap: a detector may miss it for `FLICKER_NS`, and it is gone after
+`SILENCE_NS` without a message. Only detections that lie in the scope of the question, and that
+have its least score, count.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter, defaultdict
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.conditions import Condition, Contains, Equals
+from ros2_memory.analysis.intervals import (
+    IntervalPart,
+    IntervalTable,
+    VisibleInterval,
+    joined,
+    united,
+    visible_in,
+)
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.spans import united as united_spans
+from ros2_memory.core.text import listed, named
+from ros2_memory.counts.bins import HELD_COLUMNS
+from ros2_memory.history.clock_steps import elapsed_in
+from ros2_memory.history.context import READING_S
+from ros2_memory.history.coverage import note_edges, note_unread, seconds, shown_span, unix_text
+from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
+from ros2_memory.history.no_data import matching_topics
+from ros2_memory.history.robots import note_robots_on
+from ros2_memory.history.scan import blocks, in_time, scan
+from ros2_memory.results import Bins
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.view import View
+    from ros2_memory.places.where import Scope
+    from ros2_memory.results import BinColumn
+
+BY_LABEL: Final = "label"
+_MOST_LABELS: Final = 60
+_TEXT: Final = "std_msgs/msg/String"
+_COLUMNS: Final[tuple[tuple[str, BinColumn], ...]] = (
+    *HELD_COLUMNS,
+    ("best_score", "number"),
+    ("most_at_once", "count"),
+)
+
+
+class SeenLabels(NamedTuple):
+    """When labels were in view, and how many of them were seen at once.
+
+    Attributes:
+        visible: the intervals in which each label was in view.
+        most_at_once: for each label, the most detections of it in one message.
+        most_of_all: the most detections of all these labels in one message.
+        since: log time after which everything was read, if time ran out; else None.
+    """
+
+    visible: IntervalTable
+    most_at_once: Counter[str]
+    most_of_all: int
+    since: Ns | None
+
+
+class _TopicBlock(NamedTuple):
+    """Consecutive messages of a detector's topic; no other block of the topic overlaps them."""
+
+    topic: str
+    detected: Detected
+
+
+class _SeenBlock(NamedTuple):
+    """What was in view in a block. See `SeenLabels`; `source` names its topic and window."""
+
+    source: str
+    visible: IntervalPart
+    most_at_once: Counter[str]
+    most_of_all: int
+
+
+class _LabelRow(NamedTuple):
+    """The values of `_COLUMNS` for one label."""
+
+    occurrences: int
+    length: Ns
+    first: Ns | None
+    last: Ns | None
+    best_score: float | None
+    most_at_once: int
+
+
+def count_labels(
+    view: View,
+    topic: str,
+    condition: Condition,
+    scope: Scope,
+    *,
+    any_label: bool,
+    asked: TimeWindow,
+) -> Bins:
+    """Returns a row for each label that meets a condition, those seen most often first.
+
+    Args:
+        view: the view of this call.
+        topic: the topic of a detector, or a glob.
+        condition: the test for labels, and the least score of a detection.
+        scope: the times and places in which detections count.
+        any_label: whether every label counts, whatever the test says.
+        asked: the window that the client asked for; notes say what of it is not recorded.
+
+    Raises:
+        InvalidArgumentsError: the condition is not on texts, or names a field.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    test = condition.test
+    if not isinstance(test, Contains | Equals) or condition.field is not None:
+        raise InvalidArgumentsError(
+            "by label takes labels of detections: give condition_type contains or equals, the "
+            'label as value ("" for all), and no field'
+        )
+    topics = matching_topics(view, topic)
+    seen = read_labels(
+        view, topics, scope, condition, lambda label: any_label or test.passes(label)
+    )
+    if seen.since is not None:
+        view.notes.add_lack(
+            f"not all before {unix_text(seen.since)} is counted: "
+            f"{view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
+        )
+    window = scope.window if seen.since is None else replace(scope.window, start=seen.since)
+    elapsed = elapsed_in(view, window)
+    rows = _label_rows(seen, elapsed)
+    note_robots_on(view, topics, window)
+    note_unread(view, asked, nothing=not rows, search=True)
+    note_edges(view, asked)
+    if unknown := elapsed.among(scope.unknown):
+        view.notes.add(
+            f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "
+            "or without messages of the other topic"
+        )
+    texts = [topic for topic in topics if view.timeline.types_of(topic) == (_TEXT,)]
+    if texts and not rows:
+        view.notes.add(
+            f"{listed(texts)} has texts: by label counts those that are JSON, an object with a "
+            "label or a list of such, alone or in an object, and nothing deeper; leave by out to "
+            "search texts"
+        )
+    if len(rows) > _MOST_LABELS:
+        view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
+    start, end = shown_span(view.snapshot, asked)
+    return Bins(
+        by=BY_LABEL,
+        about=tuple(topics),
+        start=min(max(start, seen.since or start), asked.asked()[1]),
+        end=max(end, asked.asked()[0]),
+        columns=_COLUMNS,
+        rows=tuple(rows[:_MOST_LABELS]),
+        all=_row(seen.visible.intervals(), elapsed, seen.most_of_all),
+        notes=view.notes.sentences(),
+    )
+
+
+def _label_rows(seen: SeenLabels, elapsed: Elapsed) -> list[tuple[str, _LabelRow]]:
+    """Returns each label with its row, those seen most often first."""
+    intervals_of: defaultdict[str, list[VisibleInterval]] = defaultdict(list)
+    for interval in seen.visible.intervals():
+        intervals_of[interval.label].append(interval)
+    rows = [
+        (named(label), _row(intervals, elapsed, seen.most_at_once[label]))
+        for label, intervals in intervals_of.items()
+    ]
+    return sorted(rows, key=lambda named_row: (-named_row[1].occurrences, named_row[0]))
+
+
+def _row(intervals: Sequence[VisibleInterval], elapsed: Elapsed, most_at_once: int) -> _LabelRow:
+    """Returns the row of intervals. Time in which several overlap counts once."""
+    spans = united_spans((interval.first, interval.last) for interval in intervals)
+    scores = [interval.best for interval in intervals if interval.best is not None]
+    return _LabelRow(
+        len(intervals),
+        elapsed.among(spans),
+        spans[0][0] if spans else None,
+        spans[-1][1] if spans else None,
+        max(scores, default=None),
+        most_at_once,
+    )
+
+
+def read_labels(
+    view: View,
+    topics: Sequence[str],
+    scope: Scope,
+    condition: Condition,
+    is_wanted: Callable[[str], bool],
+) -> SeenLabels:
+    """Returns when the wanted labels were in view in a scope.
+
+    Detections below the least score of the condition do not count.
+
+    Raises:
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    least_score = condition.least_score if condition.min_score > 0 else -math.inf
+    newest_first = _seen_blocks(view, topics, scope, least_score, is_wanted)
+    seen_blocks, since = in_time(view, newest_first, READING_S)
+    parts: defaultdict[str, list[IntervalPart]] = defaultdict(list)
+    most_at_once = Counter[str]()
+    for block in seen_blocks:
+        parts[block.source].append(block.visible)
+        most_at_once |= block.most_at_once
+    return SeenLabels(
+        united([joined(newest_first[::-1]).visible for newest_first in parts.values()]),
+        most_at_once,
+        max((block.most_of_all for block in seen_blocks), default=0),
+        since,
+    )
+
+
+def _seen_blocks(
+    view: View,
+    topics: Sequence[str],
+    scope: Scope,
+    least_score: float,
+    is_wanted: Callable[[str], bool],
+) -> Iterator[tuple[Ns, _SeenBlock]]:
+    """Yields what was in view in each block, newest first, and a log time.
+
+    Blocks that follow hold nothing that is later than this time.
+    """
+    for nth, window in enumerate(scope.narrowed()):
+        by_topic = (_topic_blocks(view, topic, window) for topic in topics)
+        newest_first = heapq.merge(*by_topic, key=lambda block: -block.detected.log_times[-1])
+        for topic, detected in newest_first:
+            seen = _seen_in_block(f"{nth} {topic}", detected, scope, least_score, is_wanted)
+            # Blocks of different topics may overlap.
+            reached = detected.log_times[0 if len(topics) == 1 else -1]
+            yield int(reached), seen
+
+
+def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_TopicBlock]:
+    """Yields the messages of a topic in blocks that do not overlap, newest first."""
+    reader = DetectionRows(view)
+    left_out = 0
+    for overlapping in blocks(scan(view, topic, window, newest_first=True), newest_first=True):
+        detected = joined_detected([reader.of(rows) for rows in overlapping])
+        left_out += sum(map(len, overlapping)) - detected.log_times.size
+        if detected.log_times.size:
+            yield _TopicBlock(topic, detected)
+    if left_out:
+        view.notes.add_lack(f"messages of {topic} that could not be decoded: {left_out}")
+
+
+def _seen_in_block(
+    source: str,
+    detected: Detected,
+    scope: Scope,
+    least_score: float,
+    is_wanted: Callable[[str], bool],
+) -> _SeenBlock:
+    """Returns when wanted labels were in view in a block, by the detections that count."""
+    times, detections = detected.log_times, detected.found
+    labels = detections.labels.words
+    wanted = np.array([is_wanted(label) for label in labels], np.bool_)
+    counts = wanted[detections.labels.codes] & ~(detections.scores < least_score)
+    if scope.is_bounded:
+        # A scope reads what the other topics said from the newest message back.
+        holds = [scope.holds_at(time) for time in times[::-1].tolist()]
+        counts &= np.array(holds[::-1], np.bool_)[detections.rows]
+    rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
+    most_at_once = Counter[str]()
+    pairs, sizes = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
+    for code, size in zip(pairs[1].tolist(), sizes.tolist(), strict=True):
+        most_at_once[labels[code]] = max(most_at_once[labels[code]], size)
+    visible = visible_in(times, rows, codes, detections.scores[counts], labels)
+    return _SeenBlock(
+        source,
+        IntervalPart(int(times[0]), int(times[-1]), visible),
+        most_at_once,
+        int(np.bincount(rows).max(initial=0)),
+    )
