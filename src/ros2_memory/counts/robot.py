@@ -26,7 +26,7 @@ from ros2_memory.places.pose_frames import (
     placed_times,
     places_in,
 )
-from ros2_memory.places.robot_tracks import Stay, stays_within
+from ros2_memory.places.stays import Stay, stays_within
 from ros2_memory.places.visits import ConfirmedStays, asked_place
 from ros2_memory.places.where import known_track_for, note_other_frame, parse_where
 
@@ -175,7 +175,7 @@ def count_visits(
 
 def _stays(view: View, frame_id: str, region: Region, window: TimeWindow) -> list[Stay]:
     """Returns when robots were in a region, in order, as the tool `visits` counts them."""
-    return sorted(visit.inside for visit in ConfirmedStays(view, frame_id, region, window).every)
+    return sorted(visit.inside for visit in ConfirmedStays(view, frame_id, region, window).visits)
 
 
 def _add_visits(binned: BinnedWindow, stays: Sequence[Stay]) -> None:

@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.places.robot_tracks import Stay
+    from ros2_memory.places.stays import Stay
 
 MOST_EVENTS: Final = 25
 
@@ -300,7 +300,7 @@ def _with_place_names(event: Event, places: RobotPlaces) -> Event:
         return event
     at = event.start
     if event.kind == "stop" and event.end is not None:
-        at = places.within(event.start, event.end)
+        at = places.standstill_time(event.start, event.end)
     return replace(event, places=places.names_at(at))
 
 
@@ -456,7 +456,7 @@ def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[
         point: tuple[float, float] | None = (x, y)
         frame = ""
         if places is not None and places.frame_id != places.pose_frame:
-            point = places.at(places.within(start, end))
+            point = places.at(places.standstill_time(start, end))
             if point is None:
                 frame = f" in {places.pose_frame}"
             else:

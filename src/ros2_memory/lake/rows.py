@@ -214,7 +214,7 @@ class RowMaker:
         reader = TrackReader(self._view, frame)
         for window in windows:
             with suppress(InvalidArgumentsError):
-                return reader.over(window.aligned(PART_NS)).track
+                return reader.track_in(window.aligned(PART_NS)).track
         return empty_track()
 
     def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:

@@ -1,8 +1,8 @@
 """What the robot drove while it was inside of a region: metres, speed and the drawn way.
 
-When it was inside follows from its track in the region's frame, and how far it drove from its drawn
-path, whose corners have times and the metres driven up to them. So corrections of the map add no
-metres.
+The robot's track in the region's frame says when it was inside. The drawn path, each of whose
+vertices has a log time and the metres driven so far, says how far it drove meanwhile. So
+corrections of the map add no metres.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from ros2_memory.places.pose_frames import (
     newest_pose,
     placed_waypoints,
 )
-from ros2_memory.places.robot_tracks import Stay, TrackReader, stays_within
+from ros2_memory.places.robot_tracks import TrackReader
+from ros2_memory.places.stays import Stay, stays_within
 from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.results import DrivenInside, FarthestPose
 
@@ -47,14 +48,16 @@ if TYPE_CHECKING:
 
 _FARTHEST_FROM: Final = "farthest_from"
 _AROUND_NS: Final = 10 * NS_PER_S
+"""Poses up to so far before and after a point of the track are tried."""
 _OFF_TRACK_M: Final = 0.1
-"""No pose is as far from the line of a track."""
+"""Every pose is nearer than this to the line of a track."""
 _MOST_TRIED: Final = 20
+"""How many points of the track are tried."""
 _SPEED_NS: Final = NS_PER_S
-"""Over so long a speed is measured: what is shorter is noise."""
+"""Speed is measured over this time: over a shorter one, noise is too large a part."""
 _FEWEST_WAYPOINTS: Final = 2
 _TURNED_RAD: Final = math.radians(10.0)
-"""More than a robot turns between two poses."""
+"""A robot turns less than this between two poses."""
 
 
 def driven_inside(
@@ -68,10 +71,17 @@ def driven_inside(
     max_waypoints: int = MAX_WAYPOINTS,
     farthest: JsonValue = None,
 ) -> DrivenInside:
-    """Returns what was driven inside of a region in a window, by one pose topic.
+    """Returns what the robot drove inside of a region in a window, by one pose topic.
 
-    Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
-    `farthest` is the point from which the farthest pose inside is wanted.
+    Args:
+        memory: the memory.
+        call: the call.
+        span: the window.
+        where: the region, as `parse_where` takes it.
+        topic: the topic of the poses; None for the robot's.
+        frame_id: the frame of the waypoints; None for that of the poses.
+        max_waypoints: how many waypoints to draw; 0 for none, 1 for the last alone.
+        farthest: the point from which to look for the farthest pose inside; None for no search.
 
     Raises:
         InvalidArgumentsError: the topic carries no position, or `where` is no region of a frame
@@ -79,23 +89,22 @@ def driven_inside(
         NoDataError: there are no poses in the window.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    region = parse_where(memory.limits, where)
+    place = parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
     path, _ = driven_path(view, name, window)
     if path is None or not path.poses:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    track = known_track_for(view, region, window).track
-    inside = stays_within(track, region.region, window)
-    totals = totals_inside(path.line, inside)
-    waypoints = way_inside(path.line, inside, max_waypoints)
+    track = known_track_for(view, place, window).track
+    stays = stays_within(track, place.region, window)
+    totals = totals_inside(path.line, stays)
     waypoints = tuple(
-        _with_measured_heading(view, name, path.line, waypoint) for waypoint in waypoints
+        _with_measured_heading(view, name, path.line, waypoint)
+        for waypoint in _way_inside(path.line, stays, max_waypoints)
     )
-    elapsed = elapsed_in(view, window)
-    spans = [(stay.start, stay.stop) for stay in inside]
-    duration = elapsed.among(spans)
+    spans = [(stay.start, stay.stop) for stay in stays]
+    duration = elapsed_in(view, window).among(spans)
     average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, path.frames[0], frame_id)
@@ -106,14 +115,14 @@ def driven_inside(
     return DrivenInside(
         name,
         frame_id or path.frames[0],
-        region.shown,
-        len(inside),
+        place.shown,
+        len(stays),
         duration,
-        inside[0].start if inside else None,
-        inside[-1].stop if inside else None,
+        stays[0].start if stays else None,
+        stays[-1].stop if stays else None,
         totals.distance_m,
         average,
-        # Measured over a second, it is below the mean of a visit that hardly lasts as long.
+        # The highest speed over a second may be below the mean of a visit of about a second.
         None if average is None else max(totals.max_speed or 0.0, average),
         waypoints,
         away,
@@ -124,57 +133,67 @@ def driven_inside(
 class InsideTotals(NamedTuple):
     """What was driven inside: metres, and the highest speed (m/s) over a second.
 
-    `max_speed` is None where no time inside is long enough for one.
+    `max_speed` is None if no stay is long enough to measure one.
     """
 
     distance_m: float
     max_speed: float | None
 
 
-def totals_inside(line: Line, spans: Sequence[Stay]) -> InsideTotals:
-    """Returns what was driven along a line in some times."""
-    metres, speeds = 0.0, [] if spans else [0.0]
-    for start, stop in united((span.start, span.stop) for span in spans):
+def totals_inside(line: Line, stays: Sequence[Stay]) -> InsideTotals:
+    """Returns what was driven along a line during stays; time in which they overlap counts once."""
+    if not stays:
+        return InsideTotals(0.0, 0.0)
+    distance_m, speeds = 0.0, []
+    for start, stop in united((stay.start, stay.stop) for stay in stays):
         first_m, last_m = line.metres_at(np.array([start, stop])).tolist()
-        metres += last_m - first_m
-        fastest = _fastest(line, start, stop, last_m - first_m)
-        speeds += [] if fastest is None else [fastest]
-    return InsideTotals(metres, max(speeds, default=None))
+        distance_m += last_m - first_m
+        max_speed = _max_speed(line, start, stop, last_m - first_m)
+        if max_speed is not None:
+            speeds.append(max_speed)
+    return InsideTotals(distance_m, max(speeds, default=None))
 
 
-def _fastest(line: Line, start: Ns, stop: Ns, driven_m: float) -> float | None:
+def _max_speed(line: Line, start: Ns, stop: Ns, driven_m: float) -> float | None:
+    """Returns the highest speed (m/s) over `_SPEED_NS`, or the mean of a shorter time.
+
+    As the window of a second moves along the line, its speed is highest where one of its ends is at
+    a vertex, or at the start or the stop.
+    """
     if stop - start <= _SPEED_NS:
         return mean_speed(driven_m, unix_from_ns(stop - start))
     end = stop - _SPEED_NS
-    inner = line.times[np.searchsorted(line.times, start) :]
-    inner = inner[: np.searchsorted(inner, end)]
-    # The speed over a second changes its slope only where it begins or ends at a vertex.
-    ends = line.times[np.searchsorted(line.times, start + _SPEED_NS) :]
-    ends = ends[: np.searchsorted(ends, stop)] - _SPEED_NS
-    begin = np.concatenate(([start, end], inner, ends))
+    begins_at_vertex = _between(line.times, start, end)
+    ends_at_vertex = _between(line.times, start + _SPEED_NS, stop) - _SPEED_NS
+    begin = np.concatenate(([start, end], begins_at_vertex, ends_at_vertex))
     here, there = line.at(begin), line.at(begin + _SPEED_NS)
     # Metres are without jumps, but noise may shift some of them along the way.
     moved = np.linalg.norm(there.places - here.places, axis=1)
     return float(np.minimum(there.metres - here.metres, moved).max())
 
 
-def way_inside(line: Line, spans: Sequence[Stay], at_most: int) -> tuple[Waypoint, ...]:
-    """Returns the drawn way in some times; `jump` marks where another time begins.
+def _between(times: Times, start: Ns, stop: Ns) -> Times:
+    """Returns those of ascending times that lie in `[start, stop)`."""
+    return times[slice(*np.searchsorted(times, (start, stop)))]
 
-    `at_most` 0 asks for none, 1 for the last.
+
+def _way_inside(line: Line, stays: Sequence[Stay], at_most: int) -> tuple[Waypoint, ...]:
+    """Returns the drawn way during stays, the first waypoint of each marked as a jump.
+
+    `at_most` 0 asks for no waypoint, 1 for the last.
     """
-    if not spans:
+    if not stays:
         return ()
-    inside = stacked([_part(line, span) for span in spans])
+    inside = stacked([_line_during(line, stay) for stay in stays])
     waypoints, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
     return waypoints if at_most >= _FEWEST_WAYPOINTS else waypoints[len(waypoints) - at_most :]
 
 
 def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoint) -> Waypoint:
-    """Returns a waypoint with the heading of the newest pose then, where it has quite another.
+    """Returns a waypoint with the heading of the newest pose then, if the two differ clearly.
 
-    Between vertices a heading is one between theirs, and the robot may have turned meanwhile
-    without turning off its way. Without an orientation then, it has no heading.
+    Between vertices a line interpolates the heading, but the robot may have turned on the spot. If
+    that pose has no orientation, the waypoint gets none.
     """
     if waypoint.yaw_rad is None or np.isin(waypoint.time, line.times):
         return waypoint
@@ -189,13 +208,13 @@ def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoin
     return waypoint
 
 
-def _part(line: Line, span: Stay) -> Line:
-    """Returns the line in a time: its first vertex is where that begins, as after a jump."""
-    inner = np.flatnonzero((line.times > span.start) & (line.times < span.stop))
-    ends = [span.start, span.stop] if span.stop > span.start else [span.start]
-    first, last = line.at(np.array(ends[:1])), line.at(np.array(ends[1:], np.int64))
-    begins = dataclasses.replace(first, jumps=np.array([True]))
-    return stacked([begins, rows_of(line, inner), last])
+def _line_during(line: Line, stay: Stay) -> Line:
+    """Returns the part of a line during a stay. Its first vertex is marked as a jump."""
+    first = dataclasses.replace(line.at(np.array([stay.start])), jumps=np.array([True]))
+    if stay.stop == stay.start:
+        return first
+    inner = np.flatnonzero((line.times > stay.start) & (line.times < stay.stop))
+    return stacked([first, rows_of(line, inner), line.at(np.array([stay.stop]))])
 
 
 def farthest_from(
@@ -205,10 +224,14 @@ def farthest_from(
     spans: Sequence[Span],
     frame_id: str | None,
 ) -> FarthestPose | None:
-    """Returns the pose in some times (both ends inclusive, in order) that is farthest from a point.
+    """Returns the pose that is farthest from a point; None if no pose can be placed in its frame.
 
-    The point, of `value`, is in the frame of places or in `frame_id`. None where no pose could be
-    placed there.
+    Args:
+        view: the view of this call.
+        value: the point, as `parse_where` takes a place.
+        topic: the topic of the poses, which must be the robot's.
+        spans: the times of the poses, in order; both ends are inclusive.
+        frame_id: the frame of the point; None for the frame of places.
 
     Raises:
         InvalidArgumentsError: `value` is no point, or the poses are not in its frame.
@@ -250,16 +273,16 @@ def _farthest_pose(
     spans: Sequence[Span],
     point: tuple[float, float],
 ) -> _DistantPose | None:
-    """Returns the pose in some times that is farthest from a point (m).
+    """Returns the pose in `spans` that is farthest from a point (m); None if there is no pose.
 
-    Poses are looked up around the places of the track that are farthest away.
+    Poses are looked up around the vertices of the track that are farthest away.
     """
     x, y = point
-    times, at_x, at_y = _along(track, spans)
-    off_m = np.hypot(at_x - x, at_y - y)
+    times, track_x, track_y = _vertices_during(track, spans)
+    track_away_m = np.hypot(track_x - x, track_y - y)
     farthest: _DistantPose | None = None
-    for nth in np.argsort(-off_m, kind="stable")[:_MOST_TRIED].tolist():
-        if farthest is not None and off_m[nth] <= farthest.away_m - _OFF_TRACK_M:
+    for nth in np.argsort(-track_away_m, kind="stable")[:_MOST_TRIED].tolist():
+        if farthest is not None and track_away_m[nth] <= farthest.away_m - _OFF_TRACK_M:
             break
         at = int(times[nth])
         first, last = next((first, last) for first, last in spans if first <= at <= last)
@@ -268,22 +291,25 @@ def _farthest_pose(
         rows = zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True)
         for time, pose_x, pose_y in rows:
             away_m = math.hypot(pose_x - x, pose_y - y)
-            is_near = away_m <= off_m[nth] + _OFF_TRACK_M  # else the robot jumped there, and back
-            if is_near and (farthest is None or away_m > farthest.away_m):
+            # A pose farther off the track is one that the robot jumped to and back from.
+            is_on_track = away_m <= track_away_m[nth] + _OFF_TRACK_M
+            if is_on_track and (farthest is None or away_m > farthest.away_m):
                 farthest = _DistantPose(away_m, time, pose_x, pose_y)
     return farthest
 
 
-def _along(track: RobotTrack, spans: Sequence[Span]) -> tuple[Times, Floats, Floats]:
-    """Returns where the track was in some times: its vertices, and where each begins and ends.
+def _vertices_during(track: RobotTrack, spans: Sequence[Span]) -> tuple[Times, Floats, Floats]:
+    """Returns the times, x and y (m) of a track's vertices in spans, and of the spans' ends.
 
-    Without those that the robot jumped to and from.
+    Vertices that the robot jumped to and from are left out.
     """
-    points = []
-    for first, last in spans:
-        part = cut(track, TimeWindow(first, last + 1))
+    parts = [cut(track, TimeWindow(first, last + 1)) for first, last in spans]
+    is_jumped_over = []
+    for part in parts:
         jumped = jumps(part)
-        fine = ~(jumped & np.roll(jumped, 1))
-        points.append((part.times[fine], part.x[fine], part.y[fine]))
-    times, x, y = (np.concatenate(column) for column in zip(*points, strict=True))
-    return times, x, y
+        is_jumped_over.append(jumped & np.roll(jumped, 1))
+    rows = np.flatnonzero(~np.concatenate(is_jumped_over))
+    times = np.concatenate([part.times for part in parts])
+    x = np.concatenate([part.x for part in parts])
+    y = np.concatenate([part.y for part in parts])
+    return times[rows], x[rows], y[rows]

@@ -20,20 +20,21 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 MOST_FIXES: Final = 4000
-"""Fixes of a path, evenly spaced."""
+"""How many messages of a path are read, evenly spaced."""
 _MOST_TRIED: Final = 1000
-"""A receiver that has no satellites yet sends fixes without a place."""
+"""How many first messages are tried: before it has satellites a receiver sends no position."""
 _MOST_BAGS: Final = 200
-"""Of so many the last message is tried, too."""
+"""In how many bags the last message is tried, too."""
 _RADIUS_M: Final = 6_378_137.0
+"""The equatorial radius of the WGS 84 ellipsoid."""
 _ECCENTRICITY_SQUARED: Final = 6.694_379_990_14e-3
-"""Of the ellipsoid of WGS 84."""
+"""The first eccentricity of the WGS 84 ellipsoid, squared."""
 
 
 def east_north(origin: Geodetic, fix: Geodetic) -> tuple[float, float]:
-    """Returns how far (m) a fix lies east and north of another, on the plane that touches there.
+    """Returns how far (m) a fix lies east and north of an origin, in the plane tangent there.
 
-    By the ellipsoid's radii of curvature; off by 1 m some 10 km away.
+    It uses the radii of curvature of the ellipsoid. The error is 1 m at a distance of 10 km.
     """
     latitude = math.radians(origin.latitude)
     flat = 1 - _ECCENTRICITY_SQUARED * math.sin(latitude) ** 2
@@ -45,7 +46,7 @@ def east_north(origin: Geodetic, fix: Geodetic) -> tuple[float, float]:
 
 
 def local_frame(origin: Geodetic) -> str:
-    """Returns the name of the frame around a fix, for people."""
+    """Returns the name of the frame around a fix, as people read it."""
     return f"east and north of {origin.latitude:.6f}, {origin.longitude:.6f}"
 
 
@@ -56,10 +57,10 @@ def fixes_in(view: View, topic: str, window: TimeWindow) -> list[tuple[Ns, Geode
 
 
 def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotTrack] | None:
-    """Returns the path of a receiver in a window around its first recorded fix, and that frame.
+    """Returns the path of a receiver in a window, and the frame that it is in.
 
-    Where its first messages have none, around the first of its bags' last messages that is one.
-    None where none of these is.
+    The origin of the frame is the first fix among the topic's first messages or, if these have
+    none, among the last messages of its bags. None if there is no such fix.
     """
     if topic not in view.timeline.topics():
         return None
@@ -67,9 +68,10 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
     first = islice(view.stream.messages([topic], everything), _MOST_TRIED)
     ends = np.unique(view.bounds(topic, everything)[1])[:_MOST_BAGS].tolist()
     lasts = filter(None, (view.stream.last(topic, end + 1) for end in ends))
-    _, origin = next(_fixes(view, chain(first, lasts)), (0, None))
-    if origin is None:
+    first_fix = next(_fixes(view, chain(first, lasts)), None)
+    if first_fix is None:
         return None
+    _, origin = first_fix
     fixes = fixes_in(view, topic, window)
     if not fixes:
         return local_frame(origin), empty_track()
@@ -79,6 +81,7 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
 
 
 def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, Geodetic]]:
+    """Yields the log time and the position of each message that has a fix."""
     extractor = view.extractor
     for stored in messages:
         message = view.bags.decode(stored)

@@ -1,10 +1,10 @@
-"""The frame that answers give positions in: one rule for all tools, and the place they are in.
+"""Which frame positions are given in, by one rule for all tools, and which places they lie in.
 
-Tools beyond the specification answer in `data.map_frame` where transforms lead there from the
-pose's own frame at the time in question, else in that frame; the specification's tools in the
-pose's own frame. `frame_id` asks for another. Places are in the map where transforms of some
-recording lead there, and else in the poses' own frame: odometry, which begins at its origin
-whenever the robot is started.
+The tools of the specification answer in the frame of the poses. Other tools answer in
+`data.map_frame` if transforms lead there at the time in question, else in the frame of the poses.
+The argument `frame_id` asks for another frame. Places are in the map if transforms of some
+recording lead there, else in the frame of the poses: odometry, whose origin changes with each
+start of the robot.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from ros2_memory.history.transforms import (
     connects_in_time,
     transform_at,
 )
-from ros2_memory.places.robot_tracks import KnownTrack, TrackReader
+from ros2_memory.places.robot_tracks import TrackReader
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -57,16 +57,17 @@ if TYPE_CHECKING:
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.places.stays import KnownTrack
     from ros2_memory.storage.base import Mask
 
 WHEREABOUTS: Final = "where the robot was"
-"""What is not known without poses, for sentences."""
+"""What notes say is not known without poses."""
 NEWEST_POSE_NS: Final = SILENCE_NS
-"""The robot may have moved since an older pose."""
+"""After so long without a pose the robot may have moved."""
 
 
 def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
-    """Returns a pose of a recording in another frame at a time; None where no transform leads."""
+    """Returns a pose of a recording in another frame; None if no transform leads there then."""
     if frame_id.lstrip("/") == pose.frame_id.lstrip("/"):
         return pose
     if not pose.frame_id:
@@ -86,10 +87,10 @@ def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) ->
 def newest_pose(
     view: View, topic: str, window: TimeWindow, recording: Path | None = None
 ) -> tuple[StoredMessage, Pose | None] | None:
-    """Returns the newest message of the topic that places the robot in a window, with its pose.
+    """Returns the newest message of a topic in a window that places the robot, with its pose.
 
-    Where the session of a `recording` has the topic, it is one of its messages. None where there is
-    no message, or it cannot be decoded.
+    With a `recording` it is a message of its session, if that has the topic. None if there is no
+    message, or if it cannot be decoded.
     """
     body = body_of(view, topic)
     if body is not None:
@@ -105,10 +106,10 @@ def newest_pose(
 
 
 def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Path | None:
-    """Returns a recording that has a topic before and after a time: `own` if it does.
+    """Returns the recording of a topic around a log time; `own` if it is one, or if there is none.
 
-    Else the shortest of them, as one that began with an unset clock spans years; or `own`. By whole
-    recordings: which of their bags reaches over a time depends on how they were split.
+    Of several it is the shortest: one that began with an unset clock spans years. Whole recordings
+    are compared, since their bags depend on how they were split.
     """
     spans = view.timeline.recordings(topic)
     around = {path: last - first for path, (first, last) in spans.items() if first <= at <= last}
@@ -118,32 +119,35 @@ def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Pat
 
 
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
-    """Returns the robot's newest pose at or before a moment; None where it is not known.
+    """Returns the robot's newest pose at or before a log time, with the names of its places.
 
-    In the map where transforms lead there, or in `frame_id`. Where the session of this recording
-    has poses, it is one of these.
+    It is in `frame_id`, or else in the map if transforms lead there, or else in its own frame. It
+    is a pose of the recording's session, if that has poses. None if there is no recent pose.
+
+    Raises:
+        InvalidArgumentsError: no transform leads to `frame_id`.
     """
     window = TimeWindow.before(at, NEWEST_POSE_NS)
     topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
     stored, pose = newest_pose(view, topic, window, recording) or (None, None)
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
-    there = placed(view, pose, stored.time, stored.bag.recording, frame_id)
-    view.notes.add(*axes_of(there.frame_id))
-    return with_place(view, there, stored.time, stored.bag.recording)
+    in_frame = placed(view, pose, stored.time, stored.bag.recording, frame_id)
+    view.notes.add(*axes_of(in_frame.frame_id))
+    return with_place(view, in_frame, stored.time, stored.bag.recording)
 
 
 def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None = None) -> Pose:
-    """Returns a pose in the map where transforms lead there, else as it is; or in `frame_id`.
+    """Returns a pose in `frame_id`; without one, in the map if transforms lead there, else as is.
 
     Raises:
-        InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
+        InvalidArgumentsError: no transform leads to `frame_id`.
     """
     target = frame_id or view.limits.map_frame
-    there = None if not target else pose_in(view, pose, target, time, recording)
-    if there is None and frame_id is not None:
+    in_target = None if not target else pose_in(view, pose, target, time, recording)
+    if in_target is None and frame_id is not None:
         raise InvalidArgumentsError(_unreachable(frame_id, pose.frame_id))
-    return pose if there is None else there
+    return pose if in_target is None else in_target
 
 
 def placed_waypoints(
@@ -152,49 +156,59 @@ def placed_waypoints(
     """Returns waypoints of a topic's poses in another frame, each by the transforms of its time.
 
     At both ends of a recording its first and last transforms hold for 2 s more, as for tracks.
-    Waypoints that no transform places are left out, with a note. No drawn way leads across a jump
-    of the frame.
+    Waypoints that no transform places are left out, with a note. Waypoints behind a jump of the
+    frame are marked.
 
     Raises:
         InvalidArgumentsError: no transform places any of them.
         QueryTimeoutError: the call's time is over before it is known whether any leads there.
     """
-    moved: list[Waypoint] = []
+    placed_ones: list[Waypoint] = []
     known_to_lead = False
     for waypoint in waypoints:
-        recording = recording_at(view, topic, waypoint.time)
-        half = math.nan if waypoint.yaw_rad is None else waypoint.yaw_rad / 2
-        pose = Pose(waypoint.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
-        # By the transforms of its time, or of the nearest one up to `HOLD_NS` off.
-        tried = (
-            pose_in(view, pose, frame_id, waypoint.time + off, recording)
-            for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS)
-            if recording is not None
-        )
-        there = next(filter(None, tried), None)
-        if there is None or there.orientation is None:
-            # Asked once: to look for a frame that nothing leads to at each time takes long.
-            if not (moved or known_to_lead) and not connects(view, (frame_id, own_frame)):
-                break
-            known_to_lead = True
+        in_frame = _placed_waypoint(view, topic, waypoint, own_frame, frame_id)
+        if in_frame is not None:
+            placed_ones.append(in_frame)
             continue
-        turn = None if waypoint.yaw_rad is None else yaw(there.orientation)
-        moved.append(replace(waypoint, position=there.position, yaw_rad=turn))
-    if waypoints and not moved:
+        # Asked once, since looking for a frame that no transform leads to takes long.
+        known_to_lead = known_to_lead or bool(placed_ones) or connects(view, (frame_id, own_frame))
+        if not known_to_lead:
+            break
+    if waypoints and not placed_ones:
         raise InvalidArgumentsError(_unreachable(frame_id, own_frame))
-    if len(moved) < len(waypoints):
-        left_out = counted(len(waypoints) - len(moved), "waypoint")
+    if len(placed_ones) < len(waypoints):
+        left_out = counted(len(waypoints) - len(placed_ones), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
-    if not moved or own_frame == frame_id or topic != resolve_path_topic(view):
-        return tuple(moved)
-    return _with_jumps(view, moved, frame_id)
+    if not placed_ones or own_frame == frame_id or topic != resolve_path_topic(view):
+        return tuple(placed_ones)
+    return _with_jumps(view, placed_ones, frame_id)
+
+
+def _placed_waypoint(
+    view: View, topic: str, waypoint: Waypoint, own_frame: str, frame_id: str
+) -> Waypoint | None:
+    """Returns a waypoint in another frame, by the transforms of its time or up to `HOLD_NS` off.
+
+    None if none of these leads there.
+    """
+    recording = recording_at(view, topic, waypoint.time)
+    if recording is None:
+        return None
+    half = math.nan if waypoint.yaw_rad is None else waypoint.yaw_rad / 2
+    pose = Pose(waypoint.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
+    for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):
+        in_frame = pose_in(view, pose, frame_id, waypoint.time + off, recording)
+        if in_frame is not None and in_frame.orientation is not None:
+            turn = None if waypoint.yaw_rad is None else yaw(in_frame.orientation)
+            return replace(waypoint, position=in_frame.position, yaw_rad=turn)
+    return None
 
 
 def _with_jumps(view: View, waypoints: Sequence[Waypoint], frame_id: str) -> tuple[Waypoint, ...]:
-    """Returns waypoints of the robot's path with `jump` at the first after each jump of a frame."""
+    """Returns waypoints of the robot's path, with `jump` set behind each jump of the frame."""
     window = TimeWindow(waypoints[0].time, waypoints[-1].time + 1)
     try:
-        known = TrackReader(view, frame_id).over(window)
+        known = TrackReader(view, frame_id).track_in(window)
     except QueryTimeoutError:
         view.notes.add_lack(f"there was no time to look where {frame_id} jumped")
         return tuple(waypoints)
@@ -224,28 +238,27 @@ def _unreachable(frame_id: str, own_frame: str) -> str:
 
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
-    """Returns a pose with the names of the places that it is in, in whatever frames these are."""
+    """Returns a pose with the names of the places that it is in, whatever their frames."""
     places = view.limits.places
     frames = {place.frame_id for place in places}
-    there = {frame: pose_in(view, pose, frame, time, recording) for frame in frames}
-    inside = (
-        place
-        for place in places
-        if (placed := there[place.frame_id]) is not None
-        and place.region.contains(*placed.position[:2])
-    )
+    pose_of_frame = {frame: pose_in(view, pose, frame, time, recording) for frame in frames}
+    inside: list[Place] = []
+    for place in places:
+        in_frame = pose_of_frame[place.frame_id]
+        if in_frame is not None and place.region.contains(*in_frame.position[:2]):
+            inside.append(place)
     return replace(pose, places=names_by_size(inside))
 
 
 @dataclass(frozen=True, slots=True)
 class MapPlacement:
-    """Which frames the robot's places are in.
+    """The frames in which it is known where the robot was.
 
     Attributes:
-        frame_id: of the places.
-        pose_frame: of the poses.
-        is_map: whether the coordinates of places keep their meaning when odometry is reset.
-        above: where transforms alone place the robot, the frames above its body.
+        frame_id: the frame of places.
+        pose_frame: the frame of the poses.
+        is_map: whether `frame_id` is the map, in which coordinates outlive a reset of odometry.
+        above: the frames above the robot's body, if only transforms place it.
     """
 
     frame_id: str
@@ -255,16 +268,16 @@ class MapPlacement:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frames that positions are known in."""
+        """All frames in which positions are known."""
         return tuple(dict.fromkeys((self.frame_id, self.pose_frame, *self.above)))
 
 
 def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPlacement:
-    """Returns how the poses of a topic are placed; in `frame_id` where one is given.
+    """Returns the frames of a topic's poses and of places; places are in `frame_id` if given.
 
     Raises:
-        InvalidArgumentsError: places are in another frame than `frame_id`, or it is of no poses.
-        QueryTimeoutError: the time is over before it is known whether they are in `frame_id`.
+        InvalidArgumentsError: positions are not known in `frame_id`.
+        QueryTimeoutError: time runs out before it is clear whether they are known in `frame_id`.
         UndecodableError: no pose can be decoded.
     """
     target, frame = view.limits.map_frame, frame_of_newest_pose(view, topic)
@@ -272,7 +285,8 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
     above = () if body is None else body.above
     if frame_id in (frame, *above):
         return MapPlacement(frame_id, frame, frame_id == target, above)
-    # No answer is better than one that denies a frame which is asked for, since the time is over.
+    # If time runs out, a `frame_id` must not be denied: then there is no answer. Without one,
+    # places are taken to be in the frame of the poses.
     leads = connects_in_time if frame_id is None else connects
     places_frame = frame
     if target and target != frame and leads(view, (target, frame)):
@@ -292,7 +306,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
 
 
 def known_placement(view: View) -> MapPlacement | None:
-    """Returns how the robot's poses are placed; None where no topic of them is recorded."""
+    """Returns the frames of the robot's poses and of places; None if no poses are recorded."""
     try:
         return map_placement(view, resolve_path_topic(view))
     except (InvalidArgumentsError, NoDataError, UndecodableError):
@@ -300,39 +314,40 @@ def known_placement(view: View) -> MapPlacement | None:
 
 
 def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
-    """Returns whether all poses in some windows are of one session, whose odometry goes on.
+    """Returns whether all poses in some windows are of one run of odometry.
 
-    Or of several that repeat each other where they overlap, as a copy does.
+    They are if they are of one session, or of several of which each overlaps the ones before and
+    repeats them, as a copy does.
     """
-    sessions, asked = view.sessions, tuple(windows)
+    asked = tuple(windows)
     spans = sorted(
         (*span, recording)
         for recording, span in view.timeline.recordings(topic).items()
         if any(window.overlaps(*span) for window in asked)
     )
-    joined: set[Session] = set()
+    seen: set[Session] = set()
     reach = MIN_NS
     for first, last, recording in spans:
-        session = sessions.of(recording)
-        if joined and session not in joined:
-            both = TimeWindow(first, max(min(reach, last) + 1, first))
-            bags = view.stream.overlapping_bags([topic], both)
-            # One that a wrong clock dated spans years, without bags.
-            has_overlap = len({span.bag.recording for span in bags}) > 1
-            if not has_overlap or recordings_apart(view, [topic], both) != frozenset():
+        session = view.sessions.of(recording)
+        if seen and session not in seen:
+            overlap = TimeWindow(first, max(min(reach, last) + 1, first))
+            bags = view.stream.overlapping_bags([topic], overlap)
+            # A recording that a wrong clock dated may span years in which it has no bags.
+            are_bags_overlapping = len({span.bag.recording for span in bags}) > 1
+            if not are_bags_overlapping or recordings_apart(view, [topic], overlap) != frozenset():
                 return False
-        joined.add(session)
+        seen.add(session)
         reach = max(reach, last)
     return True
 
 
 def changing_origin(frame_id: str) -> str:
-    """Returns why coordinates of several runs cannot be compared, for sentences."""
+    """Returns the reason, for notes, why coordinates of several runs cannot be compared."""
     return f"the origin of {frame_id or 'their frame'} changes with every start"
 
 
 def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None:
-    """Notes that positions in a frame which is not the map are of several runs of odometry."""
+    """Notes if positions outside of the map are of several runs of odometry."""
     if frame_id != view.limits.map_frame and not is_one_run(view, topic, [window]):
         view.notes.add(
             f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
@@ -341,7 +356,7 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
 
 
 def axes_of(frame_id: str) -> tuple[str, ...]:
-    """Returns the note on a frame that is north-east-down, not REP 103's, by its name."""
+    """Returns the note that a frame's axes are not those of REP 103, if its name ends in "ned"."""
     if not frame_id.casefold().endswith("ned"):
         return ()
     axes = f"in {frame_id} x is north, y east and z down"
@@ -349,46 +364,50 @@ def axes_of(frame_id: str) -> tuple[str, ...]:
 
 
 def known_track(view: View, frame_id: str, window: TimeWindow) -> KnownTrack:
-    """Returns the robot's track in a window; a note says how far back it reaches, if not all.
+    """Returns the robot's track in a window; notes say what it lacks.
 
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    joined = TrackReader(view, frame_id).over(window)
+    known = TrackReader(view, frame_id).track_in(window)
     note_runs(view, resolve_path_topic(view), frame_id, window)
-    if joined.since is not None:
+    if known.since is not None:
         view.notes.add_lack(
-            f"visits are known back to {unix_text(joined.since)}: out of time before older "
+            f"visits are known back to {unix_text(known.since)}: out of time before older "
             "poses were placed"
         )
-    if joined.left_out:
+    if known.left_out:
         view.notes.add(f"poses that no transform places in {frame_id} are left out")
-    return joined
+    return known
 
 
 def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
-    """Returns when it is known where the robot was: not at `mixed` times, which several have."""
+    """Returns when it is known where the robot was.
+
+    Not in the spans `mixed`, in which several robots were recorded.
+    """
     starts, stops = track.pieces
     return without(zip(starts.tolist(), (stops + 1).tolist(), strict=True), mixed)
 
 
 def make_tracks(view: View, window: TimeWindow) -> Iterator[Ns]:
-    """Makes the robot's tracks by the parts in a window, in the frames of places; they are stored.
+    """Makes and stores the tracks of the parts in a window, in all frames of `MapPlacement`.
 
-    Yields a log time (ns) of each, the newest first.
+    Yields a log time (ns) of each, newest first.
     """
     with suppress(InvalidArgumentsError, NoDataError, UndecodableError):
         topic = resolve_path_topic(view)
         frames = map_placement(view, topic).frames
-        yield from merge(*(TrackReader(view, frame).made(window) for frame in frames), reverse=True)
+        made = (TrackReader(view, frame).make_tracks(window) for frame in frames)
+        yield from merge(*made, reverse=True)
 
 
 def places_in(
     view: View, places: Sequence[Place], placement: MapPlacement, window: TimeWindow
 ) -> list[tuple[Place, KnownTrack]]:
-    """Returns the places of the map and of the poses' own frame, each with the track in its frame.
+    """Returns the places in the frames of a placement, each with the track in its frame.
 
-    Notes name the others.
+    A note names each place in another frame.
 
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
@@ -407,13 +426,14 @@ def places_in(
 
 @dataclass
 class RobotPlaces:
-    """Looks the robot up in a window, by its track: as exact as that, some 5 cm.
+    """Looks up by its track where the robot was in a window, within some 5 cm.
 
     Attributes:
-        frame_id: that positions are given in: the map where transforms lead there, or the one asked
-            for.
-        pose_frame: of the poses themselves.
-        map_frame: the former, whatever was asked for; named places are looked up in it.
+        view: the view of this call.
+        window: the window.
+        frame_id: the frame of positions: the one that was asked for, or else `map_frame`.
+        pose_frame: the frame of the poses.
+        map_frame: the frame of places: the map if transforms lead there, else `pose_frame`.
     """
 
     view: View
@@ -423,18 +443,24 @@ class RobotPlaces:
     map_frame: str
 
     def at(self, time: Ns) -> tuple[float, float] | None:
-        """Returns where the robot was (m) in `frame_id`; None outside the track."""
+        """Returns where the robot was (x, y in m) in the map frame.
+
+        None if the track does not reach the time, or if positions are asked for in another frame.
+        """
         if self.frame_id != self.map_frame:
             return None
         return place_at(self._track, time, SILENCE_NS)
 
-    def within(self, start: Ns, end: Ns) -> Ns:
-        """Returns a time for where the robot stood: the middle; the start, if the map jumps."""
+    def standstill_time(self, start: Ns, end: Ns) -> Ns:
+        """Returns the time that shows where the robot stood.
+
+        The middle of the standstill, or its start if the map jumps meanwhile.
+        """
         first, last = np.searchsorted(self._track.times, (start, end)).tolist()
         return start if self._jumps[max(first - 1, 0) : last].any() else (start + end) // 2
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
-        """Returns the named places that the robot was in, if that is known; the smallest first."""
+        """Returns the names of the places that the robot was in, the smallest place first."""
         places = self.view.limits.places
         if not any(place.frame_id == self.map_frame for place in places):
             return ()
@@ -448,15 +474,16 @@ class RobotPlaces:
     @cached_property
     def _track(self) -> RobotTrack:
         try:
-            joined = TrackReader(self.view, self.map_frame).over(self.window)
+            known = TrackReader(self.view, self.map_frame).track_in(self.window)
             note_runs(self.view, resolve_path_topic(self.view), self.map_frame, self.window)
         except QueryTimeoutError:
+            # If the whole call is out of time, not reading alone, it fails here.
             self.view.bags.check_deadline()
             self._note_reach("not known")
             return empty_track()
-        if joined.since is not None:
-            self._note_reach(f"known back to {unix_text(joined.since)} alone")
-        return joined.track
+        if known.since is not None:
+            self._note_reach(f"known back to {unix_text(known.since)} alone")
+        return known.track
 
     def _note_reach(self, reach: str) -> None:
         self.view.notes.add(
@@ -466,10 +493,10 @@ class RobotPlaces:
 
 
 def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) -> RobotPlaces | None:
-    """Returns where the robot was in a window; None where no topic of its poses is recorded.
+    """Returns a lookup of the robot's places in a window; None if no poses are recorded.
 
     Raises:
-        InvalidArgumentsError: no position is given in `frame_id`.
+        InvalidArgumentsError: positions are not known in `frame_id`.
     """
     usual = known_placement(view)
     if usual is None:

@@ -1,15 +1,14 @@
-"""Where the robot was in one frame over many bags, and when it was inside of a region.
+"""Where the robot was in one frame over many bags.
 
-Each table of poses, placed by the transforms around it, gives a `PartialTrack`; `joined_tracks`
-makes one of all. What follows from parts of the store alone is stored beside these, so a week is
-asked again in a tenth of a second.
+Transforms place the poses of each table in the frame, which gives a `PartialTrack`.
+`joined_tracks` joins these. The track of a whole part of the store is stored beside the part, so a
+second question about a week takes a tenth of a second.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -24,13 +23,12 @@ from ros2_memory.analysis.frames import (
     Times,
     static_in,
 )
-from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
+from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
     TRACK_SLICE_NS,
     PartialTrack,
     RobotTrack,
     joined_tracks,
-    jumps,
     partial_track,
     track_by,
 )
@@ -44,7 +42,6 @@ from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import ClippedSteps, Region, Steps, clipped
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
@@ -64,17 +61,12 @@ from ros2_memory.history.scan import (
     remembered,
     scan,
 )
-from ros2_memory.history.transforms import (
-    edges_of_rows,
-    frames_over,
-    lending_to,
-)
+from ros2_memory.history.transforms import edges_of_rows, frames_over, lending_to
+from ros2_memory.places.stays import KnownTrack
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from ros2_memory.columns.scan import Scan, Stretch
     from ros2_memory.columns.units import Rows
@@ -87,73 +79,20 @@ _NOT_PLACED: Final = Reason(
     many="have no transforms that place their poses: they are left out",
 )
 _READING_S: Final = 10.0
-"""How long a call places poses that it does not remember, before its answer is partial."""
-
-
-class Stay(NamedTuple):
-    """A time in which the robot was inside of a region; both ends are inclusive.
-
-    `entered` and `left`: whether it was seen outside just before, and just after.
-    """
-
-    start: Ns
-    stop: Ns
-    entered: bool
-    left: bool
-
-    def within(self, window: TimeWindow) -> Stay:
-        """Returns the part of it in a window that it reaches into."""
-        return Stay(
-            max(self.start, window.start),
-            min(self.stop, window.stop - 1),
-            entered=self.entered and self.start >= window.start,
-            left=self.left and self.stop < window.stop,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class KnownTrack:
-    """The track of the robot in a window.
-
-    Attributes:
-        track: of all recordings.
-        since: how far back it reaches, where the time was over before all was placed; else None.
-        left_out: how many poses could not be placed.
-        others: where recordings place a robot at one time, as of several robots, the tracks of
-            those that are not in `track`, as far as they are not.
-    """
-
-    track: RobotTrack
-    since: Ns | None
-    left_out: int
-    others: tuple[RobotTrack, ...]
-
-    @property
-    def tracks(self) -> tuple[RobotTrack, ...]:
-        """Those of all robots."""
-        return self.track, *self.others
-
-    def reaches(self, window: TimeWindow) -> bool:
-        """Whether it is known at any time of a window where a robot was."""
-        pieces = (zip(*each.pieces, strict=True) for each in self.tracks)
-        return any(window.overlaps(start, stop) for start, stop in chain(*pieces))
-
-    def inside(self, region: Region, window: TimeWindow) -> list[Stay]:
-        """Returns when any robot was inside of a region, in order; times of several may overlap."""
-        return sorted(chain(*(stays_within(track, region, window) for track in self.tracks)))
+"""How long a call reads and places poses before it answers with those that it has."""
 
 
 _MOST_SETTINGS: Final = 256
 _SETTINGS: Final[Key[dict[tuple[object, ...], str]]] = Key()
-"""Of a timeline: what places the poses of a stretch, as a hash, by the parts that they are of."""
+"""Remembered for a timeline: the hash of what places the poses of a stretch, by its parts."""
 _KNOWN: Final[Key[dict[tuple[str, TimeWindow], KnownTrack]]] = Key()
-"""Of a call: its tracks, by frame and window."""
+"""Remembered for a call: its tracks, by frame and window."""
 
 
 class TrackReader:
-    """Places the robot in one frame.
+    """Reads the track of the robot in one frame.
 
-    By its poses; where no topic has these, by the transforms of its body.
+    It follows from the robot's poses or, if no topic has poses, from the transforms of its body.
     """
 
     def __init__(self, view: View, frame_id: str) -> None:
@@ -168,18 +107,19 @@ class TrackReader:
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
 
-    def over(self, window: TimeWindow) -> KnownTrack:
-        """Returns the track in a window, and a little beyond.
+    def track_in(self, window: TimeWindow) -> KnownTrack:
+        """Returns the track in a window, and a little beyond it.
 
         Raises:
-            InvalidArgumentsError: messages of the topic of poses carry no position.
+            InvalidArgumentsError: messages of the pose topic carry no position.
             QueryTimeoutError: the call's time runs out before any result.
         """
         view, key = self._view, (self._frame_id, window)
         known = view.memo.of(_KNOWN, dict)
         if key in known:
             return known[key]
-        # Whole slices, so that no vertex depends on the window; and what may reach into it.
+        # Poses up to `SILENCE_NS` outside decide whether the track goes on at the window's ends.
+        # Whole slices are read, so that no vertex depends on the window.
         around = window.widened(SILENCE_NS).aligned(TRACK_SLICE_NS)
         try:
             tracks, since = in_time(view, self._tracks_back(around), _READING_S)
@@ -191,125 +131,138 @@ class TrackReader:
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(track.left_out for track in tracks)
-        track, others = self._joined(tracks, around)
+        track, others = self._tracks_of_robots(tracks, around)
         known[key] = KnownTrack(track, since, left_out, others)
         return known[key]
 
-    def _joined(
+    def _tracks_of_robots(
         self, tracks: Sequence[PartialTrack], window: TimeWindow
     ) -> tuple[RobotTrack, tuple[RobotTrack, ...]]:
-        """Returns the track of all recordings, and what those of other robots have beside it."""
+        """Returns `KnownTrack.track` and `KnownTrack.others`, of tracks given newest first."""
         apart = recordings_apart(self._view, self._topics, window)
         root = str(self._view.bag_dir)
         names = None if apart is None else {relative(str(path), root) for path in apart}
-        whole, numbers, is_beside = _tracks_by_robot(tracks, names)
-        fastest = self._view.limits.max_plausible_speed_mps
+        whole, recordings, is_beside = _joined_recordings(tracks, names)
+        fastest_mps = self._view.limits.max_plausible_speed_mps
 
-        def track_at(index: NDArray[np.intp]) -> RobotTrack:
-            return track_by(whole.some(index), numbers[index], fastest)
+        def robot_track(vertices: Mask) -> RobotTrack:
+            index = np.flatnonzero(vertices)
+            return track_by(whole.some(index), recordings[index], fastest_mps)
 
-        others = np.unique(numbers[is_beside])
-        beside = (track_at(np.flatnonzero(is_beside & (numbers == number))) for number in others)
-        return track_at(np.flatnonzero(~is_beside)), tuple(beside)
+        numbers = np.unique(recordings[is_beside])
+        others = (robot_track(is_beside & (recordings == number)) for number in numbers)
+        return robot_track(~is_beside), tuple(others)
 
-    def made(self, window: TimeWindow) -> Iterator[Ns]:
-        """Makes the tracks of parts in a window and beside it, the newest first.
+    def make_tracks(self, window: TimeWindow) -> Iterator[Ns]:
+        """Makes and stores the tracks of parts in a window and beside it, newest first.
 
         Yields a log time (ns) of each.
 
         Raises:
-            InvalidArgumentsError: messages of the topic of poses carry no position.
+            InvalidArgumentsError: messages of the pose topic carry no position.
             QueryTimeoutError: the call's time runs out.
         """
         return (at for at, _ in self._tracks_back(window.widened(2 * PART_NS)))
 
     def _tracks_back(self, window: TimeWindow) -> Iterator[tuple[Ns, PartialTrack]]:
-        """Yields partial tracks, the newest first, each with a time that it is not earlier than."""
-        # Whole parts, also those that the window cuts: their tracks are stored.
+        """Yields partial tracks, newest first, each with a log time at or before its first pose."""
+        # The tracks of parts that the window cuts may be stored, so these are scanned whole.
         whole = window.aligned(PART_NS)
         around = whole.widened(TF_CACHE_NS).aligned(PART_NS)
         topics = () if self._is_own else self._view.moving_topics
         moving = [open_scan(self._view, topic, around, copies=True) for topic in topics]
-        scans = [
+        pose_scans = [
             open_scan(self._view, topic, whole, stored=self._view.call.stored)
             for topic in self._topics
         ]
-        yield from _together(
+        yield from _merged_back(
             joined_back(
                 self._view,
-                opened,
+                pose_scan,
                 TRACKS,
-                partial(self._tracks_in, opened, moving, window),
-                partial(self._stretch_key, opened, moving, window),
+                partial(self._tracks_in, pose_scan, moving, window),
+                partial(self._stretch_key, pose_scan, moving, window),
             )
-            for opened in scans
+            for pose_scan in pose_scans
         )
 
     def _tracks_in(
         self,
-        opened: Scan,
-        scans: Sequence[Scan],
+        pose_scan: Scan,
+        moving: Sequence[Scan],
         window: TimeWindow,
         stretch: Stretch,
     ) -> Iterator[tuple[Ns, PartialTrack]]:
-        """Yields the track table by table, of those that begin in a stretch, the newest first."""
-        searched = stretch.window.intersect(window)
-        for rows in opened.rows(newest_first=True, among=searched):
-            if rows.first < stretch.window.start and stretch.window.start > opened.window.start:
+        """Yields the track of each table that begins in a stretch, newest first.
+
+        Each comes with the log time of the table's first row.
+        """
+        begin = stretch.window.start
+        is_oldest = begin <= pose_scan.window.start
+        for rows in pose_scan.rows(newest_first=True, among=stretch.window.intersect(window)):
+            # What began before the stretch belongs to an older one, if there is one.
+            if rows.first < begin and not is_oldest:
                 continue
             lent_spans = self._lent_spans(rows, TimeWindow.everything())
-            key = self._rows_key(rows, lent_spans, scans)
+            key = self._rows_key(rows, lent_spans, moving)
             if key is None and stretch.parts is None and self._view.call.stored:
                 continue
             if window.covers(rows.first, rows.last):
                 yield rows.first, self._track_by(rows, key, lent_spans)
                 continue
             stored = None if key is None else self._view.memory.scanner.fragments(TRACKS).get(key)
+            inside = positions_in(rows.times, window)
             if stored is not None and not stored.left_out:
                 yield rows.first, stored.some(positions_in(stored.times, window))
-            elif (inside := positions_in(rows.times, window)).size:
+            elif inside.size:
                 lent_spans = self._lent_spans(rows, window)
                 yield rows.first, self._track_by(rows.some(inside), None, lent_spans)
 
     def _stretch_key(
-        self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
+        self, pose_scan: Scan, moving: Sequence[Scan], window: TimeWindow, stretch: Stretch
     ) -> FragmentKey | None:
-        """Returns the key of a stretch's track; None where what it follows from may change."""
+        """Returns the key under which a stretch's track is stored; None if it may still change."""
         start, last = stretch.window.start, stretch.last
-        # Where the scan begins with it, what reaches into it from before is part of it.
-        if start == opened.window.start or stretch.parts is None or not window.covers(start, last):
+        # The oldest stretch of a scan also has what reaches into it from before.
+        is_oldest = start == pose_scan.window.start
+        if is_oldest or stretch.parts is None or not window.covers(start, last):
             return None
         span = TimeWindow(start, last + 1)
-        moving = self._moving_parts(scans, span)
-        if moving is None:
+        recording_of_part = self._moving_parts(moving, span)
+        if recording_of_part is None:
             return None
         known = self._view.timeline.memo.of(_SETTINGS, dict)
-        asked, noted = (self._settings_hash(()), stretch.parts, *moving), self._view.notes.added
-        settings = known.get(asked)
+        known_by = (self._settings_hash(()), stretch.parts, *recording_of_part)
+        notes_before = self._view.notes.added
+        settings = known.get(known_by)
         if settings is None:
-            recordings = [] if self._is_own else [*map(opened.recording_of, stretch.parts)]
-            settings = self._stretch_settings(recordings, moving.values(), span)
+            recordings = [] if self._is_own else [*map(pose_scan.recording_of, stretch.parts)]
+            settings = self._stretch_settings(recordings, recording_of_part.values(), span)
             if settings is None:
                 return None
-            if self._view.notes.added == noted and not self._view.call.used_active:
+            if self._view.notes.added == notes_before and not self._view.call.used_active:
                 if len(known) >= _MOST_SETTINGS:
                     known.clear()
-                known[asked] = settings
-        others = (part for part in moving if part not in stretch.parts)
+                known[known_by] = settings
+        others = (part for part in recording_of_part if part not in stretch.parts)
         return FragmentKey(start, settings, (*stretch.parts, *others))
 
     def _stretch_settings(
         self, recordings: Sequence[Path], moving: Collection[Path], span: TimeWindow
     ) -> str | None:
-        """Returns the hash of all transforms that place poses; None while these may change.
+        """Returns the hash of the transforms that place a span's poses; None if they may change.
 
-        `recordings`: of the poses. `moving`: of the transforms around that time.
+        Args:
+            recordings: the recordings of the poses.
+            moving: the recordings of the moving transforms.
+            span: the time of the poses.
         """
         sessions = self._view.sessions
         numbers: dict[Session, int] = {}
         placed_by: list[object] = []
         for recording in recordings:
             session = sessions.of(recording)
+            # A session that lacks a kind borrows transforms of another one, perhaps of a later one.
             if not sessions.has_all_kinds(session):
                 return None
             if session not in numbers:
@@ -318,22 +271,22 @@ class TrackReader:
         placed_by += [numbers.get(sessions.of(recording)) for recording in moving]
         return self._settings_hash(placed_by)
 
-    def _moving_parts(self, scans: Sequence[Scan], span: TimeWindow) -> dict[int, Path] | None:
-        """Returns the whole parts that all moving transforms around a time are of.
+    def _moving_parts(self, moving: Sequence[Scan], span: TimeWindow) -> dict[int, Path] | None:
+        """Returns the parts that have all moving transforms around a span, with their recordings.
 
-        Each with its recording. None where there are others, or some are of several recordings.
+        None if some transforms are in no whole part, or a part has those of several recordings.
         """
-        paths: dict[int, Path] = {}
-        for scan_ in scans:
-            parts = scan_.whole_parts(span.widened(TF_CACHE_NS))
+        recording_of_part: dict[int, Path] = {}
+        for moving_scan in moving:
+            parts = moving_scan.whole_parts(span.widened(TF_CACHE_NS))
             if parts is None:
                 return None
-            paths |= {part: scan_.recording_of(part) for part in parts}
-        is_mixed = any(map(self._view.sessions.holds_carried, paths.values()))
-        return None if is_mixed else paths
+            recording_of_part |= {part: moving_scan.recording_of(part) for part in parts}
+        is_mixed = any(map(self._view.sessions.holds_carried, recording_of_part.values()))
+        return None if is_mixed else recording_of_part
 
     def _settings_hash(self, placed_by: Sequence[object]) -> str:
-        """Returns a hash of the settings and transforms that a track depends on, but for parts."""
+        """Returns a hash of the settings and the transforms (`placed_by`) that make a track."""
         clock = self._view.limits.tf_clock
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
         return hashlib.sha256(settings.encode()).hexdigest()
@@ -344,7 +297,7 @@ class TrackReader:
         key: FragmentKey | None,
         lent_spans: Sequence[_LentSpan],
     ) -> PartialTrack:
-        """Returns the track by some rows: what is stored of it, else made now."""
+        """Returns the track of rows: the one that is stored under the key, or else a new one."""
 
         def make() -> PartialTrack:
             placed = self._poses_of(rows, lent_spans)
@@ -354,26 +307,33 @@ class TrackReader:
         return remembered(self._view, TRACKS, key, make)
 
     def _rows_key(
-        self, rows: Rows, lent_spans: Sequence[_LentSpan], scans: Sequence[Scan]
+        self, rows: Rows, lent_spans: Sequence[_LentSpan], moving: Sequence[Scan]
     ) -> FragmentKey | None:
-        """Returns the key of the track by some rows; None where what it follows from may change."""
+        """Returns the key under which the track of rows is stored; None if it may still change."""
         if rows.part is None:
             return None
+        sessions = self._view.sessions
         parts, placed_by = [rows.part], []
-        for lent in lent_spans:
-            moving = self._moving_parts(scans, lent.span)
-            if moving is None:
+        for since, span, session in lent_spans:
+            recording_of_part = self._moving_parts(moving, span)
+            if recording_of_part is None:
                 return None
-            sessions, session = self._view.sessions, lent.session
-            used = [part for part, path in moving.items() if sessions.folder(path) in session]
+            used = [
+                part
+                for part, recording in recording_of_part.items()
+                if sessions.folder(recording) in session
+            ]
             parts += [part for part in used if part not in parts]
-            static = static_in(self._view.sessions.static(session), lent.span)
-            # By their places among the parts: those of one recording have one text.
-            placed_by.append((lent.since, tuple(static), [parts.index(part) for part in used]))
+            static = static_in(sessions.static(session), span)
+            # Positions in place of the parts' numbers: all parts of a recording have one hash.
+            placed_by.append((since, tuple(static), [parts.index(part) for part in used]))
         return FragmentKey(rows.first, self._settings_hash(placed_by), tuple(parts))
 
     def _lent_spans(self, rows: Rows, window: TimeWindow) -> list[_LentSpan]:
-        """Returns by what the poses of some rows in a window are placed; none: by nothing."""
+        """Returns which session's transforms place the poses of rows in a window, span by span.
+
+        Empty if the poses are in the frame already.
+        """
         if self._is_own:
             return []
         lenders = self._lenders(rows)
@@ -386,7 +346,7 @@ class TrackReader:
         return [lent for lent in lent_spans if not lent.span.empty]
 
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
-        """Returns which sessions' transforms place the poses of some rows, each since when."""
+        """Returns the sessions whose transforms place the poses of rows, each with its begin."""
         sessions, recording = self._view.sessions, rows.recording
         session = sessions.of(recording)
         if sessions.has_all_kinds(session):
@@ -402,7 +362,7 @@ class TrackReader:
         return lenders
 
     def poses(self, window: TimeWindow) -> Placed:
-        """Returns all poses in a short window, in order.
+        """Returns all poses in a short window, in order of log time.
 
         Raises:
             QueryTimeoutError: the call's time is over.
@@ -412,36 +372,39 @@ class TrackReader:
         return _in_time_order([NOWHERE, *placed])
 
     def _lender_at(self, recording: Path, at: Ns) -> Session:
-        """Returns the session that places a recording's poses; a note says if none, or another."""
+        """Returns the session whose transforms place a recording's poses at a log time.
+
+        A note says if it is not the recording's own, or if there is none.
+        """
         session = lending_to(self._view, recording, (self._frame_id, self._own_frame), at)
         if not session:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 
     def _poses_of(self, rows: Rows, lent_spans: Sequence[_LentSpan]) -> Placed:
-        """Returns the poses of some rows in the frame; without lent spans as they are."""
+        """Returns the poses of rows in the frame; without lent spans, only those already in it."""
         if self._body is None:
             poses = self._reader.poses(rows)
         if not lent_spans:
             return _placed_poses(poses, None, self._frame_id)
         placed: list[Placed] = []
-        for lent in lent_spans:
-            frames = frames_over(self._view, lent.session, lent.span, self._frame_id)
+        for _, span, session in lent_spans:
+            frames = frames_over(self._view, session, span, self._frame_id)
             if self._body is None:
-                of_span = poses.between(lent.span.start, lent.span.stop)
-                placed.append(_placed_poses(of_span, frames, self._frame_id))
+                span_poses = poses.between(span.start, span.stop)
+                placed.append(_placed_poses(span_poses, frames, self._frame_id))
             else:
-                edges = edges_of_rows(self._view, rows, lent.session)
-                of_body = placed_body(edges, self._body.child, frames, lent.span)
-                x, y, _ = of_body.positions.T
-                placed.append(Placed(of_body.times, x, y, headings(of_body.turns), 0))
+                edges = edges_of_rows(self._view, rows, session)
+                body_poses = placed_body(edges, self._body.child, frames, span)
+                x, y, _ = body_poses.positions.T
+                placed.append(Placed(body_poses.times, x, y, headings(body_poses.turns), 0))
         return _in_time_order(placed)
 
 
 class _LentSpan(NamedTuple):
-    """By what poses of a span of log time are placed: the transforms of one session.
+    """A span of log time in which the transforms of one session place poses.
 
-    `since`: from when on it lends them.
+    `since` is the log time at which the session began to lend them; `span` may begin later.
     """
 
     since: Ns
@@ -456,8 +419,8 @@ class Placed(NamedTuple):
         times: log times (ns), ascending.
         x: metres.
         y: metres.
-        heading: radians; NaN where it is not known.
-        left_out: how many no transform placed.
+        heading: radians; NaN for a pose without a heading.
+        left_out: how many other poses no transform places.
     """
 
     times: Times
@@ -471,7 +434,7 @@ NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zero
 
 
 def _in_time_order(parts: Sequence[Placed]) -> Placed:
-    """Returns the poses of several tables, in order of time."""
+    """Returns the poses of one or more tables, in order of log time."""
     columns = zip(*(part[:4] for part in parts), strict=True)
     times, x, y, heading = map(np.concatenate, columns)
     order = np.argsort(times, kind="stable")
@@ -480,7 +443,7 @@ def _in_time_order(parts: Sequence[Placed]) -> Placed:
 
 
 def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
-    """Returns poses in a frame; those that no transform places are left out."""
+    """Returns poses in the target frame; those that no transform places are left out."""
     turns = QUATERNION.nearest(poses.turns)
     x, y, z = (column.copy() for column in poses.positions.T)
     valid = np.zeros(len(poses), np.bool_)
@@ -501,14 +464,27 @@ def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed
     return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
 
 
-def _tracks_by_robot(
-    tracks: Sequence[PartialTrack], apart: Collection[str] | None
-) -> tuple[PartialTrack, Times, Mask]:
-    """Returns the tracks of all recordings, whose each vertex is, and which lie beside the track.
+class _JoinedRecordings(NamedTuple):
+    """The tracks of all recordings.
 
-    Where several recordings place a robot at a time, that which began first is in the track; of
-    those that began at one time the first by name. What the other one has then is left out, unless
-    both are among those that are `apart`, as of several robots (None: all may be).
+    Attributes:
+        whole: the vertices, recording by recording.
+        recordings: for each vertex, the number of its recording.
+        is_beside: for each vertex, whether an earlier recording has another robot then.
+    """
+
+    whole: PartialTrack
+    recordings: Times
+    is_beside: Mask
+
+
+def _joined_recordings(
+    tracks: Sequence[PartialTrack], apart: Collection[str] | None
+) -> _JoinedRecordings:
+    """Joins the tracks of recordings; where two overlap, the one that began first counts.
+
+    If both began at one time, the first by name counts. The other one repeats it and is left out
+    there; if both are among the recordings `apart` (None: any may be), it is of another robot.
     """
     by_recording: dict[str, list[PartialTrack]] = defaultdict(list)
     for track in tracks[::-1]:
@@ -521,86 +497,42 @@ def _tracks_by_robot(
     whole, numbers = joined_tracks(recordings)
     ends = np.searchsorted(numbers, np.arange(len(recordings) + 1))
     firsts, lasts = whole.times[ends[:-1]], whole.times[ends[1:] - 1]
-    is_beside, repeats = np.zeros((2, len(whole.times)), np.bool_)
-    for nth in np.flatnonzero(firsts[1:] <= np.maximum.accumulate(lasts)[:-1]) + 1:
-        here = slice(*ends[nth : nth + 2])
-        for other in np.flatnonzero(lasts[:nth] >= firsts[nth]):
-            placed = whole.times[slice(*ends[other : other + 2])]
+    is_beside, is_repeated = np.zeros((2, len(whole.times)), np.bool_)
+    for later in np.flatnonzero(firsts[1:] <= np.maximum.accumulate(lasts)[:-1]) + 1:
+        vertices = slice(*ends[later : later + 2])
+        times = whole.times[vertices]
+        for earlier in np.flatnonzero(lasts[:later] >= firsts[later]):
+            placed = whole.times[slice(*ends[earlier : earlier + 2])]
             starts, stops = pieces_of(placed, placed)
-            piece = np.searchsorted(starts, whole.times[here], side="right") - 1
-            pair = {recordings[nth][0].recording, recordings[other][0].recording}
-            beside = is_beside if apart is None or pair.issubset(apart) else repeats
-            beside[here] |= (piece >= 0) & (whole.times[here] <= stops[piece])
-    own = np.flatnonzero(~repeats)
-    return whole.some(own), numbers[own], is_beside[own]
+            piece = np.searchsorted(starts, times, side="right") - 1
+            is_overlapping = (piece >= 0) & (times <= stops[piece])
+            pair = {recordings[later][0].recording, recordings[earlier][0].recording}
+            if apart is None or pair.issubset(apart):
+                is_beside[vertices] |= is_overlapping
+            else:
+                is_repeated[vertices] |= is_overlapping
+    own = np.flatnonzero(~is_repeated)
+    return _JoinedRecordings(whole.some(own), numbers[own], is_beside[own])
 
 
-def _together(
+def _merged_back(
     sources: Iterable[Iterator[tuple[Ns, PartialTrack]]],
 ) -> Iterator[tuple[Ns, PartialTrack]]:
-    """Yields what all of several yield, the newest first, each with a time that all have reached.
+    """Yields the tracks of all sources, newest first, each with a log time all have reached.
 
-    The one that is behind goes on.
+    The source that is least far back is asked for its next track.
     """
-    reached, held = dict.fromkeys(sources, MAX_NS), list[PartialTrack]()
+    reached = dict.fromkeys(sources, MAX_NS)
+    waiting: list[PartialTrack] = []
     while reached:
-        behind = max(reached, key=reached.__getitem__)
-        found = next(behind, None)
-        if found is None:
-            del reached[behind]
+        newest = max(reached, key=reached.__getitem__)
+        timed_track = next(newest, None)
+        if timed_track is None:
+            del reached[newest]
         else:
-            reached[behind], track = found
-            held.append(track)
+            reached[newest], track = timed_track
+            waiting.append(track)
         since = max(reached.values(), default=MIN_NS)
         if since < MAX_NS:
-            yield from ((since, each) for each in held)
-            held.clear()
-
-
-def _without_jumps(parts: ClippedSteps, are_jumps: Mask) -> ClippedSteps:
-    """Returns the parts of steps inside of a region; of a jump only those of its ends inside.
-
-    Nobody drives where a robot jumps: its odometry started again, or its map was corrected.
-    """
-    jumped = are_jumps[parts.step]
-    begins, ends = parts.start <= 0, parts.stop >= 1
-    start = np.where(jumped & ~begins, 1.0, parts.start)
-    stop = np.where(jumped & ~ends, 0.0, parts.stop)
-    kept = ~jumped | begins | ends
-    return ClippedSteps(parts.step[kept], start[kept], stop[kept])
-
-
-def stays_within(track: RobotTrack, region: Region, window: TimeWindow) -> list[Stay]:
-    """Returns when the robot was inside of a region in a window, in order; see `stays`."""
-    return [
-        stay.within(window)
-        for stay in stays(track, region)
-        if window.overlaps(stay.start, stay.stop)
-    ]
-
-
-def stays(track: RobotTrack, region: Region) -> list[Stay]:
-    """Returns when the robot was inside of a region, in order, by its track.
-
-    A robot that was outside for less than `FLICKER_NS` did not leave. What it did in a silence
-    longer than `SILENCE_NS` is not known: it ends the time, and begins another.
-    """
-    count = len(track.times)
-    # A piece of a single vertex is a step of no length.
-    after = np.arange(count) + ~track.ends
-    steps = Steps(track.x, track.y, track.x[after], track.y[after])
-    parts = _without_jumps(clipped(region, steps), jumps(track)) if count else None
-    if parts is None or not len(parts.step):
-        return []
-    begin = track.times[parts.step]
-    lasted = track.times[after[parts.step]] - begin
-    starts = begin + np.rint(lasted * parts.start).astype(np.int64)
-    stops = begin + np.rint(lasted * parts.stop).astype(np.int64)
-    piece = np.cumsum(track.begins)[parts.step] - 1
-    # Where the piece began, or ended, inside, it is not known.
-    opened, closed = (ends[piece] for ends in track.pieces)
-    apart = (starts[1:] - stops[:-1] >= FLICKER_NS) | (piece[1:] != piece[:-1])
-    first = np.append([True], apart)
-    last = np.append(apart, [True])
-    columns = starts[first], stops[last], (starts > opened)[first], (stops < closed)[last]
-    return [*map(Stay, *(column.tolist() for column in columns))]
+            yield from ((since, track) for track in waiting)
+            waiting.clear()

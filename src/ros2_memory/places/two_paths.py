@@ -1,7 +1,7 @@
 """Compares two paths by the robot's tracks: where they are farthest apart, and where it stood.
 
-Both results are in one frame, so they are useful only if that is the map, or if odometry did not
-start again between the two.
+Both tracks must be in one frame. That frame should be the map, unless odometry went on between the
+two paths: after a restart the same coordinates are another place.
 """
 
 from __future__ import annotations
@@ -27,14 +27,18 @@ SAME_STAND_M: Final = 0.5
 """Standstills so near to each other are at one place."""
 
 _STEP_M: Final = 0.1
+"""The distance of two samples of a path, unless that makes too many."""
 _MOST_SAMPLES: Final = 200_000
 _MOST_CELLS: Final = 4_000
+"""How many samples of a path are compared with how many of the other one."""
 _CANDIDATES: Final = 64
+"""For how many samples the exact distance from the other path is measured."""
 _SAMPLES_OF_STAND: Final = 9
+"""The place of a standstill is the median of so many samples."""
 
 
 class PlacedStandstill(NamedTuple):
-    """A standstill at a place (m)."""
+    """A standstill and its place (m); `start` is a log time, `duration` in ns."""
 
     x: float
     y: float
@@ -42,8 +46,8 @@ class PlacedStandstill(NamedTuple):
     duration: Ns
 
 
-class _Steps(NamedTuple):
-    """The straight steps of a track in a window: their ends (m), one row each, and their times."""
+class _TrackSteps(NamedTuple):
+    """The straight steps of a track in a window: x and y (m) of both ends, and their log times."""
 
     begin: Floats
     end: Floats
@@ -56,32 +60,36 @@ def farthest_apart(
     other: tuple[RobotTrack, TimeWindow],
     region: Region | None = None,
 ) -> tuple[FarFromOther | None, FarFromOther | None]:
-    """Returns the point of each path that is farthest from the other one, without named places.
+    """Returns the point of each path that is farthest from the other path.
 
-    Only the part of each path in its window counts, and in the region, if one is given.
-    None where it has no point, or the other way has none at all.
+    Of each path only the part in its window, and in the region, is searched. None if that has no
+    point, or if the other path has none in its window. The names of places are left empty.
     """
-    these, two = _steps(*this), _steps(*other)
-    return _farthest(these, two, region), _farthest(two, these, region)
+    these, others = _steps(*this), _steps(*other)
+    return _farthest(these, others, region), _farthest(others, these, region)
 
 
-def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
-    """Returns the steps of a track inside a window; a piece of one vertex is one of no length.
+def _steps(track: RobotTrack, window: TimeWindow) -> _TrackSteps:
+    """Returns the steps of a track inside a window; a lone vertex is a step of no length.
 
-    Nobody was between the ends of a jump, nor at a vertex that was jumped to and from.
+    Jumps are no steps, and a vertex that the robot jumped to and from is left out.
     """
     part = cut(track, window)
     jumped = jumps(part)
     ends = part.ends | jumped
-    alone = ends & np.append([True], ends[:-1])[: len(ends)]
-    alone &= ~(jumped & np.append([False], jumped[:-1])[: len(ends)])
-    first = np.flatnonzero(~ends | alone)
+    is_alone = ends & np.append([True], ends[:-1])[: len(ends)]
+    is_jumped_over = jumped & np.append([False], jumped[:-1])[: len(ends)]
+    first = np.flatnonzero(~ends | (is_alone & ~is_jumped_over))
     last = first + ~ends[first]
     places = np.column_stack((part.x, part.y))
-    return _Steps(places[first], places[last], part.times[first], part.times[last])
+    return _TrackSteps(places[first], places[last], part.times[first], part.times[last])
 
 
-def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarFromOther | None:
+def _farthest(steps: _TrackSteps, other: _TrackSteps, region: Region | None) -> FarFromOther | None:
+    """Returns the point of the steps that is farthest from the other steps.
+
+    Samples of both are compared first, and then the farthest samples with the exact steps.
+    """
     points, times = _sampled(steps)
     if region is not None:
         inside = [region.contains(x, y) for x, y in points.tolist()]
@@ -89,23 +97,28 @@ def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarFromOth
     if not len(points) or not len(other.begin):
         return None
     points, times = _thinned(points, times)
-    marks, _ = _thinned(*_sampled(other))
-    near = np.concatenate(
-        [
-            ((chunk[:, :1] - marks[:, 0]) ** 2 + (chunk[:, 1:] - marks[:, 1]) ** 2).min(axis=1)
-            for chunk in np.array_split(points, len(points) // 64 + 1)
-        ]
-    )
-    tried = np.argsort(-near, kind="stable")[:_CANDIDATES]
+    other_points, _ = _thinned(*_sampled(other))
+    candidates = np.argsort(-_nearest_squared(points, other_points), kind="stable")[:_CANDIDATES]
     lines = Steps(*other.begin.T, *other.end.T)
-    away = [float(lines.nearest_to(x, y)[1].min()) for x, y in points[tried].tolist()]
-    farthest = int(np.argmax(away))
-    x, y = points[tried[farthest]].tolist()
-    return FarFromOther((x, y), (), away[farthest], int(times[tried[farthest]]))
+    away_m = [float(lines.nearest_to(x, y)[1].min()) for x, y in points[candidates].tolist()]
+    nth = int(np.argmax(away_m))
+    farthest = candidates[nth]
+    x, y = points[farthest].tolist()
+    return FarFromOther((x, y), (), away_m[nth], int(times[farthest]))
 
 
-def _sampled(steps: _Steps) -> tuple[Floats, Times]:
-    """Returns points along the steps, no farther apart than `_STEP_M` unless they are too many."""
+def _nearest_squared(points: Floats, others: Floats) -> Floats:
+    """Returns the squared distance (m2) of each point from the nearest of the others."""
+    # In chunks, so that the table of all distances is never in memory.
+    nearest = [
+        ((chunk[:, :1] - others[:, 0]) ** 2 + (chunk[:, 1:] - others[:, 1]) ** 2).min(axis=1)
+        for chunk in np.array_split(points, len(points) // 64 + 1)
+    ]
+    return np.concatenate(nearest)
+
+
+def _sampled(steps: _TrackSteps) -> tuple[Floats, Times]:
+    """Returns points (m) along the steps, `_STEP_M` apart or, if too many, more; and log times."""
     lengths = np.hypot(*(steps.end - steps.begin).T)
     step_m = max(_STEP_M, float(lengths.sum()) / _MOST_SAMPLES)
     parts = np.ceil(lengths / step_m).astype(np.int64) + 1
@@ -118,74 +131,89 @@ def _sampled(steps: _Steps) -> tuple[Floats, Times]:
 
 
 def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
-    """Returns the first point in each cell of a grid as fine as leaves few of them."""
-    size = _STEP_M
+    """Returns the first point in each cell of the finest grid with `_MOST_CELLS` or fewer."""
+    cell_m = _STEP_M
     while True:
-        x, y = np.floor(points / size).astype(np.int64).T
-        first = np.sort(Groups.of(distinct_rows((x, y))[1]).firsts)
+        x, y = np.floor(points / cell_m).astype(np.int64).T
+        _, cells = distinct_rows((x, y))
+        first = np.sort(Groups.of(cells).firsts)
         if len(first) <= _MOST_CELLS:
             return points[first], times[first]
-        size *= 2
+        cell_m *= 2
 
 
 def placed_standstills(
     track: RobotTrack, spans: Iterable[Span], region: Region | None = None
 ) -> Iterator[PlacedStandstill]:
-    """Yields standstills with their place on the track; those in a region, if one is given.
+    """Yields standstills with their places on the track; only those in a region, if it is given.
 
-    Standstills outside the track are left out.
+    Standstills of which the track has no sample are left out.
     """
     ends = np.array([*spans], np.int64).reshape(-1, 2)
     if not len(track.times) or not len(ends):
         return
-    at = np.linspace(ends[:, 0], ends[:, 1], _SAMPLES_OF_STAND, axis=1).astype(np.int64)
-    is_known = _is_known(track, at)
+    times = np.linspace(ends[:, 0], ends[:, 1], _SAMPLES_OF_STAND, axis=1).astype(np.int64)
+    is_known = _is_known(track, times)
     has_known = is_known.any(axis=1)
-    ends, at, is_known = ends[has_known], at[has_known], is_known[has_known]
-    x, y = (np.nanmedian(np.where(is_known, axis, np.nan), axis=1) for axis in track.at(at)[:2])
+    ends, times, is_known = ends[has_known], times[has_known], is_known[has_known]
+    x, y = (np.nanmedian(np.where(is_known, axis, np.nan), axis=1) for axis in track.at(times)[:2])
     rows = zip(x.tolist(), y.tolist(), ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True)
-    for here, there, start, stop in rows:
-        if region is None or region.contains(here, there):
-            yield PlacedStandstill(here, there, start, stop - start)
+    for stand_x, stand_y, start, stop in rows:
+        if region is None or region.contains(stand_x, stand_y):
+            yield PlacedStandstill(stand_x, stand_y, start, stop - start)
 
 
-def _is_known(track: RobotTrack, at: Ints) -> Flags:
-    """Returns whether a track covers some times, or ends or begins `SILENCE_NS` from them."""
+def _is_known(track: RobotTrack, times: Ints) -> Flags:
+    """Returns which log times lie in a piece of the track, or within `SILENCE_NS` of one."""
     starts, stops = track.pieces
-    piece = np.searchsorted(starts - SILENCE_NS, at, side="right") - 1
-    return (piece >= 0) & (at <= stops[piece] + SILENCE_NS)
+    piece = np.searchsorted(starts - SILENCE_NS, times, side="right") - 1
+    return (piece >= 0) & (times <= stops[piece] + SILENCE_NS)
+
+
+class _PlaceStands(NamedTuple):
+    """A place (m), and the standstills there in each of two windows."""
+
+    x: float
+    y: float
+    this: list[PlacedStandstill]
+    other: list[PlacedStandstill]
 
 
 def stood_at(
     this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
 ) -> list[StandstillPlace]:
-    """Returns where the robot stood in two windows, and how long in each, without named places.
+    """Returns the places where the robot stood in two windows, and how long in each.
 
-    A place is where it stood longest within `SAME_STAND_M`.
+    A place is where the robot stood longest, and gathers standstills within `SAME_STAND_M`. The
+    names of places are left empty.
     """
-    stands = [(stand, side) for side, window in enumerate((this, other)) for stand in window]
-    stands.sort(key=lambda sided: (-sided[0].duration, sided[0]))
+    stands = [*((stand, False) for stand in this), *((stand, True) for stand in other)]
+    stands.sort(key=lambda marked: (-marked[0].duration, marked[0]))
     middles = np.empty((len(stands), 2))
-    by_place: list[tuple[list[PlacedStandstill], list[PlacedStandstill]]] = []
-    for stand, side in stands:
-        nth = count = len(by_place)
-        away = ((middles[:count] - (stand.x, stand.y)) ** 2).sum(axis=1)
-        if (away <= SAME_STAND_M**2).any():
-            nth = int(away.argmin())
+    places: list[_PlaceStands] = []
+    for stand, is_other in stands:
+        squared = ((middles[: len(places)] - (stand.x, stand.y)) ** 2).sum(axis=1)
+        if (squared <= SAME_STAND_M**2).any():
+            place = places[int(squared.argmin())]
         else:
-            middles[nth] = stand.x, stand.y
-            by_place.append(([], []))
-        by_place[nth][side].append(stand)
+            middles[len(places)] = stand.x, stand.y
+            place = _PlaceStands(stand.x, stand.y, [], [])
+            places.append(place)
+        (place.other if is_other else place.this).append(stand)
     return [
         StandstillPlace(
-            (x, y),
+            (place.x, place.y),
             (),
-            Pair(*(unix_from_ns(sum(stand.duration for stand in own)) for own in (these, those))),
-            (_first_of(these), _first_of(those)),
+            Pair(_total_s(place.this), _total_s(place.other)),
+            (_first_start(place.this), _first_start(place.other)),
         )
-        for (x, y), (these, those) in zip(middles.tolist(), by_place, strict=False)
+        for place in places
     ]
 
 
-def _first_of(stands: Iterable[PlacedStandstill]) -> Ns | None:
+def _total_s(stands: Iterable[PlacedStandstill]) -> float:
+    return unix_from_ns(sum(stand.duration for stand in stands))
+
+
+def _first_start(stands: Iterable[PlacedStandstill]) -> Ns | None:
     return min((stand.start for stand in stands), default=None)

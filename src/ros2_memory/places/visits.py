@@ -1,11 +1,9 @@
 """Visits to a place: arrival, departure and closest approach, newest first.
 
-`visits` is the query; the track comes from `robot_tracks`, by way of `known_track`.
-
-A visit is pose after pose inside. It is over when the robot is outside for some seconds, and where
-for longer there is no pose to know it by. All visits are found by the track, from which no pose is
-farther than some 5 cm; those that are shown begin and end at poses. When odometry is reset, the
-same coordinates are another place: visits from before that are marked.
+A visit lasts as long as poses are inside the place. It ends when the robot is outside for
+`FLICKER_NS`, or when there is no pose for `SILENCE_NS`. The robot's track, which is within 5 cm of
+every pose, shows the visits. Those that are shown, and those along the edge of the place, are then
+checked by the poses. A reset of odometry moves its coordinates: visits from before are marked.
 """
 
 from __future__ import annotations
@@ -41,7 +39,8 @@ from ros2_memory.places.pose_frames import (
     placed_times,
     places_in,
 )
-from ros2_memory.places.robot_tracks import Placed, Stay, TrackReader, stays
+from ros2_memory.places.robot_tracks import Placed, TrackReader
+from ros2_memory.places.stays import Stay, stays
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import PlaceVisits, Visit, Visits
 
@@ -51,13 +50,16 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.frames import Times
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
-_SPLITS: Final = 3
-"""A pose no older than so many splits is current: a split answers only when it is closed."""
+_CURRENT_SPLITS: Final = 3
+"""A pose no older than so many splits is current: the server reads a split once it is closed."""
 _CLOSE_NS: Final = 60 * NS_PER_S
+"""Two visits farther apart are never joined."""
 _MOST_TRIED: Final = 50
+"""How many doubtful joins, and doubtful visits without a vertex inside, are checked by poses."""
 _MOST_CONFIRMED: Final = 1000
-"""Visits along the edge of a region that are looked at: it takes about a millisecond for each."""
+"""How many visits along the edge of a region are checked by poses: each takes a millisecond."""
 _CLEARLY_M: Final = 5 * TOLERANCE_M
+"""If a vertex is so far (m) beyond one side of a region, no pose near it is inside."""
 
 
 def visits(
@@ -73,11 +75,11 @@ def visits(
     end_s: float | None = None,
     limit: int = 10,
 ) -> Visits:
-    """Returns when the robot was in a place, newest visits first; of no place, all named ones.
+    """Returns the visits to a place, newest first; without a place, a summary for each named one.
 
-    A place is a circle around `x` and `y` (m), or `where`. Coordinates are in `frame_id`: the map,
-    which is the default, or the frame of the poses. Between `start_s` and `end_s` (Unix seconds,
-    inclusive) alone, where these are given.
+    The place is a circle around `x` and `y` (m), or `where`. Coordinates are in `frame_id`: the map
+    (the default) or the frame of the poses. `start_s` and `end_s` (Unix seconds, inclusive) bound
+    the search.
 
     Raises:
         InvalidArgumentsError: the pose topic carries no position, the place is invalid, the frame
@@ -90,23 +92,20 @@ def visits(
     require_recorded(view, window)
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
-    asked_frame = (place and place.frame_id) or frame_id
+    asked_frame = frame_id if place is None or place.frame_id is None else place.frame_id
     placement = map_placement(view, topic, asked_frame)
     if place is None:
         return _visits_of_places(view, window, placement, mixed, now)
-    region_visits = ConfirmedStays(view, placement.frame_id, place.region, window)
-    track, all_visits = region_visits.known.track, region_visits.every
-    newest = _newest_pose_time(view, topic, track, window, now + FUTURE_NS)
-    # A newer pose shows where the robot is now; or what else was recorded since, that none does.
-    stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
-    stale = max(stale, min(view.snapshot.latest or MIN_NS, now) - NEWEST_POSE_NS)
-    current = newest if newest is not None and newest >= stale else None
+    confirmed = ConfirmedStays(view, placement.frame_id, place.region, window)
+    newest = _newest_pose_time(view, topic, confirmed.known.track, window, now + FUTURE_NS)
+    current = newest if newest is not None and newest >= _oldest_current(view, now) else None
     shown = tuple(
-        _within_asked(region_visits.shown(visit, current), window) for visit in all_visits[:limit]
+        _at_asked_bounds(confirmed.shown(visit, current), window)
+        for visit in confirmed.visits[:limit]
     )
     if not placement.is_map:
         shown = _with_restarts(view, topic, shown, now)
-    if not all_visits and asked_frame is None:
+    if not confirmed.visits and asked_frame is None:
         ask = f'ask with frame_id "{placement.pose_frame}"'
         note_other_frame(view, place, placement, window, ask)
     view.notes.retract_outside(window)
@@ -116,31 +115,41 @@ def visits(
         frame_id=placement.frame_id,
         circle=circle,
         visits=shown,
-        more=len(all_visits) > len(shown),
-        total=len(all_visits),
+        more=len(confirmed.visits) > len(shown),
+        total=len(confirmed.visits),
         now=now,
-        duration=region_visits.duration,
-        entries=sum(visit.inside.entered for visit in all_visits),
-        exits=sum(visit.inside.left for visit in all_visits),
-        all_counted=region_visits.known.since is None,
+        duration=confirmed.duration,
+        entries=len(confirmed.entries),
+        exits=len(confirmed.exits),
+        all_counted=confirmed.known.since is None,
         where=place.name,
-        unknown=_unknown(view, window, [track], mixed),
+        unknown=_unknown(view, window, [confirmed.known.track], mixed),
         is_current=current is not None,
         notes=view.notes.sentences(),
     )
 
 
+def _oldest_current(view: View, now: Ns) -> Ns:
+    """Returns the log time from which on a pose shows where the robot is now.
+
+    If the newest messages have no pose beside them, the robot may have moved meanwhile.
+    """
+    by_splits = now - _CURRENT_SPLITS * ns_from_unix(view.limits.split_duration_s)
+    newest = min(view.snapshot.latest or MIN_NS, now)
+    return max(by_splits, newest - NEWEST_POSE_NS)
+
+
 def _visits_of_places(
     view: View, window: TimeWindow, placement: MapPlacement, mixed: Spans, now: Ns
 ) -> Visits:
-    """Returns how often and for how long the robot was in each named place, the longest first."""
-    visited = [
+    """Returns how often and how long the robot was in each named place, the longest first."""
+    stays_of_places = [
         (place, ConfirmedStays(view, place.frame_id, place.region, window))
         for place, _ in places_in(view, view.limits.places, placement, window)
     ]
-    rows = (place_visits(region_visits, place.name) for place, region_visits in visited)
+    rows = (confirmed.summary(place.name) for place, confirmed in stays_of_places)
     places = tuple(sorted(rows, key=lambda row: (-row.duration, row.place)))
-    tracks = {place.frame_id: region_visits.known.track for place, region_visits in visited}
+    tracks = {place.frame_id: confirmed.known.track for place, confirmed in stays_of_places}
     was_in_one = any(row.duration for row in places)
     note_unread(view, window, nothing=not was_in_one, gaps=not was_in_one)
     return Visits(
@@ -154,7 +163,7 @@ def _visits_of_places(
 
 
 def _note_shown(view: View, window: TimeWindow, shown: Sequence[Visit], newest: Ns | None) -> None:
-    """Adds notes on what the visits shown leave open; `newest` is the time of the newest pose."""
+    """Notes what the visits shown leave open; `newest` is the log time of the newest pose."""
     note_unread(view, window, nothing=not shown, gaps=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
@@ -174,10 +183,17 @@ def asked_place(
     radius_m: float | None,
     where: JsonValue,
 ) -> Where | None:
-    """Returns the requested place; None for all named ones.
+    """Returns the place that the arguments of a tool name; None for all named places.
+
+    Args:
+        limits: the settings, which have the named places.
+        point: the middle x and y (m) of a circle, if they are given.
+        radius_m: the radius of a circle; None for the position tolerance.
+        where: the argument `where`, if it is given.
 
     Raises:
-        InvalidArgumentsError: the arguments name none, or two.
+        InvalidArgumentsError: the arguments are invalid, name two places, or name none although no
+            place has a name.
     """
     radius = limits.position_tolerance_m if radius_m is None else radius_m
     if not (radius > 0 and math.isfinite(radius)):
@@ -199,7 +215,7 @@ def asked_place(
 
 
 def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans) -> Ns:
-    """Returns for how long it is not known where the robot was, by a track for each frame."""
+    """Returns how long (ns) some track, of those in different frames, is not known."""
     spans = (
         unknown_times(view, window, placed_times(track, mixed), WHEREABOUTS, mixed=mixed)
         for track in tracks
@@ -210,7 +226,10 @@ def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed
 def _newest_pose_time(
     view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns
 ) -> Ns | None:
-    """Returns the time of the newest pose until `last`, where the window reaches as far."""
+    """Returns the log time of the track's newest vertex, which is the newest pose until `last`.
+
+    None if the window ends before that pose, or if there is none.
+    """
     message = view.stream.last(topic, last + 1)
     if message is None or window.stop <= message.time:
         return None
@@ -218,8 +237,11 @@ def _newest_pose_time(
     return int(times[-1]) if times.size else None
 
 
-def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
-    """Returns a visit that is cut at the bounds that were given, not at their tolerance."""
+def _at_asked_bounds(visit: Visit, window: TimeWindow) -> Visit:
+    """Returns the visit; if the window cuts it, it is cut at the bounds that the client gave.
+
+    The window itself has some tolerance beyond them.
+    """
     start, end = window.asked()
     if visit.arrived == window.start:
         visit = replace(visit, arrived=start)
@@ -227,16 +249,17 @@ def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
 
 
 def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) -> tuple[Visit, ...]:
-    """Returns visits, newest first, with the number of odometry resets since.
+    """Returns visits, newest first, with the number of odometry resets since each.
 
-    None are counted, with a note, if the time for the answer runs out first.
+    If time runs out, none is counted, and a note says so.
     """
     if not shown:
         return shown
     try:
         path, _ = driven_path(view, topic, TimeWindow(shown[-1].arrived or MIN_NS, MAX_NS))
     except (InvalidArgumentsError, NoDataError):
-        return shown  # poses that cannot be read say nothing about resets
+        # Poses that cannot be read say nothing about resets.
+        return shown
     except QueryTimeoutError:
         view.notes.add_lack("there was no time to check whether odometry restarted since")
         return shown
@@ -248,12 +271,12 @@ def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) ->
 
 
 class TrackedStay(NamedTuple):
-    """A visit to a region by a track.
+    """A visit to a region, as a track has it.
 
     Attributes:
-        inside: the part in the window, as long as the track has it.
-        whole: the visit, not cut.
-        track: of the robot.
+        inside: the part of the visit in the window.
+        whole: the whole visit.
+        track: the robot's track.
     """
 
     inside: Stay
@@ -262,16 +285,18 @@ class TrackedStay(NamedTuple):
 
 
 class ConfirmedStays:
-    """The visits to a region of a frame that reach into a window.
+    """The visits to a region of a frame that overlap a window.
+
+    Tracks show them. Those that are in doubt are confirmed by poses.
 
     Attributes:
         known: the tracks of the robots.
-        every: their visits, newest first.
-        elapsed: how much time passed between moments of the window.
+        visits: the visits of all robots, newest first.
+        elapsed: how much time passed between log times of the window.
     """
 
     def __init__(self, view: View, frame_id: str, region: Region, window: TimeWindow) -> None:
-        """Finds the visits by the tracks, and confirms by poses those that are in doubt.
+        """Finds the visits.
 
         Raises:
             QueryTimeoutError: the call's time runs out before any result.
@@ -279,17 +304,17 @@ class ConfirmedStays:
         self.known = known_track(view, frame_id, window)
         self.elapsed = elapsed_in(view, window)
         self._region, self._window = region, window
-        # The poses that confirm a visit show where it begins, too.
+        # A shown visit begins at one of the poses by which it was confirmed.
         self._poses = lru_cache(2 * _MOST_TRIED)(TrackReader(view, frame_id).poses)
         by_track = [
             TrackedStay(stay.within(window), stay, track)
             for track in self.known.tracks
-            for stay in self._continued(stays(track, region), track)
+            for stay in self._without_false_exits(stays(track, region), track)
             if window.overlaps(stay.start, stay.stop)
         ]
         by_track.sort(key=lambda visit: visit.whole, reverse=True)
         self._looked_at = 0
-        self.every = [visit for visit in map(self._confirmed, by_track) if visit is not None]
+        self.visits = [visit for visit in map(self._confirmed, by_track) if visit is not None]
         if self._looked_at > _MOST_CONFIRMED:
             older = counted(self._looked_at - _MOST_CONFIRMED, "older visit")
             view.notes.add(
@@ -297,62 +322,87 @@ class ConfirmedStays:
             )
 
     @property
-    def duration(self) -> Ns:
-        """How long they were in all, as the tracks have them."""
-        return self.elapsed.among((visit.inside.start, visit.inside.stop) for visit in self.every)
+    def entries(self) -> list[TrackedStay]:
+        """The visits in whose beginning the robot came from outside."""
+        return [visit for visit in self.visits if visit.inside.entered]
 
-    def ends(self, visit: TrackedStay) -> Stay:
+    @property
+    def exits(self) -> list[TrackedStay]:
+        """The visits at whose end the robot went outside."""
+        return [visit for visit in self.visits if visit.inside.left]
+
+    @property
+    def duration(self) -> Ns:
+        """How long (ns) all visits lasted together, by the tracks."""
+        return self.elapsed.among((visit.inside.start, visit.inside.stop) for visit in self.visits)
+
+    def summary(self, name: str) -> PlaceVisits:
+        """Returns how often and how long the robot was in the region, which has this name."""
+        entries, exits = self.entries, self.exits
+        first = last = None
+        if entries:
+            first = self._between_poses(entries[-1]).start
+        if exits:
+            last = self._between_poses(max(exits, key=lambda visit: visit.inside.stop)).stop
+        return PlaceVisits(name, len(entries), len(exits), self.duration, first, last)
+
+    def shown(self, visit: TrackedStay, newest: Ns | None) -> Visit:
+        """Returns a visit as the reply shows it.
+
+        Its times are log times of poses: the first and the last inside, and the closest to the
+        middle. `newest` is the log time of the robot's newest pose, or None if that is too old.
+        """
+        stay = self._between_poses(visit)
+        is_there = newest is not None and stay.start <= newest <= stay.stop and not stay.left
+        closest_m, closest_at = None, None
+        if isinstance(self._region, Circle):
+            closest_m, closest_at = self._closest(visit.track, stay, self._region)
+        return Visit(
+            arrived=stay.start,
+            departed=None if is_there else stay.stop,
+            duration=self.elapsed.between(stay.start, stay.stop),
+            closest_m=closest_m,
+            closest_at=closest_at,
+            restarts=0,
+            already_inside=not stay.entered,
+            still_inside=not stay.left and not is_there,
+        )
+
+    def _between_poses(self, visit: TrackedStay) -> Stay:
         """Returns a visit from its first to its last pose inside, cut at the window's ends."""
         exact = self._by_poses(visit)
         return visit.inside if exact is None else exact.within(self._window)
 
-    def shown(self, visit: TrackedStay, newest: Ns | None) -> Visit:
-        """Returns a visit for the reply.
+    def _without_false_exits(self, visits: list[Stay], track: RobotTrack) -> list[Stay]:
+        """Returns visits, newest first, joined where the poses between them did not leave.
 
-        Its times are those of poses: of the first and the last one inside, and of the closest.
-        `newest` is the newest pose, if it is recent enough.
-        """
-        ends = self.ends(visit)
-        is_there = newest is not None and ends.start <= newest <= ends.stop and not ends.left
-        distance_m, at = None, None
-        if isinstance(self._region, Circle):
-            distance_m, at = self._closest(visit.track, ends, self._region)
-        return Visit(
-            arrived=ends.start,
-            departed=None if is_there else ends.stop,
-            duration=self.elapsed.between(ends.start, ends.stop),
-            closest_m=distance_m,
-            closest_at=at,
-            restarts=0,
-            already_inside=not ends.entered,
-            still_inside=not ends.left and not is_there,
-        )
-
-    def _continued(self, visits: list[Stay], track: RobotTrack) -> list[Stay]:
-        """Returns visits; those as one between which the robot's poses did not leave.
-
-        Along the edge of a region its track may be outside where it was inside. The newest
-        `_MOST_TRIED` of those where it stays near the edge are looked at.
+        Along the edge of a region the track may be outside while poses are inside. At most
+        `_MOST_TRIED` such times, the newest, are looked at.
         """
         joined_visits = visits[-1:]
         looked_at = 0
         for older in visits[-2::-1]:
             newer = joined_visits[-1]
             is_close = newer.start - older.stop < _CLOSE_NS
-            if newer.entered and older.left and is_close and not self._left(older, newer, track):
+            if (
+                is_close
+                and newer.entered
+                and older.left
+                and not self._is_clearly_outside(track, older.stop, newer.start)
+            ):
                 looked_at += 1
-                if looked_at <= _MOST_TRIED and self._stays(older, newer):
+                if looked_at <= _MOST_TRIED and self._poses_stay(older, newer):
                     joined_visits[-1] = newer._replace(start=older.start, entered=older.entered)
                     continue
             joined_visits.append(older)
         return joined_visits
 
-    def _left(self, older: Stay, newer: Stay, track: RobotTrack) -> bool:
-        """Returns whether a track is clearly outside for as long as leaving takes between visits.
+    def _is_clearly_outside(self, track: RobotTrack, start: Ns, stop: Ns) -> bool:
+        """Returns whether a track is clearly outside for `FLICKER_NS` between two log times.
 
-        So far beyond one side of the region that no pose near it is inside.
+        It is if its vertices are `_CLEARLY_M` beyond one side of the region.
         """
-        between = slice(*np.searchsorted(track.times, (older.stop, newer.start)))
+        between = slice(*np.searchsorted(track.times, (start, stop)))
         times, x, y = track.times[between], track.x[between], track.y[between]
         low_x, high_x, low_y, high_y = self._region.bounds
         for beyond_m in (low_x - x, x - high_x, low_y - y, y - high_y):
@@ -362,30 +412,31 @@ class ConfirmedStays:
                 return True
         return False
 
-    def _stays(self, older: Stay, newer: Stay) -> bool:
-        """Returns whether poses between two visits were never outside for as long as leaving takes.
+    def _poses_stay(self, older: Stay, newer: Stay) -> bool:
+        """Returns whether poses between two visits were never outside for `FLICKER_NS`.
 
-        False where there is no pose inside before or after.
+        False if there is no pose inside at the end of the older or the begin of the newer one.
         """
         first = max(older.start, older.stop - TRACK_SLICE_NS)
         last = min(newer.stop, newer.start + TRACK_SLICE_NS)
         poses = self._poses(TimeWindow(first, last + 1))
-        inside = self._inside(poses)
+        inside = self._times_inside(poses)
         if not inside or inside[0] > older.stop or inside[-1] < newer.start:
             return False
         return not any(_absences(poses.times, inside))
 
     def _confirmed(self, visit: TrackedStay) -> TrackedStay | None:
-        """Returns a visit; None where no pose in the window is inside: the line alone touches.
+        """Returns a visit; None if no pose in the window is inside, but only the line of the track.
 
-        Of the visits without a vertex inside the newest `_MOST_TRIED` are looked at, and as many as
-        `_MOST_CONFIRMED` of those along the edge; a note says if there are more.
+        Poses are looked up if the visit is near an end of the window, or has no vertex inside. Of
+        the latter, those beyond the newest `_MOST_TRIED` need no poses if they are clearly inside,
+        and those beyond `_MOST_CONFIRMED` are taken as they are.
         """
         window, whole, track = self._window, visit.whole, visit.track
-        # So near to the window's ends, poses decide on which side a visit begins, or ends.
-        room = TRACK_SLICE_NS
-        if window.start + room <= whole.start and whole.stop < window.stop - room:
-            if self._inside(track, whole.start, whole.stop):
+        # Near an end of the window, poses decide on which side of it a visit begins or ends.
+        near_end = TRACK_SLICE_NS
+        if window.start + near_end <= whole.start and whole.stop < window.stop - near_end:
+            if self._times_inside(track, whole.start, whole.stop):
                 return visit
             if self._looked_at >= _MOST_TRIED and self._is_clearly_inside(visit):
                 return visit
@@ -396,16 +447,16 @@ class ConfirmedStays:
         if exact is None or not window.overlaps(exact.start, exact.stop):
             return None
         inside = exact.within(window)
-        if inside != exact and not self._inside(track, inside.start, inside.stop):
+        if inside != exact and not self._times_inside(track, inside.start, inside.stop):
             poses = self._poses(TimeWindow(inside.start, inside.stop + 1))
-            if not self._inside(poses):
+            if not self._times_inside(poses):
                 return None
         return visit._replace(
             inside=visit.inside._replace(entered=inside.entered, left=inside.left)
         )
 
     def _is_clearly_inside(self, visit: TrackedStay) -> bool:
-        """Returns whether any pose near the track in the middle of a visit would be inside."""
+        """Returns whether a pose within `TOLERANCE_M` of the middle of a visit must be inside."""
         track, at = visit.track, (visit.whole.start + visit.whole.stop) // 2
         after = min(max(int(np.searchsorted(track.times, at)), 1), len(track.times) - 1)
         step = slice(after - 1, after + 1)
@@ -418,82 +469,70 @@ class ConfirmedStays:
         return all(self._region.contains(x + dx, y + dy) for dx in off for dy in off)
 
     def _by_poses(self, visit: TrackedStay) -> Stay | None:
-        """Returns a visit from its first to its last pose inside, where it was entered and left.
+        """Returns a whole visit from its first to its last pose inside.
 
-        None where no pose is inside: the robot's line alone touches the region.
+        An end at which the robot did not enter or leave stays as it is. None if no pose is inside.
         """
         whole = visit.whole
-        first = self._inside_near(visit, whole.start) if whole.entered else [whole.start]
-        last = self._inside_near(visit, whole.stop) if whole.left else [whole.stop]
+        first = self._times_near(visit, whole.start) if whole.entered else [whole.start]
+        last = self._times_near(visit, whole.stop) if whole.left else [whole.stop]
         if not first or not last or min(first) > max(last):
             return None
         return whole._replace(start=min(first), stop=max(last))
 
-    def _inside_near(self, visit: TrackedStay, at: Ns) -> list[Ns]:
-        """Returns when poses of a visit near its begin or its end, and its vertices, are inside."""
-        whole, poses = visit.whole, self._poses_around(visit.track, at)
-        inside = self._inside(poses)
+    def _times_near(self, visit: TrackedStay, end: Ns) -> list[Ns]:
+        """Returns the log times of a visit's poses inside near one of its ends, and vertices."""
+        whole, poses = visit.whole, self._poses_around(visit.track, end)
+        inside = self._times_inside(poses)
         absences = [*_absences(poses.times, inside)]
-        # What lies beyond an absence is of the visit before, or after.
-        begin = max((back for left, back in absences if left < whole.start), default=MIN_NS)
-        end = min((left for left, back in absences if back > whole.stop), default=MAX_NS)
-        own = (time for time in inside if begin <= time <= end)
-        return [*own, *self._inside(visit.track, whole.start, whole.stop)]
+        # Poses on the far side of an absence belong to another visit.
+        first = max((back for left, back in absences if left < whole.start), default=MIN_NS)
+        last = min((left for left, back in absences if back > whole.stop), default=MAX_NS)
+        own = (time for time in inside if first <= time <= last)
+        return [*own, *self._times_inside(visit.track, whole.start, whole.stop)]
 
-    def _inside(
+    def _times_inside(
         self, path: Placed | RobotTrack, first: Ns = MIN_NS, last: Ns = MAX_NS - 1
     ) -> list[Ns]:
-        """Returns when the robot was in the region, at the poses or vertices of a time."""
-        some = slice(*np.searchsorted(path.times, (first, last + 1)))
-        rows = zip(
-            path.times[some].tolist(), path.x[some].tolist(), path.y[some].tolist(), strict=True
-        )
-        return [time for time, *place in rows if self._region.contains(*place)]
+        """Returns the log times, from `first` to `last`, of poses or vertices in the region."""
+        rows = slice(*np.searchsorted(path.times, (first, last + 1)))
+        columns = (path.times[rows], path.x[rows], path.y[rows])
+        points = zip(*(column.tolist() for column in columns), strict=True)
+        return [time for time, x, y in points if self._region.contains(x, y)]
 
     def _poses_around(self, track: RobotTrack, at: Ns) -> Placed:
-        """Returns the poses between the vertices before and after a time, these included."""
+        """Returns the poses from the vertex before a log time to the vertex after it."""
         times = track.times
         before = max(int(np.searchsorted(times, at, side="left")) - 1, 0)
         after = min(int(np.searchsorted(times, at, side="right")), len(times) - 1)
         return self._poses(TimeWindow(int(times[before]), int(times[after]) + 1))
 
     def _closest(self, track: RobotTrack, stay: Stay, circle: Circle) -> tuple[float, Ns]:
-        """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
+        """Returns how near (m) a pose of a visit was to the middle of a circle, and when.
+
+        The track shows around which time to look for that pose.
+        """
         inner = track.times[(track.times > stay.start) & (track.times < stay.stop)]
-        inner = np.concatenate(([stay.start], inner, [stay.stop]))
-        x, y, _ = track.at(inner)
-        along, off = Steps(x[:-1], y[:-1], x[1:], y[1:]).nearest_to(circle.x, circle.y)
-        nearest = int(off.argmin())
-        lasted = int(inner[nearest + 1] - inner[nearest])
-        at = int(inner[nearest]) + round(float(along[nearest]) * lasted)
+        times = np.concatenate(([stay.start], inner, [stay.stop]))
+        x, y, _ = track.at(times)
+        along, away_m = Steps(x[:-1], y[:-1], x[1:], y[1:]).nearest_to(circle.x, circle.y)
+        nearest = int(away_m.argmin())
+        lasted = int(times[nearest + 1] - times[nearest])
+        at = int(times[nearest]) + round(float(along[nearest]) * lasted)
         poses = self._poses_around(track, at)
-        away_m = np.hypot(poses.x - circle.x, poses.y - circle.y)
-        near = (poses.times >= stay.start) & (poses.times <= stay.stop)
-        approaches = zip(away_m[near].tolist(), poses.times[near].tolist(), strict=True)
-        return min(approaches, default=(float(min(off[nearest], circle.radius_m)), at))
+        pose_away_m = np.hypot(poses.x - circle.x, poses.y - circle.y)
+        is_of_visit = (poses.times >= stay.start) & (poses.times <= stay.stop)
+        approaches = zip(
+            pose_away_m[is_of_visit].tolist(), poses.times[is_of_visit].tolist(), strict=True
+        )
+        return min(approaches, default=(float(min(away_m[nearest], circle.radius_m)), at))
 
 
 def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[Span]:
-    """Yields the last pose inside, and the next one, around each absence as long as leaving takes.
+    """Yields the last pose inside before, and the first after, each absence of `FLICKER_NS`.
 
-    On a straight way from one part of a region to another one there are poses of both.
+    An absence has poses (their log times are `times`) outside. A pause without poses is none.
     """
     for left, back in pairwise(inside):
         if back - left >= FLICKER_NS and ((times > left) & (times < back)).any():
             yield left, back
-
-
-def place_visits(region_visits: ConfirmedStays, name: str) -> PlaceVisits:
-    """Returns how often, and for how long, the robot was in a place."""
-    entries = [visit for visit in region_visits.every if visit.inside.entered]
-    exits = [visit for visit in region_visits.every if visit.inside.left]
-    return PlaceVisits(
-        place=name,
-        entries=len(entries),
-        exits=len(exits),
-        duration=region_visits.duration,
-        first=region_visits.ends(entries[-1]).start if entries else None,
-        last=region_visits.ends(max(exits, key=lambda visit: visit.inside.stop)).stop
-        if exits
-        else None,
-    )

@@ -1,7 +1,7 @@
-"""The arguments `where`, a named place, a circle or a rectangle, and `while`, conditions elsewhere.
+"""The arguments `where` (named places, a circle or a rectangle) and `while` (other topics).
 
-Of several places any counts: a thing, or the robot, is there where it is in one of them. Both bound
-a search besides its window.
+Both bound a search besides its window. With several places, being in any of them counts. `while`
+takes the times in which the newest messages of other topics meet conditions.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
-    from ros2_memory.places.robot_tracks import KnownTrack
+    from ros2_memory.places.stays import KnownTrack
 
 PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 """Where places are named, for sentences."""
@@ -55,10 +55,10 @@ _EXPECTED: Final = (
     '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m); '
     'several as "kitchen, hall", or by name: {"kitchen": {"x": [0, 5], "y": [5, 9]}, "hall": ...}'
 )
-_OF_REGION: Final = frozenset({"x", "y", "radius_m"})
+_REGION_KEYS: Final = frozenset({"x", "y", "radius_m"})
 _MOST_PLACES: Final = 30
 _UNNAMED: Final = "where"
-"""What a region without a name is called in tables."""
+"""What tables call a region without a name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +66,10 @@ class Where:
     """A region, and the frame that it is in.
 
     Attributes:
-        frame_id: None for the frame that places are in by default.
-        name: of a named place, or of several; None for any other region.
-        several: these, each with a name, where the region is that of several places.
+        region: one place, or several.
+        frame_id: its frame; None for the frame that places are in by default.
+        name: the name of the place, or of several; None for a region of coordinates alone.
+        several: the places, each with a name; empty for one place.
     """
 
     region: Region
@@ -77,27 +78,27 @@ class Where:
     several: tuple[Where, ...] = ()
 
     def contains(self, frame_id: str, x: float, y: float) -> bool:
-        """Whether a point (m) of a frame lies in the region."""
+        """Returns whether a point (m) in a frame lies in the region."""
         return self.frame_id in {None, frame_id} and self.region.contains(x, y)
 
     @property
     def each(self) -> tuple[Where, ...]:
-        """The places that it is made of: itself, where it is one."""
+        """Its places, one by one."""
         return self.several or (self,)
 
     @property
     def title(self) -> str:
-        """What a row about it is called."""
+        """The name of a row about it."""
         return self.name or _UNNAMED
 
     def places(self, frame_id: str) -> tuple[Place, ...]:
-        """Returns each of its places by name; `frame_id` is the frame of those that name none."""
+        """Returns its named places; `frame_id` is the frame of places that name none."""
         frame = self.frame_id or frame_id
         return tuple(Place(part.title, part.frame_id or frame, part.region) for part in self.each)
 
     @property
     def shown(self) -> JsonValue:
-        """The argument as a reply repeats it: a place's name, or the bounds."""
+        """The argument as a reply repeats it: the name of the place, or its bounds (m)."""
         match self.region:
             case _ if self.name is not None:
                 return self.name
@@ -114,16 +115,16 @@ def parse_where(
     default_radius_m: float | None = None,
     what: str = "where",
 ) -> Where:
-    """Returns what a value of the argument `where` means.
+    """Returns the region that a value of the argument `where` describes.
 
     Args:
-        limits: have the named places.
-        value: as the client gave it: a place, or several.
-        default_radius_m: of a circle without a radius; None where it must have one.
-        what: the name of the argument.
+        limits: the settings, which have the named places.
+        value: the argument: one place, or several.
+        default_radius_m: the radius of a circle that gives none; None if it must give one.
+        what: the name of the argument, for errors.
 
     Raises:
-        InvalidArgumentsError: it is no region, or no place has that name.
+        InvalidArgumentsError: the value is no region, or no place has that name.
     """
     several = _places_by_name(limits, value)
     if several is None:
@@ -132,25 +133,23 @@ def parse_where(
         raise InvalidArgumentsError(
             f"{what} has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
         )
-    by_name = (
-        (name, _parse_place(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}"))
-        for name, place_value in several.items()
-    )
-    # Two spellings of one name are one place.
-    places = tuple(
-        dict.fromkeys(
-            replace(place, name=name) if place.name is None else place for name, place in by_name
-        )
-    )
+    places: list[Where] = []
+    for name, place_value in several.items():
+        place = _parse_place(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}")
+        if place.name is None:
+            place = replace(place, name=name)
+        # Two spellings of one name are one place.
+        if place not in places:
+            places.append(place)
     if len(places) == 1:
         return places[0]
     region = AnyOf(tuple(part.region for part in places))
     names = ", ".join(part.title for part in places)
-    return Where(region, _frame_of(places), names, places)
+    return Where(region, _shared_frame(places), names, tuple(places))
 
 
 def _places_by_name(limits: QuerySettings, value: JsonValue) -> JsonObject | None:
-    """Returns places by name; None of a value that is to be one place."""
+    """Returns the values of several places by name; None if the value describes one place."""
     if isinstance(value, str):
         names = [name.strip() for name in value.split(",")]
         if len(names) == 1 or _place_named(limits, value) is not None:
@@ -160,16 +159,17 @@ def _places_by_name(limits: QuerySettings, value: JsonValue) -> JsonObject | Non
         return {str(name): name for name in value}
     if not isinstance(value, dict):
         return None
-    is_one = any(not isinstance(value.get(name, {}), dict) for name in _OF_REGION)
+    # A place may be named "x": then it has an object as its value.
+    is_one = any(not isinstance(value.get(key, {}), dict) for key in _REGION_KEYS)
     are_places = any(isinstance(place_value, str | dict) for place_value in value.values())
     return value if are_places and not is_one else None
 
 
-def _frame_of(several: Sequence[Where]) -> str | None:
-    """Returns the frame that several places share; coordinates are in that of the named ones.
+def _shared_frame(several: Sequence[Where]) -> str | None:
+    """Returns the one frame that places name; coordinates without a frame are in it, too.
 
     Raises:
-        InvalidArgumentsError: they are in several frames.
+        InvalidArgumentsError: places name different frames.
     """
     name_by_frame = {part.frame_id: part.title for part in several if part.frame_id is not None}
     if len(name_by_frame) > 1:
@@ -190,7 +190,7 @@ def _parse_place(
         raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(value)}; {listed}")
     if not isinstance(value, dict):
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
-    unknown = value.keys() - _OF_REGION
+    unknown = value.keys() - _REGION_KEYS
     if unknown:
         raise InvalidArgumentsError(f"{what} has no {abbreviate(min(unknown))}; {_EXPECTED}")
     x, y = value.get("x"), value.get("y")
@@ -199,38 +199,43 @@ def _parse_place(
             raise InvalidArgumentsError(f"{what} has a radius_m and a range; {_EXPECTED}")
         return Where(Rectangle(*_parse_range(f"{what}: x", x), *_parse_range(f"{what}: y", y)))
     radius = value.get("radius_m", default_radius_m)
-    numbers = [*map(as_float, (x, y, radius))]
-    if not all(map(math.isfinite, numbers)) or numbers[-1] <= 0:
+    circle = Circle(as_float(x), as_float(y), as_float(radius))
+    is_finite = math.isfinite(circle.x) and math.isfinite(circle.y)
+    if not (is_finite and math.isfinite(circle.radius_m) and circle.radius_m > 0):
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
-    return Where(Circle(*numbers))
+    return Where(circle)
 
 
 def places_asked(
     limits: QuerySettings, where: Where | None, frames: Iterable[str]
 ) -> tuple[Place, ...]:
-    """Returns the named places, and those that a question names in any of some frames."""
+    """Returns the named places of the settings, and the places that a question names.
+
+    A place of the question without a frame is taken once in each of `frames`.
+    """
     asked = [] if where is None or where.name is None else [where.places(frame) for frame in frames]
     return tuple(dict.fromkeys(chain(limits.places, *asked)))
 
 
 def places_setting(limits: QuerySettings) -> str:
-    """Returns where places are named, with the file that was read."""
+    """Returns the name of the setting for places, and the path of the file that was read."""
     return f"{PLACES_SETTING}, here {limits.places_file}" if limits.places_file else PLACES_SETTING
 
 
 def _place_named(limits: QuerySettings, name: str) -> Place | None:
-    def folded(words: str) -> str:
-        return caseless(" ".join(words.split()))
-
-    same = (named for named in limits.places if folded(named.name) == folded(name))
-    return next(same, None)
+    wanted = caseless(" ".join(name.split()))
+    for place in limits.places:
+        if caseless(" ".join(place.name.split())) == wanted:
+            return place
+    return None
 
 
 def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
-    bounds = [*map(as_float, value)] if isinstance(value, list) else []
-    match bounds:
-        case [low, high] if low < high and all(map(math.isfinite, bounds)):
-            return low, high
+    match value:
+        case [low_value, high_value]:
+            low, high = as_float(low_value), as_float(high_value)
+            if low < high and math.isfinite(low) and math.isfinite(high):
+                return low, high
     raise InvalidArgumentsError(
         f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
     )
@@ -239,9 +244,10 @@ def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
 def note_other_frame(
     view: View, where: Where, placement: MapPlacement, window: TimeWindow, ask: str
 ) -> None:
-    """Notes that coordinates without a frame, where nothing is in the map, are those of poses.
+    """Notes that the robot was in the region if its coordinates are taken in the poses' frame.
 
-    As replies of get_position_* give them. `ask` says how to ask for what is there.
+    Planners copy coordinates from replies of get_position_*, which may be in that frame, not in the
+    map. Does nothing if the region names a frame. `ask` says how to ask in the poses' frame.
     """
     pose_frame = placement.pose_frame
     if where.frame_id is not None or pose_frame == placement.frame_id:
@@ -256,7 +262,7 @@ def note_other_frame(
 
 @dataclass(frozen=True, slots=True)
 class WhileCondition:
-    """A condition on another topic, which its newest message must meet."""
+    """A condition that the newest message of another topic must meet."""
 
     topic: str
     condition_type: str
@@ -265,16 +271,16 @@ class WhileCondition:
 
 
 class Scope:
-    """The times in which matches count: in a place, and while all of some conditions hold.
+    """The times in which matches count: the robot is in a place, and all conditions hold.
 
     Attributes:
-        window: that is searched.
-        unknown: the recorded times of it in which it is not known whether matches count.
-        since: back to when the robot's place is known, where the time was over before; else None.
+        window: the window that is searched.
+        unknown: the recorded spans of it in which it is not known whether matches count.
+        since: log time before which the robot's place is not known because time ran out; else None.
 
     Raises:
-        InvalidArgumentsError: `where` is no place, or nothing can meet one of the other conditions.
-        NoDataError: one of the other topics is not recorded, or no pose is.
+        InvalidArgumentsError: `where` is no place, or nothing can meet one of the conditions.
+        NoDataError: a topic of the conditions is not recorded, or no pose is.
     """
 
     def __init__(
@@ -291,12 +297,12 @@ class Scope:
         self._inside: Spans | None = None
         if where is not None:
             place = parse_where(view.limits, where)
-            joined = known_track_for(view, place, window)
-            self.since = joined.since
-            inside = joined.inside(place.region, window)
+            known_track = known_track_for(view, place, window)
+            self.since = known_track.since
+            inside = known_track.inside(place.region, window)
             self._inside = united((stay.start, stay.stop + 1) for stay in inside)
             mixed = note_robots(view, resolve_path_topic(view), window)
-            known = placed_times(joined.track, mixed)
+            known = placed_times(known_track.track, mixed)
             self.unknown = unknown_times(view, window, known, WHEREABOUTS, mixed=mixed)
         self._states = [_ConditionStates(view, condition) for condition in during]
         for state, condition in zip(self._states, during, strict=True):
@@ -310,31 +316,39 @@ class Scope:
 
     @property
     def compared_frames(self) -> tuple[str, ...]:
-        """The notes on the frames in which the other conditions compared positions, if any did."""
-        searches = [state.search for state in self._states]
-        notes = (compared_frames(self._view, each.topics, each.condition) for each in searches)
+        """Notes on the frames in which the conditions compared positions."""
+        searches = (state.search for state in self._states)
+        notes = (
+            compared_frames(self._view, search.topics, search.condition) for search in searches
+        )
         return tuple(dict.fromkeys(chain(*notes)))
 
     @property
     def is_bounded(self) -> bool:
-        """Whether messages in the window may not count."""
+        """Whether there is a place or a condition."""
         return self._inside is not None or bool(self._states)
 
     def narrowed(self) -> Iterator[TimeWindow]:
-        """Returns the parts of the window in which matches may count, newest first."""
+        """Yields the parts of the window in which the robot was in the place, newest first.
+
+        Conditions do not narrow them. Without a place this is the whole window.
+        """
         if self._inside is None:
-            return iter([self.window])
-        spans = (TimeWindow(*span) for span in reversed(self._inside))
-        return (part for part in map(self.window.intersect, spans) if not part.empty)
+            yield self.window
+            return
+        for start, stop in reversed(self._inside):
+            part = self.window.intersect(TimeWindow(start, stop))
+            if not part.empty:
+                yield part
 
     def holds_at(self, time: Ns) -> bool:
-        """Returns whether a match at a moment counts."""
+        """Returns whether a match at a log time counts."""
         if self._inside is not None and not lies_inside(self._inside, time):
             return False
         return all(state.holds_at(time) for state in self._states)
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
-        """Returns until when matches count from a moment at which they do, at most until `end`."""
+        """Returns until when (at most `end`) matches count, from a time at which they count."""
         if self._inside is not None:
             nth = bisect_right(self._inside, time, key=itemgetter(1))
             end = min(end, self._inside[nth][1] - 1)
@@ -343,39 +357,41 @@ class Scope:
         return end
 
     def parts_of(self, first: Ns, last: Ns) -> Spans:
-        """Returns the parts of a time (inclusive, as they are) in which matches count, in order."""
+        """Returns the parts of a time in which matches count, in order; all ends are inclusive."""
         inside = [(first, last + 1)] if self._inside is None else self._inside
         begin = bisect_right(inside, first, key=itemgetter(1))
         end = bisect_right(inside, last, key=itemgetter(0))
         parts = [(max(first, start), min(last, stop - 1)) for start, stop in inside[begin:end]]
         for state in self._states:
-            parts = [part for span in parts for part in state.parts_of(*span)]
+            parts = list(chain.from_iterable(state.parts_of(*part) for part in parts))
         return parts
 
 
 def known_track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
-    """Returns the robot's track in the frame of a region: the map, unless it names another.
+    """Returns the robot's track in the frame of a region: its own, or else the map.
 
-    Notes say where it is not all known, and where it is in the region in another frame alone.
+    Notes say how far back the track is known, and whether the robot was in the region if that is
+    taken in the poses' frame.
 
     Raises:
-        InvalidArgumentsError: no pose is in the region's frame, and none can be placed there.
+        InvalidArgumentsError: poses are not in the region's frame, and cannot be placed there.
         NoDataError: no pose is recorded.
         QueryTimeoutError: the call's time runs out before any result.
     """
     topic = resolve_path_topic(view)
     placement = map_placement(view, topic, where.frame_id)
-    joined = known_track(view, where.frame_id or placement.frame_id, window)
-    if not joined.inside(where.region, window):
+    known = known_track(view, where.frame_id or placement.frame_id, window)
+    if not known.inside(where.region, window):
         ask = f'ask it with frame_id "{placement.frame_id}"'
         note_other_frame(view, where, placement, window, ask)
-    return joined
+    return known
 
 
 class _ConditionStates:
-    """Whether the newest message of a topic met a condition; moments are asked newest first.
+    """When the newest message of some topics met a condition.
 
-    Messages are read bag by bag: those around the moment, and the newest one before.
+    Messages are read bag by bag, those around the time that is asked about. So it is quick to ask
+    about times from the newest to the oldest.
     """
 
     def __init__(self, view: View, during: WhileCondition) -> None:
@@ -384,15 +400,22 @@ class _ConditionStates:
         condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
         self.search = ReverseSearch(view, topic, condition)
         self._holds_on = holds_on(view, self.search.topics)
-        found = breaks_of if self._holds_on else deletions
-        moments = chain.from_iterable(found(view, topic) for topic in self.search.topics)
-        self._breaks = sorted(moments)
-        self._known = TimeWindow(0, 0)
+        break_times = breaks_of if self._holds_on else deletions
+        # After these log times it is not known what the topics say, until their next message.
+        self._breaks = sorted(
+            chain.from_iterable(break_times(view, topic) for topic in self.search.topics)
+        )
+        # The window that was read, the log times of its messages, and whether each met the
+        # condition.
+        self._read = TimeWindow(0, 0)
         self._times: list[Ns] = []
-        self._values: list[bool] = []
+        self._met: list[bool] = []
 
     def known_in(self, window: TimeWindow) -> Spans:
-        """Returns when it is known what the topics said: without silences, unless that holds on."""
+        """Returns when it is known what the topics said.
+
+        What latched and rare topics said holds through silences; what others said does not.
+        """
         topics, timeline = self.search.topics, self._view.timeline
         if self._holds_on:
             spans = (span for topic in topics for span in timeline.recordings(topic).values())
@@ -401,7 +424,7 @@ class _ConditionStates:
         return heard_times(self._view, topics, window.widened(SILENCE_NS))
 
     def _after_breaks(self, window: TimeWindow) -> Spans:
-        """Returns from each break to the next message, as far as they reach into a window."""
+        """Returns the times from each break to the next message that overlap a window."""
         spans: Spans = []
         reached = MIN_NS
         for at in self._breaks[max(bisect_right(self._breaks, window.start) - 1, 0) :]:
@@ -413,38 +436,40 @@ class _ConditionStates:
         return spans
 
     def holds_at(self, time: Ns) -> bool:
-        """Returns whether the newest message then met the condition; False without one."""
-        if not self._known.contains(time):
+        """Returns whether the newest message at a log time met the condition.
+
+        False if there is none, or if what it said may no longer hold.
+        """
+        if not self._read.contains(time):
             self._read_around(time)
-        number = bisect_right(self._times, time)
-        if not number:
+        count = bisect_right(self._times, time)
+        if not count or not self._met[count - 1]:
             return False
-        last = self._times[number - 1]
-        return (
-            self._values[number - 1]
-            and (self._holds_on or time - last <= SILENCE_NS)
-            and self._broken_from(last) >= time
-        )
+        last = self._times[count - 1]
+        is_silent = not self._holds_on and time - last > SILENCE_NS
+        return not is_silent and self._break_after(last) >= time
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
-        """Returns until when the condition is known to be met from a moment on; at most `end`."""
+        """Returns until when (at most `end`) the condition is known to hold, from a log time on."""
         while time < end and self.holds_at(time):
-            number = bisect_right(self._times, time)
-            last, following = self._times[number - 1], self._next_after(time, end)
-            if not self._holds_on and min(following, end) - last > SILENCE_NS:
+            last = self._times[bisect_right(self._times, time) - 1]
+            following = self._next_after(time, end)
+            known_until = min(following, end)
+            if not self._holds_on and known_until - last > SILENCE_NS:
                 return max(time, last)
-            if (broken := self._broken_from(last)) < min(following, end):
-                return max(time, broken)
+            break_time = self._break_after(last)
+            if break_time < known_until:
+                return max(time, break_time)
             time = following
         return min(time, end)
 
-    def _broken_from(self, last: Ns) -> Ns:
-        """Returns from when on what a message said is not known to hold; `MAX_NS`: it may hold."""
+    def _break_after(self, last: Ns) -> Ns:
+        """Returns the first break at or after the log time of a message; `MAX_NS` without one."""
         nth = bisect_left(self._breaks, last)
         return self._breaks[nth] if nth < len(self._breaks) else MAX_NS
 
     def parts_of(self, first: Ns, last: Ns) -> Iterator[Span]:
-        """Yields the parts of a time (inclusive) in which the condition is met, in order."""
+        """Yields the parts of a time in which the condition holds, in order; ends are inclusive."""
         time = first
         while time <= last:
             until = time
@@ -454,19 +479,19 @@ class _ConditionStates:
             time = MAX_NS if until == last else self._next_after(until, last)
 
     def _next_after(self, time: Ns, end: Ns) -> Ns:
-        """Returns the log time of the first message after a moment that was read around.
+        """Returns the log time of the first message after a time that was read around.
 
-        `MAX_NS` where none comes until `end`.
+        `MAX_NS` if there is none until `end`.
         """
-        number = bisect_right(self._times, time)
-        if number < len(self._times):
-            return self._times[number]
-        window = TimeWindow(self._known.stop, end + 1)
+        count = bisect_right(self._times, time)
+        if count < len(self._times):
+            return self._times[count]
+        window = TimeWindow(self._read.stop, end + 1)
         message = self._view.stream.first(self.search.topics, window)
         return MAX_NS if message is None else message.time
 
     def _read_around(self, time: Ns) -> None:
-        """Reads the messages of the bags that may hold the newest one at a moment."""
+        """Reads the bags that may hold the newest message at a log time."""
         topics = self.search.topics
         spans = self._view.stream.overlapping_bags(topics, TimeWindow(time, time + 1))
         start = min((span.first for span in spans), default=time)
@@ -476,29 +501,31 @@ class _ConditionStates:
         if not messages or messages[0].time > start:
             before = self._view.stream.first(topics, TimeWindow(MIN_NS, start), newest_first=True)
             messages = messages if before is None else [before, *messages]
-        self._times, self._values = [], []
+        self._times, self._met = [], []
         for message in messages:
             met = self.search.matches(message)
             if met is not None:
                 self._times.append(message.time)
-                self._values.append(met)
-        self._known = TimeWindow(start, stop)
+                self._met.append(met)
+        self._read = TimeWindow(start, stop)
 
 
 def heard_times(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
     """Returns when topics had messages, without silences of more than `SILENCE_NS`.
 
-    Of a bag that holds a topic for no longer, its first and its last message say enough.
+    Only bags that hold a topic for longer are scanned. In others there is no such silence.
     """
-    spans = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+    starts, stops = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for topic in topics:
         firsts, lasts = view.bounds(topic, window)
         is_long = lasts - firsts > SILENCE_NS
-        spans.append((firsts[~is_long], lasts[~is_long]))
-        within = zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
+        starts.append(firsts[~is_long])
+        stops.append(lasts[~is_long])
         if is_long.any():
-            scanned = scan(view, topic, window, columns=False, within=united(within))
-            spans += [pieces_of(rows.times, rows.times) for rows in scanned]
-    starts, stops = (np.concatenate(bounds) for bounds in zip(*spans, strict=True))
-    starts, stops = pieces_of(starts, stops)
-    return list(zip(starts.tolist(), (stops + 1).tolist(), strict=True))
+            long = zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
+            for rows in scan(view, topic, window, columns=False, within=united(long)):
+                piece_starts, piece_stops = pieces_of(rows.times, rows.times)
+                starts.append(piece_starts)
+                stops.append(piece_stops)
+    heard_from, heard_to = pieces_of(np.concatenate(starts), np.concatenate(stops))
+    return list(zip(heard_from.tolist(), (heard_to + 1).tolist(), strict=True))

@@ -112,7 +112,7 @@ def robot_path(view: View, window: TimeWindow) -> RobotPath | None:
         return None if local is None else RobotPath(*local, is_whole=True, reader=None)
     reader = TrackReader(view, places.map_frame)
     # With what was just before, to know whether the path goes on from there.
-    known = reader.over(TimeWindow(window.start - SILENCE_NS, window.stop))
+    known = reader.track_in(TimeWindow(window.start - SILENCE_NS, window.stop))
     return RobotPath(places.map_frame, cut(known.track, window), known.since is None, reader)
 
 
