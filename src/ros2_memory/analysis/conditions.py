@@ -1,8 +1,7 @@
-"""Conditions on one extracted value.
+"""Conditions on one extracted value, and what a dot-path leads to in it.
 
-They are tested on the whole value, before anything in it is downsampled or rounded. NaN and null
-match nothing. `refusal_for` says where no value of a shape can match: a search for a field that
-the values do not have would find nothing, and the answer "never" would be false.
+A condition is tested on the whole value, before anything in it is downsampled or rounded. NaN and
+null match nothing. `refusals` says when no value of some shape can match.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import re
 import struct
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, starmap
+from itertools import chain
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -37,11 +36,11 @@ POSITION_KEYS: Final = ("position", "point", "translation")
 # Bounded, since int() refuses texts of thousands of digits.
 _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
 _DECIMAL: Final = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_LISTED_PATHS: Final = 16
 _AXES: Final = {"0": "x", "1": "y", "2": "z"}
-"""An array of three numbers may be shown as a point."""
+"""An array of three numbers may be shown as a point: these indices lead to its axes."""
 _POINT: Final = {*_AXES.values()}
-_PICKED: Final = re.compile(r"(\.-?\d+)+$")
+_INDICES: Final = re.compile(r"(\.-?\d+)+$")
+"""The end of a dot-path that picks an element of a list."""
 _EXAMPLES: Final = {
     "contains": 'condition_type "contains", value "scissors"',
     "contains_word": 'condition_type "contains_word", value "pot", which is not in "potato"',
@@ -51,25 +50,23 @@ _EXAMPLES: Final = {
     "near_position": 'condition_type "near_position", value {"x": 1.5, "y": -0.2}',
 }
 _SINGLE_BELOW: Final = 2**24
-"""Whole numbers below this are float32s."""
+"""A float32 represents every whole number below this."""
 _EXACT_BELOW: Final = 2**53
-"""Whole numbers below this are floats."""
-_SIDES: Final = {"above": True, "below": False}
-"""Conditions on a number, and whether it is to be above the limit."""
+"""A float represents every whole number below this."""
 
 
 @dataclass(frozen=True)
 class Contains:
     """Part of a string, or an element of a list.
 
-    A string is found inside any string at any depth (not in the keys), without regard to case; a
-    boolean wherever one is equal. A number is a whole value, never a part of one, and is searched
-    only where a field leads (`has_element`): in a whole message every size, level and coordinate
-    would match. Elsewhere its digits are searched as a string.
+    A string is found inside any string at any depth (not in the keys), without regard to case. A
+    boolean is found wherever an equal one is. A number is found only in a field, as an element of
+    it: in a whole message it would match every size, level and coordinate. The digits of a number
+    are also searched as a string.
 
-    With `whole` it must stand there as whole words: `pot` is in "the pot", not in "potato". Words
-    behind it that begin with a minus must not stand there: `knife -butter`. Of a string that is
-    JSON it is enough that this is so of a label of its detections.
+    With `whole`, the needle is found as whole words: `pot` is in "the pot", not in "potato". Its
+    words that begin with a minus must not be there: `knife -butter`. In a string that is JSON, one
+    label of its detections may match for itself.
     """
 
     needle: Scalar
@@ -77,7 +74,7 @@ class Contains:
 
     @cached_property
     def equal(self) -> Equals:
-        """What an element is compared with."""
+        """The test for an element of a list."""
         return Equals(self.needle)
 
     @cached_property
@@ -88,7 +85,7 @@ class Contains:
 
     @cached_property
     def folded(self) -> str | None:
-        """The needle as casefolded text; None where no text can contain it."""
+        """The needle as casefolded text, without `others`; None if it has no text."""
         text = _text_of(self.needle)
         if text is None or not self.others:
             return None if text is None else caseless(text)
@@ -96,7 +93,7 @@ class Contains:
 
     @cached_property
     def boolean(self) -> bool | None:
-        """The boolean that matches; None where none does."""
+        """The boolean that matches; None if the needle means no boolean."""
         meant = _meaning(self.needle)
         return meant if isinstance(meant, bool) else None
 
@@ -108,7 +105,7 @@ class Contains:
 
     @property
     def is_one_word(self) -> bool:
-        """Whether it is a row of letters that is found wherever a text has it, and no number."""
+        """Whether the needle is letters alone, which match inside of any word."""
         return not self.whole and (self.folded or "").isalpha()
 
     def passes(self, leaf: JsonValue) -> bool:
@@ -133,34 +130,34 @@ def _has_words(text: str, words: str) -> bool:
 class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
-    1 and 0 equal true and false. A number equals itself, and a float that a float32 field stores of
-    it. Strings are compared without regard to case; one that spells a boolean or a number equals
-    that too, since planners put values in quotes. Of a string that is JSON the labels of its
-    detections are compared, too.
+    1 and 0 equal true and false. A number equals itself, and the float that a float32 field stores
+    in its place. Strings are compared without regard to case. A string that spells a boolean or a
+    number equals that, too, since planners put values in quotes. In a string that is JSON, the
+    labels of its detections are compared, too.
     """
 
     value: Scalar
 
     @cached_property
     def folded(self) -> str | None:
-        """The casefolded text that is equal; None where no text is."""
+        """The casefolded text that is equal; None if the value is no text."""
         return caseless(self.value) if isinstance(self.value, str) else None
 
     @cached_property
     def boolean(self) -> bool | None:
-        """The boolean that is equal; None where none is."""
+        """The boolean that is equal; None if neither is."""
         meant = _meaning(self.value)
         return bool(meant) if meant is not None and meant in (0, 1) else None
 
     @cached_property
     def integers(self) -> tuple[int | float, ...]:
-        """The number that an integer is equal to, if any."""
+        """The number that an integer is compared with; empty if the value means none."""
         meant = _meaning(self.value)
         return () if meant is None else (meant,)
 
     @cached_property
     def numbers(self) -> tuple[int | float, ...]:
-        """The numbers that a float is equal to."""
+        """The numbers that a float is compared with: the meant one, and as a float32 stores it."""
         return tuple(number for meant in self.integers for number in (meant, stored_as(meant)))
 
     def passes(self, leaf: JsonValue) -> bool:
@@ -188,7 +185,7 @@ def _labels_in_json(text: str) -> list[str]:
 class Beyond:
     """A number above or below a limit, the limit excluded; a boolean is no number.
 
-    Excluded is also what a float32 field stores of the limit: 0.2 there is 0.2000000030.
+    What a float32 field stores in place of the limit is excluded, too: 0.2000000030 for 0.2.
     """
 
     limit: int | float
@@ -200,7 +197,7 @@ class Beyond:
         return stored_as(self.limit)
 
     def passes(self, leaf: JsonValue) -> bool:
-        """Returns whether a leaf is a number on that side."""
+        """Returns whether a leaf is a number on this side of the limit."""
         if isinstance(leaf, bool) or not isinstance(leaf, int | float):
             return False
         if isinstance(leaf, float) and leaf == self.stored:
@@ -210,10 +207,10 @@ class Beyond:
 
 @dataclass(frozen=True, slots=True)
 class NearPosition:
-    """A position (m) within `tolerance_m`, inclusive; in the plane where `z` is None.
+    """A position (m) within `tolerance_m`, inclusive; in the plane if `z` is None.
 
-    The frame is the value's own; `frame_id` is what the question says that it is, if it does. A
-    position without a finite x and y (and z, where one is asked) never matches.
+    Coordinates are in the frame of the message. `frame_id` is the frame that the question names; it
+    is not tested here. A position without a finite x and y (and z, if one is asked) never matches.
     """
 
     x: float
@@ -223,9 +220,9 @@ class NearPosition:
     frame_id: str | None = None
 
     def is_near(self, x: float, y: float, z: float) -> bool:
-        """Returns whether a position (m) is near; its z may be NaN where none is asked."""
+        """Returns whether a position (m) is near; its z may be NaN if none is asked."""
         off_x, off_y, off_z = x - self.x, y - self.y, 0.0 if self.z is None else z - self.z
-        # Not `math.dist`: numpy computes the same of columns.
+        # Not `math.dist`, which rounds unlike numpy does for columns.
         return math.sqrt(off_x * off_x + off_y * off_y + off_z * off_z) <= self.tolerance_m
 
 
@@ -236,7 +233,7 @@ Test: TypeAlias = Contains | Equals | Beyond | NearPosition
 class Condition:
     """A test, and the dot-path of the part of the value that it is applied to (None: all of it).
 
-    Where `min_score` is above 0, detections of a lower score do not count.
+    If `min_score` is above 0, detections of a lower score do not count.
     """
 
     test: Test
@@ -244,55 +241,55 @@ class Condition:
     min_score: float = 0.0
 
     def of_type(self, type_name: str, extractor: SchemaExtractor) -> Condition:
-        """Returns the condition on extracted values of a type, where `field` may be a full path."""
+        """Returns the condition for a type, whose extracted values may have a shorter field."""
         if self.field is None:
             return self
         path = extractor.own_path(self.field, type_name)
         return self if path == self.field else replace(self, field=path)
 
     def is_unstated(self, value: JsonValue) -> bool:
-        """Returns whether a value says nothing of the field: it names other elements.
+        """Returns whether a value names elements, but not the one that the field asks for.
 
-        So it is of joint states where several nodes publish those of some joints each.
+        Several nodes may publish joint states of some joints each.
         """
         names = names_beside(value, self.field or "")
         return bool(names) and self.element not in names
 
     @property
     def element(self) -> str:
-        """The name of an element that the field asks for, where it asks for one."""
+        """The name of the element that the field asks for: `elbow` of `positions.elbow`."""
         return (self.field or "").partition(".")[2]
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether the value, or any target of the field in it, passes the test."""
         if not self._passes(value):
             return False
-        # Both have to pass, since a zone map bounds the whole value alone.
+        # The whole value has to pass, too: columns skip messages by the bounds of whole values.
         counted = self.counted(value)
         return counted is value or self._passes(counted)
 
     def counted(self, value: JsonValue) -> JsonValue:
-        """Returns what of a value counts; see `without_low_scores`."""
+        """Returns the value without the detections whose score is too low to count."""
         return value if self.min_score <= 0 else without_low_scores(value, self.least_score)
 
     @property
     def least_score(self) -> float:
         """The score from which on detections count.
 
-        A limit is met by its float32 rounding, too, which is what most detectors store.
+        Most detectors store a float32, so the rounded limit counts, too.
         """
         return min(self.min_score, _float32(self.min_score))
 
     def _passes(self, value: JsonValue) -> bool:
         targets, test = self.targets(value), self.test
         if isinstance(test, NearPosition):
-            return any(starmap(test.is_near, chain.from_iterable(map(positions, targets))))
-        for target in targets:
-            if any(map(test.passes, leaves(target))):
-                return True
+            points = chain.from_iterable(positions(target) for target in targets)
+            return any(test.is_near(*point) for point in points)
+        if any(test.passes(leaf) for target in targets for leaf in leaves(target)):
+            return True
         if self.field is None or not isinstance(test, Contains):
             return False
-        # Elements of nested lists count as such, too, fields of objects in them do not.
+        # Elements of nested lists are compared, fields of objects in lists are not.
         elements = chain.from_iterable(leaves(target, in_objects=False) for target in targets)
         return any(map(test.equal.passes, elements))
 
@@ -303,63 +300,48 @@ class Condition:
     @property
     def array(self) -> str:
         """The dot-path of the list from which the field picks an element, else the field."""
-        return _PICKED.sub("", self.field or "")
+        return _INDICES.sub("", self.field or "")
 
     @property
     def looks_at_numbers(self) -> bool:
-        """Whether numbers in arrays are compared; of a whole value no boolean is meant by them."""
+        """Whether numbers in arrays are compared, which summaries lack.
+
+        In a whole value, "equals 1" looks for the boolean true and not at numbers in arrays.
+        """
         test = self.test
-        if isinstance(test, NearPosition) or _plain_text(test) is not None:
+        if isinstance(test, NearPosition) or plain_text(test) is not None:
             return False
         is_number = isinstance(test, Equals) and test.boolean is None
         return self.field is not None or is_number
 
     @property
     def can_be_refused(self) -> bool:
-        """Whether some values have a shape that cannot match; see `refusal_for`.
+        """Whether values of some shapes cannot match; see `refusal_for`.
 
-        Not of a number or boolean that any part may equal: as JSON, another message may have one.
+        A number or boolean that any part of a value may equal is never refused: another message may
+        have one, for instance in a text that is JSON.
         """
         test = self.test
         return (
             self.field is not None
             or isinstance(test, NearPosition)
             or (isinstance(test, Contains) and test.is_number)
-            or (isinstance(test, Equals) and _plain_text(test) is not None)
+            or (isinstance(test, Equals) and plain_text(test) is not None)
         )
 
 
 def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
-    """Returns the texts in a value that meet a condition on texts, each once, in their order."""
+    """Returns the texts in a value that meet a condition on texts, each once, in order."""
     test = condition.test
     if not isinstance(test, Contains | Equals):
         return ()
-    # `leaves` goes through a value from its end.
-    parts = chain.from_iterable([*leaves(target)][::-1] for target in condition.targets(value))
-    return tuple(
-        dict.fromkeys(leaf for leaf in parts if isinstance(leaf, str) and test.passes(leaf))
-    )
-
-
-def summarising(field: str | None, value: JsonValue) -> list[Condition]:
-    """Returns what messages meet that only summarise an array at or below a field.
-
-    The arrays are found in one value.
-    """
-    paths = [*_dot_paths(value, "")]
-    if field:
-        below = (_dot_paths(target, f"{field}.") for target in at_field(value, field))
-        paths = [field, *chain.from_iterable(below)]
-    arrays = [path for path in dict.fromkeys(paths) if any(map(_is_array, at_field(value, path)))]
-    sizes = [f"{path}.{size}" for path in arrays for size in ("bytes", "numbers")]
-    return [Condition(Beyond(-1, above=True), size) for size in sizes]
-
-
-def _is_array(value: JsonValue) -> bool:
-    """Whether a value is an array of numbers or booleans, or may be, or the summary of one."""
-    if isinstance(value, list):
-        return not value or isinstance(value[0], bool | int | float)
-    return isinstance(value, Summary)
+    texts: dict[str, None] = {}
+    for target in condition.targets(value):
+        # `leaves` goes through a value from its end.
+        for leaf in reversed([*leaves(target)]):
+            if isinstance(leaf, str) and test.passes(leaf):
+                texts[leaf] = None
+    return tuple(texts)
 
 
 def parse_condition(
@@ -372,16 +354,16 @@ def parse_condition(
     """Returns the condition that a planner's arguments describe.
 
     Args:
-        condition_type: one of `_EXAMPLES`.
+        condition_type: a key of `_EXAMPLES`.
         value: a string, number or boolean; for `above` and `below` a number; for `near_position`
-            an object with x, y and perhaps z.
+            an object with x, y and perhaps z (m).
         tolerance_m: how near `near_position` is.
-        field: dot-path in the value that narrows the test; None or blank for all of it. `above`
-            and `below` need one: most messages have numbers of many kinds.
+        field: dot-path of the part that is tested; None or blank for the whole value. `above` and
+            `below` need one, since most messages have numbers of many kinds.
         min_score: detections of a lower score do not count.
 
     Raises:
-        InvalidArgumentsError: the sentence says what is wrong and gives an example.
+        InvalidArgumentsError: an argument is invalid; the message says why and gives an example.
     """
     path = (field or "").strip() or None
     test = _parse_test(condition_type, value, tolerance_m)
@@ -394,30 +376,30 @@ def parse_condition(
 
 
 def at_field(value: T, dot_path: str) -> list[T]:
-    """Returns what is at a dot-path in an extracted value; empty where there is nothing.
+    """Returns the parts of an extracted value that a dot-path leads to, perhaps none.
 
-    Over a list the path goes on in every element, unless the segment is a whole number, which
-    selects one (negative: from the end); of a point it selects an axis. `detections.label` gives
-    every label, `detections.0.label` the first. Of joint states `positions.elbow` is what `names`
-    has beside it in each value.
+    In a list the path goes on in every element: `detections.label` gives all labels. A whole number
+    picks one element (negative: from the end): `detections.0.label` gives the first label. A number
+    picks an axis of a point, too. `positions.elbow` of joint states gives the position beside
+    `elbow` in the list of names.
     """
     head, _, name = dot_path.partition(".")
     names = names_beside(value, dot_path)
-    is_name = name in names
-    return along(value, [head, str(names.index(name))] if is_name else dot_path.split("."))[-1]
+    path = [head, str(names.index(name))] if name in names else dot_path.split(".")
+    return along(value, path)[-1]
 
 
 def element_at(elements: list[T], index: int) -> list[T]:
-    """Returns the element at a place, negative from the end, if there is one."""
+    """Returns the element at an index (negative: from the end); empty if there is none."""
     return [elements[index]] if -len(elements) <= index < len(elements) else []
 
 
 def along(
     value: T, path: Sequence[str], pick: Callable[[list[T], int], list[T]] = element_at
 ) -> list[list[T]]:
-    """Returns what is at each beginning of a path: first the value, last its targets.
+    """Returns the parts that each beginning of a path leads to: first the value, last the targets.
 
-    `pick` returns the element of a list at a place.
+    `pick` returns the element of a list at an index, as `element_at` does.
     """
     nodes = [[value]]
     for segment in path:
@@ -428,18 +410,15 @@ def along(
 def positions(value: JsonValue) -> Iterator[Vector3]:
     """Yields the positions (m) in a value, with NaN for a coordinate that is missing or null.
 
-    The value itself where it is an object with x and y, or the elements of a list of those; else
-    the objects found at any depth under `position`, `point` or `translation`.
+    If the value is an object with x and y, or a list of such, these are the positions. Else it is
+    the objects at any depth under `position`, `point` or `translation`.
     """
     for node in points(value, lambda axis: isinstance(axis, int | float | None)):
         yield (as_float(node["x"]), as_float(node["y"]), as_float(node.get("z")))
 
 
 def points(value: T, is_axis: Callable[[T], bool]) -> Iterator[dict[str, T]]:
-    """Yields the objects that are the positions in a value.
-
-    `is_axis` returns whether something may be a coordinate.
-    """
+    """Yields the objects of `positions`; `is_axis` says whether a node may be a coordinate."""
     own = [*_own_points(value, is_axis)]
     yield from own
     waiting = [] if own else [value]
@@ -463,14 +442,14 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
             f" for example {_EXAMPLES['contains']}"
         )
     example = f"for example {_EXAMPLES[condition_type]}"
-    if condition_type in _SIDES:
+    if condition_type in {"above", "below"}:
         limit = _meaning(value) if isinstance(value, Scalar) else None
         is_nan = isinstance(limit, float) and math.isnan(limit)
-        if limit is not None and not isinstance(limit, bool) and not is_nan:
-            return Beyond(limit, _SIDES[condition_type])
-        raise InvalidArgumentsError(
-            f"'{condition_type}' takes a number as value, not {_kind(value)}; {example}"
-        )
+        if limit is None or isinstance(limit, bool) or is_nan:
+            raise InvalidArgumentsError(
+                f"'{condition_type}' takes a number as value, not {_kind(value)}; {example}"
+            )
+        return Beyond(limit, above=condition_type == "above")
     if not isinstance(value, bool | int | float | str):
         raise InvalidArgumentsError(
             f"'{condition_type}' takes a text, a number or a boolean as value,"
@@ -519,13 +498,14 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
 
 
 def _kind(value: JsonValue) -> str:
-    """Returns a value as a sentence names it."""
+    """Returns a value as an error names it."""
     if isinstance(value, list):
         return "a list"
     return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
 def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> Iterator[T]:
+    """Yields the parts of a node that one segment of a dot-path leads to."""
     if isinstance(node, dict):
         if segment in node:
             yield node[segment]
@@ -540,37 +520,35 @@ def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> 
 
 
 def leaves(value: T, *, in_objects: bool = True) -> Iterator[T]:
-    """Yields everything at any depth that is neither a list nor an object.
+    """Yields all parts at any depth that are neither a list nor an object, from the last one on.
 
-    Without `in_objects` nothing inside an object: the value itself, or the elements of a list. Of a
-    summary its texts: its sizes are not what the array holds.
+    Without `in_objects`, nothing inside an object. Only the texts of a summary are leaves: its
+    sizes are no numbers of the array.
     """
     waiting = [value]
     while waiting:
         node = waiting.pop()
-        if isinstance(node, Summary):
-            texts = (part for part in node.values() if not isinstance(part, int | list))
-            waiting += texts if in_objects else ()
-            continue
-        if isinstance(node, dict):
-            if in_objects:
-                waiting += node.values()
-        elif isinstance(node, list):
+        if isinstance(node, list):
             waiting += node
-        else:
+        elif not isinstance(node, dict):
             yield node
+        elif in_objects:
+            is_summary = isinstance(node, Summary)
+            waiting += [
+                part for part in node.values() if not (is_summary and isinstance(part, int | list))
+            ]
 
 
 def _own_points(value: T, is_axis: Callable[[T], bool]) -> Iterator[dict[str, T]]:
-    """Yields the object that a value is, or the elements of a list, that have an x and a y."""
+    """Yields the value, or the elements of a list, that are objects with an x and a y."""
     for node in value if isinstance(value, list) else (value,):
-        # Null is a coordinate that was NaN; texts and lists are not coordinates at all.
+        # A null was NaN, which is a coordinate. Texts and lists are none.
         if isinstance(node, dict) and all(axis in node and is_axis(node[axis]) for axis in "xy"):
             yield node
 
 
 def as_float(value: JsonValue) -> float:
-    """Returns a number as it is; NaN for anything else, so that it is near nothing."""
+    """Returns a number as a float; NaN, which is near nothing, for any other value."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     try:
@@ -580,7 +558,7 @@ def as_float(value: JsonValue) -> float:
 
 
 def _meaning(value: Scalar) -> bool | int | float | None:
-    """Returns a boolean or number as it is, or the one that a string spells, if any."""
+    """Returns the boolean or number that a value is or, if it is a string, spells; else None."""
     if not isinstance(value, str):
         return value
     word = caseless(value.strip())
@@ -592,7 +570,7 @@ def _meaning(value: Scalar) -> bool | int | float | None:
 
 
 def _text_of(needle: Scalar) -> str | None:
-    """Returns the needle as a string, in JSON's spelling; None for a number too long to spell."""
+    """Returns a string as it is, and any other needle as JSON; None for a number too long."""
     if isinstance(needle, str):
         return needle
     try:
@@ -602,17 +580,17 @@ def _text_of(needle: Scalar) -> str | None:
 
 
 def stored_as(number: float) -> float:
-    """Returns the number that a float32 field holds where this one was meant.
+    """Returns the number that a float32 field stores in place of this one.
 
-    Itself where that is another number: from 24 bits on a float32 has no digits after the point,
-    and a Unix time would be that of a minute later.
+    A number beyond 24 bits is returned as it is: a float32 would round it to another whole number,
+    such as a Unix time to that of a minute later.
     """
     rounded = _float32(number)
     return number if rounded == 0.0 or _SINGLE_BELOW <= abs(number) < _EXACT_BELOW else rounded
 
 
 def _float32(number: float) -> float:
-    """Returns the number rounded to a float32; itself where a float32 cannot represent it."""
+    """Returns the number rounded to a float32; unchanged if it is beyond the range of one."""
     try:
         rounded: float = struct.unpack("<f", struct.pack("<f", number))[0]
     except (OverflowError, struct.error):
@@ -620,85 +598,8 @@ def _float32(number: float) -> float:
     return rounded
 
 
-def refusal_for(condition: Condition, value: JsonValue) -> str | None:
-    """Returns why no value of this shape can match; None where one may.
-
-    An empty list or a null in the value may be anything in another message, so nothing is refused
-    for what would be below it.
-    """
-    targets = [value]
-    if condition.field is not None:
-        if _is_unknown_below(value, condition.field):
-            return None
-        targets = at_field(value, condition.field)
-        if not targets:
-            paths = ", ".join(_paths(value)) or "none"
-            refusal = f"the values have no field {condition.field!r}; their fields are: {paths}"
-            named = ", ".join(map(str, names_beside(value, condition.field)[:_LISTED_PATHS]))
-            return f"{refusal}; or an element of a list by its name: {named}" if named else refusal
-    elif isinstance(condition.test, NearPosition):
-        if any(True for _ in positions(value)) or _has_unknown_part(value):
-            return None
-        return _refusal_for_position(value)
-    return _refusal_for_summary(condition, targets) or _refusal_for_kind(condition, targets)
-
-
-def _refusal_for_position(value: JsonValue) -> str:
-    if isinstance(value, dict) and value.keys() >= {"latitude", "longitude"}:
-        return (
-            "the values give latitude and longitude in degrees, and near_position compares metres: "
-            "ask with above or below on field latitude or longitude"
-        )
-    return (
-        "the values have no position: near_position needs a topic that does, "
-        "or a field that leads to an object with x and y"
-    )
-
-
-def _refusal_for_summary(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
-    """Returns why a number is not known to be in none of these; None where it is, or no number."""
-    field = condition.field
-    summary = next((target for target in targets if isinstance(target, Summary)), None)
-    if field is None or summary is None or _plain_text(condition.test) is not None:
-        return None
-    keys = ", ".join(f"{field}.{key}" for key in summary)
-    return f"field {field!r} is only summarised, and its numbers are not searched: ask about {keys}"
-
-
-def _refusal_for_kind(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
-    """Returns why all of these are of another kind than what is looked for; None where one is."""
-    test, field = condition.test, condition.field
-    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
-    met: set[type] = {str}
-    given = ""
-    if isinstance(test, Beyond):
-        met, given = {int, float}, f"{'above' if test.above else 'below'} compares numbers"
-    elif isinstance(test, Contains) and test.is_number:
-        are_elements = (leaves(target, in_objects=False) for target in targets if field)
-        if str in kinds or not kinds & {int, float} or any(True for _ in chain(*are_elements)):
-            return None
-        return (
-            "the values hold numbers and no text, and contains finds a number only as the value "
-            "of a field or as an element of its list: name that in field, or ask with equals"
-        )
-    elif isinstance(test, Equals) and not isinstance(test.value, str):
-        met = {bool, int, float}
-        kind = "boolean" if isinstance(test.value, bool) else "number"
-        given = f"{abbreviate(test.value)} is a {kind}"
-    elif (text := _plain_text(test)) is not None and (field or isinstance(test, Equals)):
-        given = f"{abbreviate(text)} is a text"
-    if not given or not kinds or kinds & met or any(map(_has_unknown_part, targets)):
-        return None
-    where = "the values" if field is None else f"the values of field {field!r}"
-    name, wanted = ("texts", "a text") if str in kinds else ("numbers", "a number")
-    if kinds == {bool}:
-        name, wanted = "booleans", "true or false"
-    needed = "" if isinstance(test, Beyond) else f": the value must be {wanted}"
-    return f"{where} are {name}, and {given}{needed}"
-
-
-def _plain_text(test: Test) -> str | None:
-    """Returns the text that a test looks for, unless it spells a boolean or a number."""
+def plain_text(test: Test) -> str | None:
+    """Returns the text that a test looks for; None if it looks for a boolean or a number."""
     if isinstance(test, Contains):
         needle = test.needle
     elif isinstance(test, Equals):
@@ -706,42 +607,3 @@ def _plain_text(test: Test) -> str | None:
     else:
         return None
     return needle if isinstance(needle, str) and _meaning(needle) is None else None
-
-
-def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
-    """Returns whether some beginning of the path leads to an empty list or a null."""
-    beginnings = chain.from_iterable(along(value, dot_path.split("."))[:-1])
-    return any(target is None or target == [] for target in beginnings)
-
-
-def shows_field(value: JsonValue, dot_path: str) -> bool:
-    """Returns whether others lack what this value lacks; not below an empty list, nor by a name."""
-    if _is_unknown_below(value, dot_path):
-        return False
-    return bool(at_field(value, dot_path)) or not names_beside(value, dot_path)
-
-
-def _has_unknown_part(value: JsonValue) -> bool:
-    if isinstance(value, dict):
-        return any(_has_unknown_part(inner) for inner in value.values())
-    if isinstance(value, list):
-        return not value or any(_has_unknown_part(inner) for inner in value)
-    return value is None
-
-
-def _paths(value: JsonValue) -> list[str]:
-    """Returns the dot-paths of a value, outermost first, as many as fit into a sentence."""
-    paths = list(dict.fromkeys(_dot_paths(value, "")))
-    paths.sort(key=lambda path: path.count("."))
-    more = len(paths) - _LISTED_PATHS
-    return [*paths[:_LISTED_PATHS], *([f"{more} more"] if more > 0 else [])]
-
-
-def _dot_paths(value: JsonValue, prefix: str) -> Iterator[str]:
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield f"{prefix}{name}"
-            yield from _dot_paths(inner, f"{prefix}{name}.")
-    elif isinstance(value, list):
-        for element in value[:1]:
-            yield from _dot_paths(element, prefix)

@@ -7,13 +7,15 @@ As in tf2 (`buffer_core.cpp`, `time_cache.cpp`, `static_cache.cpp` of ros2/geome
   the earlier one is valid until the later. Of two messages for one time the later received is used.
 - Nothing is extrapolated. tf2 forgets after 10 s, so it never interpolates across more; neither
   does this (`TF_CACHE_NS`).
-- A leading slash of a frame name is dropped; a transform from a frame to itself or with an empty
-  name is left out.
+- A leading slash of a frame name is dropped. A transform from a frame to itself, or with an empty
+  name, is left out.
 
-Different from tf2, because a memory holds more than one run of a robot: a static transform is valid
-until the next one of its child, the first of them also before; a child that is published both ways
-is dynamic wherever its dynamic messages reach, static elsewhere (tf2 keeps the kind received last);
-and a time that went through a float of seconds is granted the slack of `timebase`.
+A memory holds more than one run of a robot, so some rules differ from tf2:
+
+- A static transform is valid until the next one of its child. The first one is also valid before.
+- A child that is published both ways is dynamic as far as its dynamic messages reach, and static
+  elsewhere. (In tf2 the kind received last decides.)
+- A time that went through a float of seconds is granted `AT_OR_BEFORE_SLACK_NS`.
 """
 
 from __future__ import annotations
@@ -45,10 +47,10 @@ Vectors: TypeAlias = "tuple[Floats, Floats, Floats]"
 Rotations: TypeAlias = "tuple[Floats, Floats, Floats, Floats]"
 
 TfClock: TypeAlias = Literal["stamp", "log"]
-"""Which of a transform's two times is used: its header stamp, or when it was recorded."""
+"""The time of a transform: its header stamp, or its log time."""
 
 ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
-"""Which of the two is asked for; `auto`: as `agreeing_clock` finds."""
+"""The setting for `TfClock`; with `auto`, `agreeing_clock` decides."""
 
 TF_CACHE_NS: Final = 10 * NS_PER_S
 """tf2's default buffer length: messages farther apart are never interpolated."""
@@ -61,16 +63,17 @@ tenths. Simulated and replayed clocks are off by far more.
 """
 
 HOLD_NS: Final = 2 * NS_PER_S
-"""How long tracks take a transform as valid beyond the times between which it is known.
+"""How long a transform stays valid before the first and after the last message, for tracks.
 
-Localisers date transforms up to a second ahead, and a robot's last second is no secret.
+Localisers date transforms up to a second ahead. So the robot's last second can be placed, too.
 """
 
 _MAX_NAMES: Final = 12
+"""How many frames an error lists."""
 
 
 class FramePoses(NamedTuple):
-    """Poses of a frame in another at some times; numbers are only meaningful where `valid`."""
+    """Poses of a frame in another at some times (m, unit quaternions), and which are known."""
 
     translation: Vectors
     rotation: Rotations
@@ -83,7 +86,7 @@ class FramePoses(NamedTuple):
         return x + dx, y + dy, z + dz
 
     def at(self, nth: int | tuple[()] = ()) -> Transform:
-        """Returns the pose at one of the times; of an array without dimensions at the only one."""
+        """Returns the pose at the nth time; at the only one, if the arrays have no dimensions."""
         x, y, z = (float(part[nth]) for part in self.translation)
         qx, qy, qz, qw = (float(part[nth]) for part in self.rotation)
         return Transform((x, y, z), (qx, qy, qz, qw))
@@ -94,8 +97,8 @@ class Edge:
     """Transforms of one child in one parent, in the order in which they were received.
 
     Attributes:
-        stamps: of their headers (ns).
-        log_times: ns.
+        stamps: header stamps (ns).
+        log_times: log times (ns).
         translation: metres, N x 3.
         rotation: unit quaternions (x, y, z, w), N x 4.
     """
@@ -107,7 +110,7 @@ class Edge:
 
     @classmethod
     def of(cls, transforms: Sequence[StampedTransform]) -> Edge:
-        """Returns transforms, of which there is at least one, as arrays."""
+        """Returns one or more transforms as arrays."""
         return cls(
             np.array([transform.stamp for transform in transforms], np.int64),
             np.array([transform.log_time for transform in transforms], np.int64),
@@ -121,7 +124,7 @@ Edges: TypeAlias = "Mapping[tuple[str, str], Edge]"
 
 
 def edges_of(transforms: Iterable[StampedTransform]) -> dict[tuple[str, str], Edge]:
-    """Returns transforms by their edges."""
+    """Returns transforms by parent and child."""
     by_pair: dict[tuple[str, str], list[StampedTransform]] = defaultdict(list)
     for transform in transforms:
         by_pair[transform.parent.lstrip("/"), transform.child.lstrip("/")].append(transform)
@@ -129,13 +132,13 @@ def edges_of(transforms: Iterable[StampedTransform]) -> dict[tuple[str, str], Ed
 
 
 def is_edge(pair: tuple[str, str]) -> bool:
-    """Whether tf2 takes a parent and a child for an edge of the tree."""
+    """Returns whether tf2 accepts a transform between a parent and a child."""
     parent, child = (name.lstrip("/") for name in pair)
     return bool(parent and child) and parent != child
 
 
 def joined_edges(parts: Sequence[Edges]) -> Edges:
-    """Returns the transforms of several tables, each edge in the order of the tables."""
+    """Returns the transforms of several tables; those of one edge in the order of the tables."""
     by_pair: dict[tuple[str, str], list[Edge]] = defaultdict(list)
     for part in parts:
         for pair, edge in part.items():
@@ -144,14 +147,19 @@ def joined_edges(parts: Sequence[Edges]) -> Edges:
 
 
 class _History:
-    """The transforms of one child: moving ones ascending, one for each time, then static ones.
+    """The transforms of one child, as rows of arrays.
+
+    Moving transforms come first, in order of time, one for each time. Static ones follow.
 
     Args:
-        child: its name.
-        moving: by parent.
-        static: in the order in which they were received.
-        clock: which time of the moving ones counts.
-        hold_ns: how long they are valid beyond the times between which they are known.
+        child: the name of the child.
+        moving: its moving transforms by parent.
+        static: its static transforms, in the order in which they were received.
+        clock: which time of moving transforms counts.
+        hold_ns: how long a moving transform is valid before the first and after the last one.
+
+    Attributes:
+        parents: the names of all its parents.
     """
 
     def __init__(
@@ -171,7 +179,7 @@ class _History:
         count = len(joined.stamps) - len(static)
         times = (joined.stamps if clock == "stamp" else joined.log_times)[:count]
         order = np.lexsort((joined.log_times[:count], times))
-        # Of several for one time the last received counts.
+        # Of several transforms for one time, the one received last counts.
         is_last = np.ones(count, np.bool_)
         is_last[:-1] = times[order[1:]] != times[order[:-1]]
         order = order[is_last]
@@ -183,7 +191,7 @@ class _History:
         self._parent = np.repeat([self.parents.index(name) for name in names], counts)[rows]
 
     def at(self, times: Times) -> FramePoses:
-        """Returns the transforms at some times."""
+        """Returns the poses of the child in its parent at some times (ns)."""
         before, after, ratio, valid = self._bracket(times)
         x, y, z = self._translation[before].T
         to_x, to_y, to_z = self._translation[after].T
@@ -194,15 +202,15 @@ class _History:
         return FramePoses(moved, turned, valid)
 
     def parents_at(self, times: Times) -> Times:
-        """Returns which of the parents the child is in at some times, by their numbers."""
+        """Returns the parent at some times (ns), as indices into `parents`."""
         return self._parent[self._bracket(times).before]
 
     def newest_parent(self) -> str:
-        """Returns the parent where no time is given."""
+        """Returns the parent in the newest moving transform, or else in the newest static one."""
         return self.parents[int(self._parent[len(self._times) - 1])]
 
-    def nothing_at(self, time: Ns) -> NoDataError:
-        """Returns why no transform is valid at a time: `OUTSIDE_RANGE` or `GAP`."""
+    def lookup_error(self, time: Ns) -> NoDataError:
+        """Returns the error for a time (ns) without a transform: `OUTSIDE_RANGE` or `GAP`."""
         later = int(self._times.searchsorted(time, "right"))
         nearest = min(max(later - 1, 0), len(self._times) - 1)
         parent, times = self.parents[self._parent[nearest]], self._times.tolist()
@@ -226,8 +234,9 @@ class _History:
         )
 
     def _bracket(self, times: Times) -> _Bracket:
+        """Returns the rows between which the child is interpolated at some times (ns)."""
         count = len(self._times)
-        # The first static transform holds before it was received, too.
+        # The first static transform is valid before it was received, too.
         static = count - 1 + np.maximum(self._since.searchsorted(times, "right"), 1)
         if not count:
             return _Bracket(static, static, 0.0 * static, static >= 0)
@@ -246,9 +255,13 @@ class _History:
 
 
 class _Bracket(NamedTuple):
-    """The rows of a history between which each of some times lies; `ratio` 0 is at the former.
+    """How the transform of a child follows from the rows of its history, at each of some times.
 
-    Where nothing is interpolated, both are the row that counts. `valid`: whether one does.
+    Attributes:
+        before: the row before; if nothing is interpolated, the row whose transform is valid.
+        after: the row after; if nothing is interpolated, the same as `before`.
+        ratio: 0 at the row before, 1 at the row after.
+        valid: whether a transform is valid.
     """
 
     before: Times
@@ -261,15 +274,15 @@ class FrameTree:
     """Looks frames up in a target frame by the transforms of one session.
 
     Args:
-        static: its static transforms in log-time order; each holds until the next one of its child.
-        moving: the moving ones, in the times that are asked about and around these.
+        static: the static transforms in log-time order; each holds until the next of its child.
+        moving: the moving transforms around the times that are looked up.
         target: the frame in which the others are looked up.
-        clock: which time of the moving ones counts; `auto`: as `agreeing_clock` finds.
-        hold_ns: how long a transform is valid beyond the times between which it is known.
+        clock: which time of moving transforms counts; with `auto`, `agreeing_clock` decides.
+        hold_ns: how long a moving transform is valid before the first and after the last one.
 
     Attributes:
-        target: the name of that frame.
-        clock: which time counts, and which clock lookups are in.
+        target: the name of the target frame.
+        clock: the clock of transforms, and so of the times that are looked up.
     """
 
     def __init__(
@@ -296,24 +309,24 @@ class FrameTree:
         self._histories: dict[str, _History] = {}
 
     def reaches(self, frame: str) -> bool:
-        """Returns whether transforms connect a frame with the target, at whatever time."""
+        """Returns whether transforms connect a frame with the target at some time."""
         return frame.lstrip("/") in connected_with(self.target, self._pairs)
 
     def poses(self, frame: str, times: Times) -> FramePoses | None:
-        """Returns the poses of a frame in the target at some times.
+        """Returns the poses of a frame in the target at some times (ns).
 
-        Composed along the tree through their common ancestor, in either direction. None where no
-        transform connects them at any time.
+        They are composed along the tree, up and down, through the common ancestor. None if no
+        transforms connect the two frames at any time.
         """
         name = frame.lstrip("/")
         is_known = name == self.target or self.reaches(name)
         return self._compose(name, times) if is_known else None
 
     def carriers(self, frame: str, odometry: str) -> tuple[str, str] | None:
-        """Returns what a frame is fixed to by static transforms, and the body that carries that.
+        """Returns the frame that carries a frame by static transforms, and the robot's body.
 
-        The body is the frame next to the world, which is the target, odometry, and what is above
-        these. None of a frame of the world.
+        The body is the last frame on the way up to the world: the target, odometry, and all frames
+        above them. None if the frame is one of the world.
         """
         world = self._newest_chain(self.target)
         chain: list[str] = []
@@ -324,8 +337,9 @@ class FrameTree:
             chain.append(name)
         if not chain:
             return None
-        fixed = takewhile(lambda name: name not in self._moving, chain[:-1])
-        return chain[sum(1 for _ in fixed)], chain[-1]
+        body = chain[-1]
+        carrier = next((name for name in chain if name in self._moving), body)
+        return carrier, body
 
     def lookup(self, frame: str, time: Ns) -> Transform:
         """Returns the pose of a frame in the target at one time (tf2: source and target).
@@ -338,7 +352,7 @@ class FrameTree:
         for named in (self.target, name):
             if named not in frames:
                 raise _unknown_frame(named, sorted(frames))
-        # Of damaged bags, times may be centuries apart: they wrap, and are not near.
+        # In damaged bags times may be centuries apart: differences wrap around, and are not small.
         with np.errstate(over="ignore"):
             pose = self._compose(name, np.array(time, np.int64))
             if not pose.valid:
@@ -346,7 +360,10 @@ class FrameTree:
         return pose.at()
 
     def _compose(self, name: str, times: Times) -> FramePoses:
-        """Returns the poses by the chains of frames up to the common ancestor at each time."""
+        """Returns the poses of a frame in the target, through the common ancestor at each time.
+
+        If the tree changes during the times, they are split until it does not.
+        """
         up, down = self._chain(name, times), self._chain(self.target, times)
         common = next((frame for frame in up if frame in down), None)
         if common is not None:
@@ -354,27 +371,30 @@ class FrameTree:
             if common == self.target:
                 return poses
             return _product(_inverted(self._pose_in_ancestor(common, down, times)), poses)
-        poses = _identity(times, valid=False)
+        whole = _identity(times, valid=False)
         for rows in self._split_by_parent(times, (*up, *down)):
             part = self._compose(name, times[rows])
-            for whole, part_column in zip(
-                (*poses.translation, *poses.rotation, poses.valid),
-                (*part.translation, *part.rotation, part.valid),
-                strict=True,
-            ):
-                whole[rows] = part_column
-        return poses
+            whole.valid[rows] = part.valid
+            for axis, part_axis in zip(whole.translation, part.translation, strict=True):
+                axis[rows] = part_axis
+            for axis, part_axis in zip(whole.rotation, part.rotation, strict=True):
+                axis[rows] = part_axis
+        return whole
 
     def _chain(self, frame: str, times: Times) -> dict[str, None]:
-        """Returns the frames from one upwards, as far as they are the same at some times."""
+        """Returns a frame and its ancestors, as far up as they are the same at all times."""
         chain = {frame: None}
-        while len(parents := self._parents_at(frame, times)) == 1 and parents[0] not in chain:
-            [frame] = parents
-            chain[frame] = None
+        parents = self._parents_at(frame, times)
+        while len(parents) == 1 and parents[0] not in chain:
+            chain[parents[0]] = None
+            parents = self._parents_at(parents[0], times)
         return chain
 
     def _split_by_parent(self, times: Times, frames: Iterable[str]) -> list[Mask]:
-        """Returns times apart in which the first frame that has several parents has one."""
+        """Returns masks of times, in each of which the first frame with several parents has one.
+
+        Empty if no frame has several.
+        """
         for frame in frames:
             if len(self._parents_at(frame, times)) > 1:
                 numbers = self._histories[frame].parents_at(times)
@@ -382,13 +402,13 @@ class FrameTree:
         return []
 
     def _pose_in_ancestor(self, ancestor: str, chain: Iterable[str], times: Times) -> FramePoses:
-        """Returns the pose of the first frame of a chain in one of the frames above it."""
+        """Returns the poses of the first frame of a chain in one of its ancestors."""
         below = takewhile(lambda frame: frame != ancestor, chain)
         steps = [self._histories[frame].at(times) for frame in below]
         return reduce(_product, reversed(steps)) if steps else _identity(times)
 
     def _parents_at(self, child: str, times: Times) -> Sequence[str]:
-        """Returns the parents that a frame has at some times; none, if it is a root."""
+        """Returns all parents that a frame has at some times; none, if it is a root."""
         history = self._history(child)
         if history is None:
             return ()
@@ -397,7 +417,7 @@ class FrameTree:
         return [history.parents[number] for number in np.unique(history.parents_at(times))]
 
     def _history(self, child: str) -> _History | None:
-        """Returns the transforms of a frame in those above it; None, if it is a root."""
+        """Returns the transforms of a frame in its parents; None, if it is a root."""
         if child not in self._histories and (child in self._moving or child in self._static):
             moving, static = self._moving.get(child, {}), self._static.get(child, ())
             history = _History(child, moving, static, self.clock, self._hold_ns)
@@ -405,17 +425,15 @@ class FrameTree:
         return self._histories.get(child)
 
     def _no_path_at(self, name: str, time: Ns) -> NoDataError:
-        """Returns why there is no transform at a time, though both frames are known."""
-        tree = connected_with(self.target, self._pairs)
-        if name in tree:
-            for frame, other in ((name, self.target), (self.target, name)):
-                lacking = self._missing_link(frame, other, time)
-                if lacking is not None:
-                    return lacking
-        # A root is, in a loop, the frame where it closes.
+        """Returns the error for two known frames without a transform between them at a time."""
         pair = f"frames '{self.target}' and '{name}'"
-        if name in tree:
+        if self.reaches(name):
+            link_error = self._link_error(name, self.target, time)
+            link_error = link_error or self._link_error(self.target, name, time)
+            if link_error is not None:
+                return link_error
             at = np.array(time, np.int64)
+            # In a loop, the last frame of a chain is the one before the loop closes.
             target_root, root = ([*self._chain(frame, at)][-1] for frame in (self.target, name))
             detail = (
                 f"{pair} were not connected at {_unix(time)}, because the tree changes or contains"
@@ -432,18 +450,21 @@ class FrameTree:
             )
         return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 
-    def _missing_link(self, frame: str, other: str, time: Ns) -> NoDataError | None:
-        """Returns why one frame's part of the way to another is broken at a time, if it is."""
+    def _link_error(self, frame: str, other: str, time: Ns) -> NoDataError | None:
+        """Returns the error of the first link that has no transform at a time, if there is one.
+
+        Links are looked at from a frame up to the first ancestor of the other one.
+        """
         at = np.array(time, np.int64)
-        beyond = self._chain(other, at)
-        for above in takewhile(lambda name: name not in beyond, self._chain(frame, at)):
-            history = self._history(above)
+        ancestors = self._chain(other, at)
+        for below in takewhile(lambda name: name not in ancestors, self._chain(frame, at)):
+            history = self._history(below)
             if history is not None and not history.at(at).valid:
-                return history.nothing_at(time)
+                return history.lookup_error(time)
         return None
 
     def _newest_chain(self, frame: str) -> dict[str, None]:
-        """Returns the frames from one upwards to the newest known root, or once round a loop."""
+        """Returns a frame and its ancestors by its newest transforms; a loop is walked once."""
         chain = {frame: None}
         while (history := self._history(frame)) is not None:
             frame = history.newest_parent()
@@ -454,10 +475,9 @@ class FrameTree:
 
 
 def agreeing_clock(moving: Edges) -> TfClock:
-    """Returns `stamp` where header stamps of moving transforms agree with log time, else `log`.
+    """Returns `stamp` if header stamps of moving transforms agree with log time, else `log`.
 
-    They agree when the median distance between the two is within `AGREEMENT_NS`. Without any:
-    `stamp`.
+    They agree if the median of their distances is at most `AGREEMENT_NS`, or if there are none.
     """
     if not moving:
         return "stamp"
@@ -467,7 +487,10 @@ def agreeing_clock(moving: Edges) -> TfClock:
 
 
 def connected_with(frame: str, pairs: Iterable[tuple[str, str]]) -> set[str]:
-    """Returns the frames that pairs of a parent and a child lead to from one; itself, if any."""
+    """Returns all frames of the tree that a frame is in; empty if no pair has the frame.
+
+    `pairs` are the parent and the child of each edge.
+    """
     beside: defaultdict[str, set[str]] = defaultdict(set)
     for parent, child in pairs:
         beside[parent].add(child)
@@ -482,10 +505,10 @@ def connected_with(frame: str, pairs: Iterable[tuple[str, str]]) -> set[str]:
 
 
 def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
-    """Returns, of static transforms in log-time order, the newest of each child at a moment.
+    """Returns the static transform of each child that is valid at a log time.
 
-    A static transform holds at all times of its session. So where all of a child were received
-    later, the first of them holds.
+    It is the newest one received by then; if all were received later, the first one. `static` is in
+    log-time order.
     """
     newest: dict[str, StampedTransform] = {}
     for transform in static:
@@ -496,15 +519,15 @@ def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransfo
 
 
 def static_in(static: Sequence[StampedTransform], window: TimeWindow) -> list[StampedTransform]:
-    """Returns, of static transforms in log-time order, those that hold in a window."""
+    """Returns the static transforms that are valid in a window; `static` is in log-time order."""
     received = (transform for transform in static if window.contains(transform.log_time))
     return [*static_at(static, window.start), *received]
 
 
 def unit_quaternions(rotations: Floats) -> Floats:
-    """Returns unit quaternions, N x 4; NaN where they are zero or not finite.
+    """Returns rotations scaled to unit quaternions, N x 4; NaN if they are zero or not finite.
 
-    Those that are of unit length within 1e-12 are left as they are.
+    Rotations whose squared length is within 1e-12 of 1 are left as they are.
     """
     with np.errstate(all="ignore"):
         is_unit = np.abs(row_sums(rotations * rotations) - 1) < 1e-12

@@ -22,11 +22,9 @@ from ros2_memory.analysis.conditions import (
     Equals,
     NearPosition,
     parse_condition,
-    refusal_for,
-    shows_field,
-    summarising,
 )
 from ros2_memory.analysis.facts import FULL_CHARGE, charge_of
+from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.values import TruthValues
@@ -476,7 +474,7 @@ def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeW
     value = view.value(newest)
     paths = (view.extractor.own_path(field, newest.type) for field in fields)
     try:
-        for condition in chain(*(summarising(path, value) for path in paths)):
+        for condition in chain(*(summary_conditions(path, value) for path in paths)):
             candidates = CandidateRows(view, [topic], condition, window).messages()
             long = next((at for at in candidates if condition.matches(view.value(at))), None)
             if long is not None:

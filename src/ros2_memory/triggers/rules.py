@@ -24,8 +24,8 @@ import time
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-from ros2_memory.analysis.conditions import refusal_for
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, RunRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS

@@ -29,7 +29,8 @@ from dataclasses import KW_ONLY, dataclass
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
+from ros2_memory.analysis.conditions import Equals, leaves
+from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import (
     SCREENED_FILE,

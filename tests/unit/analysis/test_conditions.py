@@ -16,8 +16,8 @@ from ros2_memory.analysis.conditions import (
     Scalar,
     at_field,
     parse_condition,
-    refusal_for,
 )
+from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 

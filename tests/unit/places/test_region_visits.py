@@ -158,7 +158,9 @@ def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
         clock = chain([0.0] * (looks + 1), repeat(math.inf))
         deadline = Deadline.after(1.0, partial(next, clock))
         monkeypatch.setattr(Call, "partial_after", lambda *_, deadline=deadline: deadline)
-        known = TrackReader(View(memory, Call()), "odom").track_in(TimeWindow(BEGIN, BEGIN + 120 * S))
+        known = TrackReader(View(memory, Call()), "odom").track_in(
+            TimeWindow(BEGIN, BEGIN + 120 * S)
+        )
         known_since.add(known.since)
         if known.since is None or known.since < BEGIN + 50 * S:
             assert known.track.x.max() == 5.0

@@ -1,0 +1,198 @@
+"""Why no value of some shape can meet a condition.
+
+Without a refusal, a search on a field that the values do not have would find nothing, and the
+answer "never" would be false.
+"""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.analysis.conditions import (
+    Beyond,
+    Condition,
+    Contains,
+    Equals,
+    NearPosition,
+    along,
+    at_field,
+    leaves,
+    plain_text,
+    positions,
+)
+from ros2_memory.core.text import abbreviate
+from ros2_memory.messages.conversions import Summary, names_beside
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.core.model import JsonValue
+
+_LISTED_PATHS: Final = 16
+"""How many dot-paths, or names, a sentence lists."""
+
+
+def refusal_for(condition: Condition, value: JsonValue) -> str | None:
+    """Returns why no value of this shape can match; None if one may.
+
+    A field below an empty list or a null is never refused: other messages may have it.
+    """
+    field = condition.field
+    if field is None:
+        if isinstance(condition.test, NearPosition):
+            return _refusal_for_position(value)
+        return _refusal_for_kind(condition, [value])
+    if _is_unknown_below(value, field):
+        return None
+    targets = at_field(value, field)
+    if not targets:
+        return _refusal_for_field(value, field)
+    return _refusal_for_summary(condition, targets) or _refusal_for_kind(condition, targets)
+
+
+def _refusal_for_field(value: JsonValue, field: str) -> str:
+    paths = ", ".join(_paths(value)) or "none"
+    refusal = f"the values have no field {field!r}; their fields are: {paths}"
+    named = ", ".join(map(str, names_beside(value, field)[:_LISTED_PATHS]))
+    return f"{refusal}; or an element of a list by its name: {named}" if named else refusal
+
+
+def _refusal_for_position(value: JsonValue) -> str | None:
+    if any(True for _ in positions(value)) or _has_unknown_part(value):
+        return None
+    if isinstance(value, dict) and value.keys() >= {"latitude", "longitude"}:
+        return (
+            "the values give latitude and longitude in degrees, and near_position compares metres: "
+            "ask with above or below on field latitude or longitude"
+        )
+    return (
+        "the values have no position: near_position needs a topic that does, "
+        "or a field that leads to an object with x and y"
+    )
+
+
+def _refusal_for_summary(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
+    """Returns a refusal if the field is a summarised array, and the test is not on a text."""
+    field = condition.field
+    summary = next((target for target in targets if isinstance(target, Summary)), None)
+    if summary is None or plain_text(condition.test) is not None:
+        return None
+    keys = ", ".join(f"{field}.{key}" for key in summary)
+    return f"field {field!r} is only summarised, and its numbers are not searched: ask about {keys}"
+
+
+def _refusal_for_kind(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
+    """Returns a refusal if all leaves of the targets are of types that the test never takes."""
+    test, field = condition.test, condition.field
+    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
+    if isinstance(test, Contains) and test.is_number:
+        has_elements = field is not None and any(
+            True for target in targets for _ in leaves(target, in_objects=False)
+        )
+        if str in kinds or not kinds & {int, float} or has_elements:
+            return None
+        return (
+            "the values hold numbers and no text, and contains finds a number only as the value "
+            "of a field or as an element of its list: name that in field, or ask with equals"
+        )
+    wanted = _wanted_kinds(condition)
+    if wanted is None or not kinds or kinds & wanted.kinds:
+        return None
+    if any(map(_has_unknown_part, targets)):
+        return None
+    where = "the values" if field is None else f"the values of field {field!r}"
+    name, example = ("texts", "a text") if str in kinds else ("numbers", "a number")
+    if kinds == {bool}:
+        name, example = "booleans", "true or false"
+    advice = "" if isinstance(test, Beyond) else f": the value must be {example}"
+    return f"{where} are {name}, and {wanted.reason}{advice}"
+
+
+class _WantedKinds(NamedTuple):
+    """The types of leaves that may pass a test, and the reason as a refusal gives it."""
+
+    kinds: frozenset[type]
+    reason: str
+
+
+def _wanted_kinds(condition: Condition) -> _WantedKinds | None:
+    """Returns the types of leaves that may pass; None if leaves of any type may."""
+    test = condition.test
+    if isinstance(test, Beyond):
+        reason = f"{'above' if test.above else 'below'} compares numbers"
+        return _WantedKinds(frozenset({int, float}), reason)
+    if isinstance(test, Equals) and not isinstance(test.value, str):
+        kind = "boolean" if isinstance(test.value, bool) else "number"
+        reason = f"{abbreviate(test.value)} is a {kind}"
+        return _WantedKinds(frozenset({bool, int, float}), reason)
+    text = plain_text(test)
+    if text is None or (condition.field is None and not isinstance(test, Equals)):
+        return None
+    return _WantedKinds(frozenset({str}), f"{abbreviate(text)} is a text")
+
+
+def shows_field(value: JsonValue, dot_path: str) -> bool:
+    """Returns whether a value shows that all values of its type have a field, or lack it.
+
+    One does not if the field lies below an empty list or a null. Nor does one that lacks a named
+    element (`positions.elbow`), since several nodes may publish some joints each.
+    """
+    if _is_unknown_below(value, dot_path):
+        return False
+    return bool(at_field(value, dot_path)) or not names_beside(value, dot_path)
+
+
+def summary_conditions(field: str | None, value: JsonValue) -> list[Condition]:
+    """Returns conditions, each met by messages that only summarise one array.
+
+    The arrays are those at or below the field in one value; all, without a field.
+    """
+    paths = [*_dot_paths(value, "")]
+    if field:
+        below = (_dot_paths(target, f"{field}.") for target in at_field(value, field))
+        paths = [field, *chain.from_iterable(below)]
+    arrays = [path for path in dict.fromkeys(paths) if any(map(_is_array, at_field(value, path)))]
+    sizes = [f"{path}.{size}" for path in arrays for size in ("bytes", "numbers")]
+    return [Condition(Beyond(-1, above=True), size) for size in sizes]
+
+
+def _is_array(value: JsonValue) -> bool:
+    """Returns whether a value is or may be an array of numbers or booleans, or its summary."""
+    if isinstance(value, list):
+        return not value or isinstance(value[0], bool | int | float)
+    return isinstance(value, Summary)
+
+
+def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
+    """Returns whether the path leads through an empty list or a null."""
+    nodes = chain.from_iterable(along(value, dot_path.split("."))[:-1])
+    return any(node is None or node == [] for node in nodes)
+
+
+def _has_unknown_part(value: JsonValue) -> bool:
+    """Returns whether a value is or has an empty list or a null at any depth."""
+    if isinstance(value, dict):
+        return any(_has_unknown_part(inner) for inner in value.values())
+    if isinstance(value, list):
+        return not value or any(_has_unknown_part(inner) for inner in value)
+    return value is None
+
+
+def _paths(value: JsonValue) -> list[str]:
+    """Returns the dot-paths of a value, outermost first, as many as fit into a sentence."""
+    paths = list(dict.fromkeys(_dot_paths(value, "")))
+    paths.sort(key=lambda path: path.count("."))
+    more = len(paths) - _LISTED_PATHS
+    return [*paths[:_LISTED_PATHS], f"{more} more"] if more > 0 else paths
+
+
+def _dot_paths(value: JsonValue, prefix: str) -> Iterator[str]:
+    """Yields the dot-paths of all fields; those of a list by its first element."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield f"{prefix}{name}"
+            yield from _dot_paths(inner, f"{prefix}{name}.")
+    elif isinstance(value, list):
+        for element in value[:1]:
+            yield from _dot_paths(element, prefix)
