@@ -73,7 +73,7 @@ _MAX_NAMES: Final = 12
 
 
 class FramePoses(NamedTuple):
-    """Poses of a frame in another at some times (m, unit quaternions), and which are known."""
+    """Poses of a frame in another at some times (m, unit quaternions); only `valid` ones count."""
 
     translation: Vectors
     rotation: Rotations

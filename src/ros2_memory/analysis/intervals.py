@@ -1,12 +1,13 @@
 """Visible intervals: when objects were in view, as columns of numbers.
 
-An object stays in view from one message that contains it to the next where these follow each other
-on the topic within `SILENCE_NS`, or are within `FLICKER_NS` whatever is between them: detectors
-miss objects now and then. Where a history is cut into bags changes nothing.
+An object stays in view from a message that contains it to the topic's next message that does, if
+that follows within `SILENCE_NS`. Detectors miss objects now and then, so it also stays in view
+if other messages lie between the two, but no more than `FLICKER_NS`. How a history is cut into bags
+changes nothing.
 
-Many detectors publish only what they see, so an interval alone does not show that the object was
-seen all the time. It was where its messages follow each other at the detector's own usual rate: no
-farther apart than `USUAL_PERIODS` times their mean distance, or `SHORT_NS`.
+Many detectors publish only what they see, so an interval does not show that the object was seen all
+the time. It was if its messages follow each other at the detector's usual rate: at most
+`USUAL_PERIODS` times their mean distance apart, or `SHORT_NS`.
 """
 
 from __future__ import annotations
@@ -26,12 +27,11 @@ if TYPE_CHECKING:
 
 
 SILENCE_NS: Final = 10 * NS_PER_S
-"""After so long without a message an object counts as gone: many detectors publish only what
-they see."""
+"""After so long without a message an object is gone: many detectors publish only what they see."""
 THINNED_NS: Final = 7 * NS_PER_S
-"""In a day of which only some messages stayed, each topic has one in so long, or as it had them."""
+"""In a thinned day each topic keeps a message this often, if it had one."""
 FLICKER_NS: Final = 3 * NS_PER_S
-"""An object that is missed for less did not leave."""
+"""An object that is missed for less time has not left."""
 USUAL_PERIODS: Final = 3
 SHORT_NS: Final = NS_PER_S
 
@@ -51,13 +51,18 @@ IntervalRows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
 
 _NO_SCORE: Final = -(2**31)
 _SCORES: Final = 10_000
-"""What scores are multiplied with, and rounded."""
+"""Scores are stored as whole numbers of such parts."""
 _FROM_START: Final = 1
+"""Flag of `ends`: the first of all messages contains the object."""
 _TO_END: Final = 2
+"""Flag of `ends`: the last of all messages contains the object."""
 
 
 def pieces_of(starts: Ints, stops: Ints, silence_ns: Ns = SILENCE_NS) -> tuple[Ints, Ints]:
-    """Returns when the pieces of spans begin and end, in order. A silence parts them."""
+    """Joins spans that are at most `silence_ns` apart; returns the starts and the stops, in order.
+
+    Without spans, both are empty.
+    """
     order = np.argsort(starts, kind="stable")
     starts, stops = starts[order], stops[order]
     reached = np.maximum.accumulate(stops)
@@ -69,7 +74,7 @@ def pieces_of(starts: Ints, stops: Ints, silence_ns: Ns = SILENCE_NS) -> tuple[I
 class VisibleInterval(NamedTuple):
     """An object in view: log times of the first and last message that contain it (inclusive).
 
-    `best` is the highest score among its detections; None where none has one.
+    `best` is the highest score among its detections; None if no detection has a score.
     """
 
     label: str
@@ -85,9 +90,10 @@ class IntervalTable(NamedTuple):
 
     Attributes:
         labels: the labels, sorted.
-        rows: of each interval its first and last time, the index of its label, whether the first
-            and the last message of all contain it, how many messages do, the longest time between
-            two of these, and its best score.
+        rows: the rows of the table, of type `ROW`. For each interval they have its first and last
+            time, the index of its label, whether the first and the last message of the topic
+            contain it, how many messages do, the longest time between two of these, and its best
+            score.
     """
 
     labels: tuple[str, ...] = ()
@@ -98,73 +104,84 @@ class IntervalTable(NamedTuple):
         """How many intervals there are."""
         return len(self.rows) // ROW.itemsize
 
+    @property
+    def _array(self) -> IntervalRows:
+        return np.frombuffer(self.rows, ROW)
+
     def intervals(self) -> tuple[VisibleInterval, ...]:
-        """Returns each of them."""
-        rows = _unpacked(self.rows).tolist()
+        """Returns all intervals as objects."""
         return tuple(
             VisibleInterval(
                 self.labels[label], first, last, None if best == _NO_SCORE else best / _SCORES
             )
-            for first, last, label, *_, best in rows
+            for first, last, label, *_, best in self._array.tolist()
         )
 
     def spans(self) -> dict[str, tuple[Ints, Ints]]:
-        """Returns by label the first and the last time of each of its intervals, in order."""
-        rows = _unpacked(self.rows)
-        by_label = {label: rows[rows["label"] == at] for at, label in enumerate(self.labels)}
-        return {label: (its["first"], its["last"]) for label, its in by_label.items()}
+        """Returns the first and the last times of the intervals of each label, in order."""
+        spans = {}
+        for code, label in enumerate(self.labels):
+            rows = self._array[self._array["label"] == code]
+            spans[label] = rows["first"], rows["last"]
+        return spans
 
     def most_lasting(self, at_most: int) -> IntervalTable:
         """Returns the longest intervals, in order of time; of equally long ones the earliest."""
         if self.size <= at_most:
             return self
-        rows = _unpacked(self.rows)
-        rows = rows[np.sort(_by_length(rows)[:at_most])]
+        rows = self._array[np.sort(self._by_length()[:at_most])]
         used, rows["label"] = np.unique(rows["label"], return_inverse=True)
-        return IntervalTable(tuple(self.labels[place] for place in used.tolist()), rows.tobytes())
-
-    def throughout(self, start: Ns, end: Ns) -> list[str]:
-        """Returns the labels seen at their usual rate all the time from `start` to `end`."""
-        rows = _unpacked(self.rows)
-        pause = _longest_pause(rows)
-        chosen = (rows["longest"] <= pause) & (rows["count"] > 1)
-        chosen &= (rows["first"] <= start + pause) & (rows["last"] >= end - pause)
-        return self._labels_in(rows[chosen])
-
-    def at_end(self, last: Ns, known_to: Ns) -> list[str]:
-        """Returns labels of the last message, at `last`, that may be visible until `known_to`."""
-        rows = _unpacked(self.rows)
-        return self._labels_in(
-            rows[(rows["last"] == last) & (known_to - last <= _longest_pause(rows))]
-        )
-
-    def _labels_in(self, rows: IntervalRows) -> list[str]:
-        return [self.labels[place] for place in rows["label"].tolist()]
-
-    def without(self, labels: Collection[str]) -> IntervalTable:
-        """Returns the intervals of all other labels."""
-        kept = np.array([label not in labels for label in self.labels], np.bool_)
-        return self if kept.all() else self._select(kept[_unpacked(self.rows)["label"]])
-
-    def scoring(self, least: float) -> IntervalTable:
-        """Returns the intervals with a best score of so much at least, or without any."""
-        best = _unpacked(self.rows)["best"]
-        return self._select((best == _NO_SCORE) | (best >= _stored_scores(np.array([least]))))
-
-    def during(self, spans: Iterable[Span]) -> IntervalTable:
-        """Returns the intervals some of which is in one of these times (inclusive)."""
-        rows = _unpacked(self.rows)
-        chosen = np.zeros(rows.size, np.bool_)
-        for start, stop in spans:
-            chosen |= (rows["first"] <= stop) & (rows["last"] >= start)
-        return self._select(chosen)
+        return IntervalTable(tuple(self.labels[code] for code in used.tolist()), rows.tobytes())
 
     def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
-        return self._select(_by_length(_unpacked(self.rows))[:at_most]).intervals()
+        return self._select(self._by_length()[:at_most]).intervals()
 
-    def _select(self, which: Flags | NDArray[np.intp]) -> IntervalTable:
-        return IntervalTable(self.labels, _unpacked(self.rows)[which].tobytes())
+    def throughout(self, start: Ns, end: Ns) -> list[str]:
+        """Returns the labels seen at their usual rate all the time from `start` to `end`."""
+        rows = self._array
+        pause = _longest_pause(rows)
+        is_steady = (rows["longest"] <= pause) & (rows["count"] > 1)
+        reaches = (rows["first"] <= start + pause) & (rows["last"] >= end - pause)
+        return self._labels_in(rows[is_steady & reaches])
+
+    def at_end(self, last: Ns, known_to: Ns) -> list[str]:
+        """Returns the labels in the last message (at `last`) that may be in view at `known_to`.
+
+        They may be if the time since is no longer than their usual pauses.
+        """
+        rows = self._array
+        is_recent = known_to - last <= _longest_pause(rows)
+        return self._labels_in(rows[(rows["last"] == last) & is_recent])
+
+    def _labels_in(self, rows: IntervalRows) -> list[str]:
+        return [self.labels[code] for code in rows["label"].tolist()]
+
+    def without(self, labels: Collection[str]) -> IntervalTable:
+        """Returns the intervals of all other labels."""
+        is_other = np.array([label not in labels for label in self.labels], np.bool_)
+        return self if is_other.all() else self._select(is_other[self._array["label"]])
+
+    def scoring(self, least: float) -> IntervalTable:
+        """Returns the intervals whose best score is at least this, or that have no score."""
+        best = self._array["best"]
+        return self._select((best == _NO_SCORE) | (best >= _stored_scores(np.array([least]))))
+
+    def during(self, spans: Iterable[Span]) -> IntervalTable:
+        """Returns the intervals that overlap one of the spans (inclusive)."""
+        rows = self._array
+        overlaps = np.zeros(rows.size, np.bool_)
+        for start, stop in spans:
+            overlaps |= (rows["first"] <= stop) & (rows["last"] >= start)
+        return self._select(overlaps)
+
+    def _select(self, rows: Flags | NDArray[np.intp]) -> IntervalTable:
+        return IntervalTable(self.labels, self._array[rows].tobytes())
+
+    def _by_length(self) -> NDArray[np.intp]:
+        """Returns the indices of rows, the longest interval first; of equal ones the earliest."""
+        rows = self._array
+        return np.argsort(rows["first"] - rows["last"], kind="stable")
 
 
 class IntervalPart(NamedTuple):
@@ -186,9 +203,9 @@ def visible_in(
 
     Args:
         times: log times of all messages, ascending.
-        rows: for each detection, its message.
-        codes: its label, by the place in `labels`.
-        scores: NaN where it has none.
+        rows: for each detection, the index of its message.
+        codes: for each detection, the index of its label.
+        scores: for each detection, its score or NaN.
         labels: the labels, each once.
     """
     if not rows.size:
@@ -199,46 +216,50 @@ def visible_in(
     order = np.lexsort((rows, rank[codes]))
     label, row = rank[codes][order], rows[order]
     at = times[row]
-    # Each detection is an interval; two of one label in a message are one.
+    # Each detection begins as an interval of its own. Of two with one label in a message, the
+    # second one adds no message to the count.
     seen = np.zeros(row.size, ROW)
     seen["first"], seen["last"], seen["label"] = at, at, label
     seen["count"] = np.append(True, (np.diff(row) != 0) | (np.diff(label) != 0))
     seen["ends"] = (row == 0) * _FROM_START + (row == len(times) - 1) * _TO_END
     seen["best"] = _stored_scores(scores[order])
-    # As if an empty message came where the topic was silent.
-    silent = np.cumsum(np.diff(times, prepend=times[0]) > SILENCE_NS)
-    goes_on = (np.diff(row + silent[row]) <= 1) | (np.diff(at) <= FLICKER_NS)
+    # A silence counts as a message without detections.
+    silences = np.cumsum(np.diff(times, prepend=times[0]) > SILENCE_NS)
+    goes_on = (np.diff(row + silences[row]) <= 1) | (np.diff(at) <= FLICKER_NS)
     goes_on &= np.diff(label) == 0
     return IntervalTable(tuple(sorted(names)), _merge_runs(seen, at, goes_on))
 
 
 def _stored_scores(scores: NDArray[np.float64]) -> Ints:
-    # The least number stands for no score.
+    """Returns scores as `ROW` stores them; `_NO_SCORE` for NaN, and only for NaN."""
     most = -_NO_SCORE - 1
     with np.errstate(invalid="ignore"):
         stored = np.rint(np.clip(scores, -most / _SCORES, most / _SCORES) * _SCORES)
     return np.where(np.isnan(scores), _NO_SCORE, stored).astype(np.int64)
 
 
-def joined(parts: Sequence[IntervalPart]) -> IntervalPart:
-    """Merges parts that follow each other: an object may stay visible from one to the next."""
-    follow = [after.first - before.last <= SILENCE_NS for before, after in pairwise(parts)]
-    seen = _merge_tables([part.visible for part in parts], np.array([False, *follow]))
-    return IntervalPart(parts[0].first, parts[-1].last, seen)
+def join_parts(parts: Sequence[IntervalPart]) -> IntervalPart:
+    """Joins consecutive parts of a topic: an object may stay visible from one to the next."""
+    follows = [after.first - before.last <= SILENCE_NS for before, after in pairwise(parts)]
+    visible = _merge_tables([part.visible for part in parts], np.array([False, *follows]))
+    return IntervalPart(parts[0].first, parts[-1].last, visible)
 
 
 def united(tables: Sequence[IntervalTable]) -> IntervalTable:
-    """Merges the tables of several topics of one time: visible on one of them is visible."""
+    """Returns when objects were visible on any of several topics, by a table of each topic."""
     return _merge_tables(tables, np.zeros(len(tables), np.bool_))
 
 
-def _merge_tables(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTable:
-    """Merges tables: joins intervals of one label that overlap, or that go on in the next part."""
-    rows = _unpacked(b"".join([table.rows for table in tables]))
+def _merge_tables(tables: Sequence[IntervalTable], follows: Flags) -> IntervalTable:
+    """Merges tables: joins intervals of one label that overlap, or that go on in the next table.
+
+    `follows` says for each table whether it follows the one before without a silence.
+    """
+    rows = np.frombuffer(b"".join([table.rows for table in tables]), ROW)
     if not rows.size:
         return IntervalTable()
     part = np.repeat(np.arange(len(tables)), [table.size for table in tables])
-    codes, words = joined_codes((_unpacked(table.rows)["label"], table.labels) for table in tables)
+    codes, words = joined_codes((table._array["label"], table.labels) for table in tables)
     labels = tuple(sorted(words))
     place = {label: at for at, label in enumerate(labels)}
     label = np.array([place[word] for word in words], np.intp)[codes]
@@ -246,7 +267,7 @@ def _merge_tables(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTab
     rows, part, label = rows[order], part[order], label[order]
     first, ends, reach = rows["first"], rows["ends"], running_end(label, rows["last"])
     goes_on = (ends[:-1] & _TO_END > 0) & (ends[1:] & _FROM_START > 0)
-    goes_on &= (part[1:] - part[:-1] == 1) & follow[part[1:]]
+    goes_on &= (part[1:] - part[:-1] == 1) & follows[part[1:]]
     goes_on |= first[1:] <= np.minimum(reach[:-1], MAX_NS - FLICKER_NS) + FLICKER_NS
     goes_on &= label[1:] == label[:-1]
     rows["label"] = label
@@ -255,16 +276,19 @@ def _merge_tables(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTab
 
 
 def _merge_runs(rows: IntervalRows, reach: Ints, goes_on: Flags) -> bytes:
-    """Returns rows, sorted by label, as those of an `IntervalTable`: some go on in the next one.
+    """Merges runs of rows into one interval each, and returns the rows of an `IntervalTable`.
 
-    `reach` is the latest end of each and of those of its label before it.
+    Args:
+        rows: the rows, sorted by label and then by time.
+        reach: for each row, the latest end so far of its label.
+        goes_on: for each row but the last, whether the next one is of the same interval.
     """
     begins = np.flatnonzero(np.append(True, ~goes_on))
     stops = np.append(begins[1:], len(rows)) - 1
     intervals = rows[begins]
     intervals["last"] = reach[stops]
     intervals["count"] = np.add.reduceat(rows["count"], begins)
-    # Times may be as far apart as any two can be: only those of one interval are subtracted.
+    # A difference of times of different intervals may overflow; `where` drops it.
     pauses = np.append(0, np.where(goes_on, np.maximum(rows["first"][1:] - reach[:-1], 0), 0))
     intervals["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
     intervals["best"] = np.maximum.reduceat(rows["best"], begins)
@@ -273,30 +297,23 @@ def _merge_runs(rows: IntervalRows, reach: Ints, goes_on: Flags) -> bytes:
 
 
 def running_end(label: NDArray[np.intp], last: Ints) -> Ints:
-    """Returns the latest end of each row and of those before it of its label; sorted by label."""
+    """Returns, for each row, the latest end so far of its label; rows are sorted by label."""
     if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
         return last
     by_time = np.argsort(last, kind="stable")
     rank = np.empty(len(last), np.intp)
     rank[by_time] = np.arange(len(last))
-    # Labels are whole tables apart, so that the running maximum starts again at each label.
+    # Ranks of a later label are all higher, so the running maximum starts again at each label.
     far = label * len(last)
     return last[by_time[np.maximum.accumulate(rank + far) - far]]
 
 
 def _longest_pause(rows: IntervalRows) -> Ints:
-    """Returns, for each row, the longest pause between messages at the detector's usual rate."""
+    """Returns the longest usual pause between two messages with the object, for each row.
+
+    An object that was seen once has no rate: it counts as missed for at most `FLICKER_NS`.
+    """
     spans = rows["last"] - rows["first"]
-    # An object seen once has no known rate: it may have been missed for a moment, at most.
     usual = USUAL_PERIODS * spans // np.maximum(rows["count"].astype(np.int64) - 1, 1)
     pause = np.where(rows["count"] > 1, np.maximum(usual, SHORT_NS), FLICKER_NS)
     return np.minimum(pause, SILENCE_NS)
-
-
-def _by_length(rows: IntervalRows) -> NDArray[np.intp]:
-    """Returns the indices of the rows, the longest interval first; of equal ones the earliest."""
-    return np.argsort(rows["first"] - rows["last"], kind="stable")
-
-
-def _unpacked(packed: bytes) -> IntervalRows:
-    return np.frombuffer(packed, ROW)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class FrameCodes(NamedTuple):
-    """The frames of poses: `words[code]` for each; there may be words that no pose has."""
+    """The frames of poses: `words[code]` for each pose; some words may have no pose."""
 
     codes: np.ndarray[tuple[int], np.dtype[np.uint32]]
     words: tuple[str, ...]
@@ -28,7 +28,7 @@ class FrameCodes(NamedTuple):
         return [self.words[code] for code in self.codes.tolist()]
 
     def names(self) -> tuple[str, ...]:
-        """Returns the frames that poses have, each once, in order of appearance."""
+        """Returns the frames of all poses, each once, in order of appearance."""
         used, first = np.unique(self.codes, return_index=True)
         return tuple(self.words[code] for code in used[np.argsort(first)].tolist())
 
@@ -39,10 +39,10 @@ class Poses:
 
     Attributes:
         times: log times (ns).
-        positions: x, y and z (m) of each, as a row; NaN and infinities as the message has them.
-        turns: unit quaternions x, y, z, w, as rows; NaN where there is no orientation.
-        frames: of each; empty where it is not known.
-        speeds: the linear speed (m/s) that each message states; NaN where it states none.
+        positions: rows of x, y and z (m); NaN and infinities as messages have them.
+        turns: unit quaternions, as rows of x, y, z, w; NaN without an orientation.
+        frames: the frame of each pose; empty if it is not known.
+        speeds: the linear speed (m/s) that each message states; NaN if it states none.
     """
 
     times: IntArray
@@ -56,7 +56,7 @@ class Poses:
         return self.times.size
 
     def rows(self, which: IntArray | slice[int, int, None]) -> Poses:
-        """Returns some of them, in the order given."""
+        """Returns the poses of some rows, in the order given."""
         return Poses(
             self.times[which],
             self.positions[which],
@@ -66,7 +66,7 @@ class Poses:
         )
 
     def between(self, start: int, stop: int) -> Poses:
-        """Returns those from a log time on, before another (ns)."""
+        """Returns the poses with log times (ns) in `[start, stop)`."""
         first, end = np.searchsorted(self.times, (start, stop)).tolist()
         if end - first == len(self):
             return self
@@ -83,7 +83,7 @@ NO_POSES: Final = Poses(
 
 
 def joined_poses(parts: Sequence[Poses]) -> Poses:
-    """Returns poses as one, in order of log time, ties in the order of the parts."""
+    """Returns the poses of all parts, in order of log time; of equal times the earlier part's."""
     parts = [part for part in parts if len(part)]
     if len(parts) < 2:
         return parts[0] if parts else NO_POSES
@@ -101,11 +101,11 @@ def joined_poses(parts: Sequence[Poses]) -> Poses:
 
 
 def headings(turns: Vectors) -> Floats:
-    """Returns the heading about z (rad) of unit quaternions, as `geometry.yaw` has it; or NaN."""
+    """Returns the yaw (rad) of unit quaternions, as `geometry.yaw` computes it; NaN of NaN."""
     x, y, z, w = turns.T
     sine = 2 * (w * y - z * x)
-    plain = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    # At gimbal lock only the sum of roll and heading is known.
-    both = 2 * np.arctan2(z, w)
-    both -= math.tau * np.rint(both / math.tau)
-    return np.where(np.abs(sine) > GIMBAL_LOCK_SINE, both, plain)
+    yaws = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    # At gimbal lock only the sum of roll and yaw is known.
+    sums = 2 * np.arctan2(z, w)
+    sums -= math.tau * np.rint(sums / math.tau)
+    return np.where(np.abs(sine) > GIMBAL_LOCK_SINE, sums, yaws)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES, Stated
-from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, visible_in
+from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, join_parts, visible_in
 from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
@@ -164,7 +164,7 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
     whole = TopicEvents(
         parts[0].first,
         parts[-1].last,
-        joined(seen).visible,
+        join_parts(seen).visible,
         states,
         changes,
         _merge_errors(error for part in parts for error in part.errors),

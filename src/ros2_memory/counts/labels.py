@@ -20,7 +20,7 @@ from ros2_memory.analysis.intervals import (
     IntervalPart,
     IntervalTable,
     VisibleInterval,
-    joined,
+    join_parts,
     united,
     visible_in,
 )
@@ -220,7 +220,7 @@ def read_labels(
         parts[block.source].append(block.visible)
         most_at_once |= block.most_at_once
     return SeenLabels(
-        united([joined(newest_first[::-1]).visible for newest_first in parts.values()]),
+        united([join_parts(newest_first[::-1]).visible for newest_first in parts.values()]),
         most_at_once,
         max((block.most_of_all for block in seen_blocks), default=0),
         since,

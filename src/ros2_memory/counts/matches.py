@@ -27,7 +27,7 @@ from ros2_memory.analysis.intervals import (
     SILENCE_NS,
     IntervalPart,
     IntervalTable,
-    joined,
+    join_parts,
 )
 from ros2_memory.analysis.topic_events import TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -291,7 +291,7 @@ def _visible_by_events(
         others = [label for label in part.visible.labels if not matches(label)]
         if part.first <= part.last:
             parts.append(IntervalPart(part.first, part.last, part.visible.without(others)))
-    return joined(parts).visible if parts else IntervalTable()
+    return join_parts(parts).visible if parts else IntervalTable()
 
 
 def _flag_spans(

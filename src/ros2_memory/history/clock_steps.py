@@ -220,7 +220,7 @@ def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
     # A recording that ended before the pause tells nothing about one that began after it.
     through = set.intersection(*({bag.recording for bag in side_bags} for side_bags in bags))
     sides = [_poses(view, topic, window, through) for window in (before, after)]
-    return step_over(pause.span, *sides)
+    return step_over(pause.span[0], *sides)
 
 
 def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
@@ -236,7 +236,7 @@ def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
         by_recording = _stamps(view, topic, around).values()
         found = (delay_change(pause.span, *stamped) for stamped in by_recording)
         changes += islice((change for change in found if change is not None), 1)
-    return step_by_delays(pause.span, changes)
+    return step_by_delays(pause.span[0], changes)
 
 
 def _is_late(view: View, topic: str, pause: Pause) -> bool:
