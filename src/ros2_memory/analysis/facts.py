@@ -1,9 +1,9 @@
 """What messages state, as facts: of one message, and of many as columns.
 
-A fact is of a kind, is about a name, and has a value: an object in view (with its score), a boolean
-(0 or 1), the level of a diagnostic status, the status of a goal, how low a battery is, whether a
-velocity is commanded; or it is a sentence: an error, or a log entry of WARN and above. The same
-facts are read from whole tables in `columns.stated`.
+A fact has a kind, a name and a value. It is an object in view (with its score), a boolean (0 or 1),
+the level of a diagnostic status, the status of a goal, how low a battery is, or whether a velocity
+is commanded. Or it is a sentence: an error, or a log entry of WARN and above. `columns.stated`
+reads the same facts from whole tables.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ VELOCITIES: Final = frozenset({"geometry_msgs/msg/Twist", "geometry_msgs/msg/Twi
 
 LABEL: Final = "label"
 FLAG: Final = "flag"
-"""Named by its dot-path."""
+"""Its name is its dot-path."""
 STATUS: Final = "status"
 GOAL: Final = "goal"
-"""Named by its id in hexadecimal digits."""
+"""Its name is its id in hexadecimal digits."""
 CHARGE: Final = "charge"
 COMMAND: Final = "command"
 ERROR: Final = "error"
@@ -54,22 +54,23 @@ STATES: Final = frozenset({FLAG, STATUS, GOAL, CHARGE, COMMAND})
 """Kinds whose values hold until another message says otherwise."""
 
 MOST: Final = {LABEL: 256, FLAG: 512, STATUS: 512, GOAL: 512}
-"""Facts of a kind in one message that are tracked; the rest is counted."""
+"""How many facts of a kind in one message are tracked; the rest is counted."""
 LOW_CHARGES: Final = (0.2, 0.1, 0.05)
-"""Fractions of a full battery; the value of its charge is how many of them it is below."""
+"""Fractions of a full battery. The value of a charge is how many of them it is below."""
 _UNSURE_CHARGE: Final = 0.02
-"""So little above such a fraction says nothing: the charge that a battery reports trembles."""
+"""A charge less than this above a fraction is not known: what a battery reports trembles."""
 
 _PERCENT: Final = 100
 FULL_CHARGE: Final = 1.05
-"""Up to here a charge is a fraction, of a full battery that reports a little more."""
+"""A charge up to this is a fraction (a full battery may report a little more than 1), else percent.
+"""
 _WARN: Final = 30
 _ERROR: Final = 40
 _LOG_WORDS: Final = ((50, "fatal"), (_ERROR, "error"), (_WARN, "warning"))
 _ERROR_STATUS: Final = 2
 _STALE_STATUS: Final = 3
 _STILL: Final = 1e-3
-"""A commanded velocity (m/s, rad/s) below which it is zero: controllers publish -0.0 and 1e-17."""
+"""A commanded velocity (m/s, rad/s) below this is zero: controllers publish -0.0 and 1e-17."""
 _MAX_CHARS: Final = 120
 _MAX_ERROR_CHARS: Final = 160
 _MEASUREMENT_PACKAGES: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
@@ -85,11 +86,11 @@ class Word(NamedTuple):
 
 
 Fact: TypeAlias = tuple[Word, float]
-"""NaN is the value of a sentence, and of a label without a score."""
+"""What a fact is about, and its value; NaN for a sentence, and for a label without a score."""
 
 
 class State(NamedTuple):
-    """The facts of one message, and how many more it has than are tracked."""
+    """The tracked facts of one message, and how many more it has."""
 
     facts: tuple[Fact, ...] = ()
     beyond: int = 0
@@ -106,31 +107,31 @@ def has_errors(type_name: str) -> bool:
 
 
 def has_changes(type_name: str) -> bool:
-    """Returns whether messages of a type can show what changed, besides booleans."""
-    return type_name in _OF_TYPE
+    """Returns whether messages of a type have states other than booleans and labels."""
+    return type_name in _FACTS_OF_TYPE
 
 
 def state_of(value: JsonValue, type_name: str) -> State:
-    """Returns what an extracted message of a type states."""
+    """Returns the facts of an extracted message of a type."""
     facts: Iterator[Fact] = iter(())
-    if type_name in _OF_TYPE:
-        facts = _OF_TYPE[type_name](value)
+    if type_name in _FACTS_OF_TYPE:
+        facts = _FACTS_OF_TYPE[type_name](value)
     if has_events(type_name) and not has_errors(type_name):
         facts = chain(facts, _labels(value), _flags(value, ""))
-    kept: list[Fact] = []
+    tracked: list[Fact] = []
     counts: Counter[str] = Counter()
     for word, number in facts:
         counts[word.kind] += 1
         if counts[word.kind] <= MOST.get(word.kind, math.inf):
-            kept.append((word, number))
-    return State(tuple(kept), counts.total() - len(kept))
+            tracked.append((word, number))
+    return State(tuple(tracked), counts.total() - len(tracked))
 
 
 def charge_of(value: JsonValue) -> float | None:
-    """Returns how full the battery of an extracted message is, 0 to 1; None if it is not known.
+    """Returns how full the battery of an extracted message is, 0 to 1.
 
-    That is where it is NaN or negative. Some drivers publish percent where the message asks for a
-    fraction.
+    None if the message says NaN or a negative number. Some drivers publish percent, although the
+    message definition asks for a fraction.
     """
     charge = value.get("percentage") if isinstance(value, dict) else None
     if not isinstance(charge, float) or not 0 <= charge <= _PERCENT:
@@ -139,17 +140,17 @@ def charge_of(value: JsonValue) -> float | None:
 
 
 def charge_levels(charges: Floats) -> Ints:
-    """Returns below how many of `LOW_CHARGES` each charge is; -1 where that is not known."""
+    """Returns how many of `LOW_CHARGES` each charge is below; -1 if that is not known."""
     with np.errstate(invalid="ignore"):
-        part = np.where(charges > FULL_CHARGE, charges / _PERCENT, charges)
-        levels = np.sum([part < least for least in LOW_CHARGES], axis=0, dtype=np.int64)
-        surely = np.sum([part < least + _UNSURE_CHARGE for least in LOW_CHARGES], axis=0)
-        is_known = (charges >= 0) & (charges <= _PERCENT) & (levels == surely)
+        fractions = np.where(charges > FULL_CHARGE, charges / _PERCENT, charges)
+        levels = np.sum([fractions < low for low in LOW_CHARGES], axis=0, dtype=np.int64)
+        unsure = np.sum([fractions < low + _UNSURE_CHARGE for low in LOW_CHARGES], axis=0)
+        is_known = (charges >= 0) & (charges <= _PERCENT) & (levels == unsure)
         return np.where(is_known, levels, -1)
 
 
 def is_still(numbers: Floats, error: float = 0.0) -> Flags:
-    """Returns which numbers of a command are zero even if they are off by `error`."""
+    """Returns which numbers of a command count as zero, even if they are off by `error`."""
     with np.errstate(invalid="ignore"):
         return np.abs(numbers) + error < _STILL
 
@@ -159,15 +160,15 @@ def _labels(value: JsonValue) -> Iterator[Fact]:
     best: dict[str, float] = {}
     for detection in detections_of(value):
         score = math.nan if detection.score is None else detection.score
-        best_so_far = best.get(detection.label, math.nan)
-        best[detection.label] = (
-            score if math.isnan(best_so_far) or score > best_so_far else best_so_far
-        )
-    return ((Word(LABEL, label), score) for label, score in best.items())
+        known = best.setdefault(detection.label, score)
+        if math.isnan(known) or score > known:
+            best[detection.label] = score
+    for label, score in best.items():
+        yield Word(LABEL, label), score
 
 
 def _flags(value: JsonValue, path: str) -> Iterator[Fact]:
-    """Yields the booleans of an object and of nested objects; none of lists."""
+    """Yields the booleans of an object and of the objects in it, but not in lists."""
     if isinstance(value, bool):
         yield Word(FLAG, path), value
     elif isinstance(value, dict):
@@ -176,7 +177,7 @@ def _flags(value: JsonValue, path: str) -> Iterator[Fact]:
 
 
 def _log_entry(value: JsonValue) -> Iterator[Fact]:
-    """Yields an entry as an error, and with how bad it is as a report."""
+    """Yields a log entry of WARN and above as a report, and one of ERROR and above as an error."""
     if not isinstance(value, dict):
         return
     level, name, message = value.get("level"), value.get("name"), value.get("msg")
@@ -204,7 +205,7 @@ def _diagnostics(value: JsonValue) -> Iterator[Fact]:
 
 
 def _error(*parts: JsonValue) -> Word:
-    """Returns an error as a sentence: who reports it, and what."""
+    """Returns an error as a sentence: the name of who reports it, and the message."""
     text = ": ".join(part for part in parts if isinstance(part, str) and part)
     return Word(ERROR, shortened(text, _MAX_ERROR_CHARS))
 
@@ -220,6 +221,7 @@ def _goals(value: JsonValue) -> Iterator[Fact]:
 
 
 def _entries(value: JsonValue, key: str) -> Iterator[JsonObject]:
+    """Yields the objects in the list under a key."""
     listed = value.get(key) if isinstance(value, dict) else None
     for entry in listed if isinstance(listed, list) else ():
         if isinstance(entry, dict):
@@ -238,7 +240,7 @@ def _command(value: JsonValue) -> Iterator[Fact]:
 
 
 def _floats(value: JsonValue) -> Iterator[float]:
-    """Yields the floats of a value; what is no number counts as one that is not zero."""
+    """Yields the floats of a value; a null, which was NaN, as NaN."""
     if isinstance(value, dict):
         for inner in value.values():
             yield from _floats(inner)
@@ -248,7 +250,7 @@ def _floats(value: JsonValue) -> Iterator[float]:
         yield math.nan
 
 
-_OF_TYPE: Final = {
+_FACTS_OF_TYPE: Final = {
     LOG: _log_entry,
     DIAGNOSTICS: _diagnostics,
     GOALS: _goals,
@@ -258,13 +260,13 @@ _OF_TYPE: Final = {
 
 
 class Facts(NamedTuple):
-    """Facts of many messages, by message, and in a message in its order.
+    """Facts of many messages, in order of the messages.
 
     Attributes:
-        rows: the message of each, ascending.
-        codes: what it is about, by the place in `words`.
-        values: see `Fact`.
-        words: each once.
+        rows: for each fact, the index of its message, ascending.
+        codes: for each fact, the index of its word.
+        values: for each fact, its value (see `Fact`).
+        words: what facts are about, each once.
     """
 
     rows: Ints
@@ -274,30 +276,30 @@ class Facts(NamedTuple):
 
     @classmethod
     def of(cls, facts: Sequence[tuple[int, Fact]]) -> Facts:
-        """Returns facts, each given with its row."""
+        """Returns facts as arrays; each comes with the index of its message."""
         words, codes = numbered(word for _, (word, _) in facts)
         values = np.array([value for _, (_, value) in facts], np.float64)
         return cls(np.array([row for row, _ in facts], np.int64), codes, values, words)
 
     def of_kinds(self, kinds: Collection[str]) -> Facts:
-        """Returns those of some kinds."""
-        wanted = np.array([word.kind in kinds for word in self.words], np.bool_)
-        return self if wanted.all() else self._where(wanted[self.codes])
+        """Returns the facts of these kinds."""
+        is_wanted = np.array([word.kind in kinds for word in self.words], np.bool_)
+        return self if is_wanted.all() else self._select(is_wanted[self.codes])
 
     def at(self, rows: Ints) -> Facts:
-        """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
+        """Returns the facts of the messages `rows` (ascending), which become messages 0, 1, ..."""
         place, is_among = places_among(self.rows, rows)
-        return self._replace(rows=place)._where(is_among)
+        return self._replace(rows=place)._select(is_among)
 
-    def _where(self, kept: Flags) -> Facts:
-        return Facts(self.rows[kept], self.codes[kept], self.values[kept], self.words)
+    def _select(self, which: Flags) -> Facts:
+        return Facts(self.rows[which], self.codes[which], self.values[which], self.words)
 
 
 NOTHING: Final = Facts.of(())
 
 
 def joined_facts(parts: Sequence[Facts]) -> Facts:
-    """Returns the facts of all parts, by their messages."""
+    """Returns the facts of all parts, whose messages are numbered alike, by message."""
     parts = [part for part in parts if part.rows.size]
     if len(parts) <= 1:
         return parts[0] if parts else NOTHING
@@ -313,9 +315,9 @@ class Stated(NamedTuple):
 
     Attributes:
         times: log times of the messages that can be decoded.
-        facts: of these.
-        undecodable: log times of the others.
-        beyond: facts of one message that are not tracked, at most.
+        facts: the facts of these messages.
+        undecodable: log times of the other messages.
+        beyond: the most facts of one message that are not tracked.
     """
 
     times: Ints
@@ -324,35 +326,35 @@ class Stated(NamedTuple):
     beyond: int = 0
 
     def at(self, rows: Ints) -> Stated:
-        """Returns what some of the messages that can be decoded state."""
+        """Returns what decodable messages state, by their indices."""
         return self._replace(times=self.times[rows], facts=self.facts.at(rows))
 
 
 def stated_by(times: Sequence[Ns], states: Sequence[State | None]) -> Stated:
-    """Returns what messages state, one by one; None is one that cannot be decoded."""
+    """Returns what messages state, by their log times and states; None if one is not decodable."""
     decodable = [state for state in states if state is not None]
-    decoded = np.array([state is not None for state in states], np.bool_)
+    is_decodable = np.array([state is not None for state in states], np.bool_)
     all_times = np.array(times, np.int64)
     return Stated(
-        all_times[decoded],
+        all_times[is_decodable],
         Facts.of([(row, fact) for row, state in enumerate(decodable) for fact in state.facts]),
-        all_times[~decoded],
+        all_times[~is_decodable],
         max((state.beyond for state in decodable), default=0),
     )
 
 
 def joined_stated(parts: Sequence[Stated]) -> Stated:
-    """Returns what the messages of all parts state, which may overlap in time."""
+    """Returns what the messages of all parts state; parts may overlap in time."""
     if len(parts) == 1:
         return parts[0]
     times, _, places = merged_times([part.times for part in parts])
-    moved = [
+    renumbered = [
         part.facts._replace(rows=place[part.facts.rows])
         for place, part in zip(places, parts, strict=True)
     ]
     return Stated(
         times,
-        joined_facts(moved),
+        joined_facts(renumbered),
         np.sort(np.concatenate([part.undecodable for part in parts])),
         max(part.beyond for part in parts),
     )

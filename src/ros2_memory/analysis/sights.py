@@ -1,14 +1,14 @@
 """Sights: what detectors saw in a slice of the clock, and from where, as small tables of integers.
 
-A *spot* is where a detector saw one label: the mean of detections that lie together, never two of
-one message. A *look* is a cell of the robot's pose (`CELL_MM`, `CELL_DECIDEG`) from which a
-detector published, whether it saw anything or not. A *hit* counts how often a spot was seen in a
-look. So it is known what was not seen, too.
+A *spot* is a place where a detector saw one label: the mean of detections that lie together, no two
+of them in one message. A *look* is a cell of the robot's pose (`CELL_MM`, `CELL_DECIDEG`) from
+which a detector published, whether it saw anything or not. A *hit* counts how often a spot was seen
+in a look. So it is known what was not seen, too.
 
-Lengths are in mm, angles in tenths of a degree, times in ns of log time, scores in thousandths:
-integers, so that sums do not depend on their order. A slice is ten seconds of the clock, so that
-sights do not depend on how a history is cut into bags: the sum over an hour would not show whether
-a thing was missed before or after it was last seen.
+Lengths are in mm, angles in tenths of a degree, times in ns of log time, scores in thousandths: all
+are integers, so that sums do not depend on their order. A slice is ten seconds of the clock,
+however a history is cut into bags. Sums over an hour would not show whether a thing was missed
+before or after it was last seen.
 """
 
 from __future__ import annotations
@@ -38,29 +38,30 @@ CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100
 NO_YAW: Final = -1
 STOREY_MM: Final = 2_000
-"""What differs so much in height is on another floor."""
+"""Two points that differ so much in height are on different floors."""
 _CELL: Final = (CELL_MM, CELL_MM, STOREY_MM, CELL_DECIDEG, CELL_DECIDEG)
 SCORE_BINS: Final = 20
-"""Scores are counted in bins of 0.05, what lies above 1 in the last one."""
+"""Scores are counted in bins of 0.05; scores above 1 are in the last bin."""
 SLICE_NS: Final = 10 * NS_PER_S
 
 _GATE_SQUARED: Final = 750.0**2
-"""A detection farther from a spot is of another thing: 30 cm of noise, two and a half times."""
+"""A detection farther (mm) from a spot is of another thing: two and a half times 30 cm of noise."""
 _SAME_SQUARED: Final = 500.0**2
-"""Spots that grew this near to each other were one, unless messages have both."""
+"""Spots nearer (mm) to each other than this are one thing, unless messages have both."""
 _TOGETHER_SHARE: Final = 0.05
+"""Spots that share messages, but fewer than this share of the smaller spot, may still be one."""
 _BESIDE_MM: Final = 600
-"""Another label this near in the same message is not this one under a wrong name."""
+"""Another label this near in the same message is another thing, and no wrong name of this one."""
 MAX_SPOTS: Final = 128
-"""Of more of a label at once, detections are left out as if they had no place."""
+"""How many spots a label may have at once; further detections count as without a place."""
 _MANY_PAIRS: Final = 200
-"""So many are compared sooner as arrays."""
+"""From so many pairs on, arrays are quicker than a loop."""
 MAX_LABELS: Final = 512
-"""Of more in a slice one more is kept, which shows that others are left out."""
+"""How many labels a slice may have; one more stays and shows that others are left out."""
 _MAX_COMPARED: Final = 128
-"""Of more detections of a message that lie so near in x, not all are compared."""
+"""Each detection of a message is compared with so many next ones in order of x."""
 _MAX_AWAY_M: Final = 1e8
-"""From the origin: UTM has ten thousand kilometres, and squares of more are beyond 63 bits."""
+"""The farthest place: UTM reaches 1e7 m, and squares (mm2) of more would be beyond 63 bits."""
 _MAX_SCORE: Final = 1e6
 _TOGETHER_MESSAGES: Final = 3
 
@@ -98,24 +99,24 @@ Fix = IntEnum("Fix", "SLICE TIME X Y YAW SIGMA", start=0)
 """
 
 AHEAD_MM: Final = 2_000
-"""Things are about so far away: so much do errors of heading weigh."""
+"""The usual distance of a thing, by which errors of the heading are weighed."""
 TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
 """The columns of each table of `Sights`."""
 _NAMES: Final = ("spots", "looks", "hits", "scores", "beside", "unplaced", "fixes")
 
 
 class DetectorMessages(NamedTuple):
-    """What the messages of a detector have, in order of log time, in one frame.
+    """The M messages of a detector, in order of log time, and their N detections, in one frame.
 
     Attributes:
-        times: log times of the messages (ns).
-        robot: x, y, z (m) and yaw (rad) of the robot at each, and how far the detector was turned
-            from that (rad) by what moves it (M x 5); NaN where that is not known.
-        rows: of each detection its message, ascending.
-        labels: the place of their names in `names`.
-        names: of labels; there may be some that none has.
-        places: N x 3 (m); NaN where that is not known.
-        scores: not finite where there is none.
+        times: for each message, its log time (ns).
+        robot: for each message, x, y, z (m) and yaw (rad) of the robot, and the angle (rad) by
+            which the detector was turned from the robot's heading (M x 5); NaN if not known.
+        rows: for each detection, the index of its message, ascending.
+        labels: for each detection, the index of its label in `names`.
+        names: the labels; some may have no detection.
+        places: for each detection, x, y, z (m); NaN if not known.
+        scores: for each detection, its score; not finite if it has none.
     """
 
     times: Ints
@@ -129,13 +130,15 @@ class DetectorMessages(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sights:
-    """What detectors saw in some slices of the clock: column 0 of most tables is the slice.
+    """What detectors saw in slices of the clock; column 0 of most tables is the slice.
 
     Attributes:
+        topics: the topics of the detectors.
+        labels: the labels that they saw.
         spots: where labels were seen (`Spot`).
         looks: from where detectors published (`Look`).
         hits: how often a spot was seen in a look (`Hit`).
-        scores: of spots (`Score`).
+        scores: how high the scores of spots were (`Score`).
         beside: which other labels were beside a spot in the same message (`Beside`).
         unplaced: detections without a place (`Unplaced`).
         fixes: where odometry was in the map (`Fix`).
@@ -153,13 +156,13 @@ class Sights:
 
     @property
     def tables(self) -> tuple[Ints, ...]:
-        """All of them, as `TABLES` has their columns."""
+        """All tables, in the order of `TABLES`."""
         return attrgetter(*_NAMES)(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Detections:
-    """Detections in whole millimetres, ascending by message; what is not placed has zeros."""
+    """Detections in whole millimetres, ascending by message; at 0 if they are not placed."""
 
     message: Ints
     slice: Ints
@@ -177,45 +180,47 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     look, looks = _looks(seen, slices)
     detections, labels = _detections(seen, slices)
     group, together = _label_groups(detections)
-    near = np.flatnonzero(detections.is_placed)
-    near = near[np.argsort(group[near], kind="stable")]
+    rows = np.flatnonzero(detections.is_placed)
+    rows = rows[np.argsort(group[rows], kind="stable")]
     cluster = np.full(len(detections.message), -1, np.int64)
-    cluster[near] = _clusters(
-        group[near], detections.message[near], detections.x[near], detections.y[near]
+    cluster[rows] = _clusters(
+        group[rows], detections.message[rows], detections.x[rows], detections.y[rows]
     )
-    lost, kept = rows_of(detections, cluster < 0), rows_of(detections, cluster >= 0)
-    _, spot = distinct_rows((group[cluster >= 0], cluster[cluster >= 0]))
-    scored = ~np.isnan(kept.score)
-    which, other = _labels_beside(kept)
+    in_spot = cluster >= 0
+    _, spot = distinct_rows((group[in_spot], cluster[in_spot]))
+    placed = rows_of(detections, in_spot)
+    is_scored = ~np.isnan(placed.score)
+    row, other_label = _labels_beside(placed)
     tables = (
-        _spots(kept, spot, seen.times, together[group[cluster >= 0]]),
+        _spots(placed, spot, seen.times, together[group[in_spot]]),
         looks,
-        _tallied(spot, look[kept.message]),
-        _tallied(spot[scored], bin_of(_thousandths(kept.score[scored]))),
-        _tallied(spot[which], other),
-        _unplaced(lost, seen.times),
+        _pair_counts(spot, look[placed.message]),
+        _pair_counts(spot[is_scored], bin_of(_thousandths(placed.score[is_scored]))),
+        _pair_counts(spot[row], other_label),
+        _unplaced(rows_of(detections, ~in_spot), seen.times),
         np.zeros((0, len(Fix)), np.int64),
     )
     return Sights((topic,), labels, *tables)
 
 
 def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
-    """Returns where odometry was in the map at some log times, and nothing else.
+    """Returns sights with fixes alone: where odometry was in the map.
 
     Args:
-        times: ns.
-        poses: x, y (m) and yaw (rad) at each.
-        sigma_m: what the localiser says; NaN where it does not.
+        times: log times (ns).
+        poses: for each time, x, y (m) and yaw (rad) of odometry in the map.
+        sigma_m: for each time, `Fix.SIGMA` as the localiser states it; NaN if it does not.
     """
-    said = np.rint(np.nan_to_num(np.minimum(sigma_m, _MAX_AWAY_M) * 1000, nan=-1)).astype(np.int64)
+    sigma_mm = np.nan_to_num(np.minimum(sigma_m, _MAX_AWAY_M) * 1000, nan=-1)
+    sigmas = np.rint(sigma_mm).astype(np.int64)
     x, y, yaw = poses.T
-    columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), said)
-    none = (np.zeros((0, len(kind)), np.int64) for kind in TABLES[:-1])
-    return Sights((), (), *(*none, np.stack(columns, axis=1)))
+    columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), sigmas)
+    empty = (np.zeros((0, len(kind)), np.int64) for kind in TABLES[:-1])
+    return Sights((), (), *(*empty, np.stack(columns, axis=1)))
 
 
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
-    """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
+    """Returns the look of each message (-1 if the robot's pose is not known), and the table."""
     is_known = ~np.isnan(seen.robot.sum(axis=1))
     x, y, z, yaw, pan = np.where(is_known[:, None], seen.robot, 0.0).T
     turned = np.rint(_decideg(pan) / CELL_DECIDEG).astype(np.int64) * CELL_DECIDEG % 3600
@@ -234,30 +239,33 @@ def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
 
 
 def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
-    """Returns the detections, and the names of their labels."""
-    # Those that none has are of other messages, which may be forgotten.
+    """Returns the detections, and the names of their labels, sorted."""
+    # A label without a detection is of other messages, which may be forgotten.
     used, nth_used = np.unique(seen.labels, return_inverse=True)
-    shown = [shortened(seen.names[code], MAX_LABEL_CHARS) for code in used.tolist()]
-    names = sorted({*shown})
+    short_names = [shortened(seen.names[code], MAX_LABEL_CHARS) for code in used.tolist()]
+    names = sorted({*short_names})
     number = {name: nth for nth, name in enumerate(names)}
-    label = np.array([number[name] for name in shown], np.int64)[nth_used]
+    label = np.array([number[name] for name in short_names], np.int64)[nth_used]
     with np.errstate(invalid="ignore"):
-        near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
-    x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
+        is_placed: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
+    x, y, z = _mm(np.where(is_placed[:, None], seen.places, 0.0)).T
     scores = np.where(np.isfinite(seen.scores), seen.scores, np.nan)
-    detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, near)
+    detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, is_placed)
     if len(names) > MAX_LABELS:
         rows, nth = distinct_rows((detections.slice, label))
         begins = run_starts(rows[:, 0])
-        before = np.repeat(begins, np.diff(begins, append=len(rows)))
-        detections = rows_of(detections, (np.arange(len(rows)) - before <= MAX_LABELS)[nth])
+        slice_begins = np.repeat(begins, np.diff(begins, append=len(rows)))
+        nth_in_slice = np.arange(len(rows)) - slice_begins
+        detections = rows_of(detections, (nth_in_slice <= MAX_LABELS)[nth])
     return detections, tuple(names)
 
 
 def _label_groups(detections: _Detections) -> tuple[Ints, Ints]:
-    """Returns the slice and label of each detection, numbered, and how many are seen at once.
+    """Groups detections by slice and label.
 
-    That is how many of the label at least three messages of the slice have, or all.
+    Returns:
+        For each detection its group, and for each group how many of the label are seen at once:
+        at least three messages of the slice have so many or, if there are fewer, all messages.
     """
     _, group = distinct_rows((detections.slice, detections.label))
     rows, nth = distinct_rows((group, detections.message))
@@ -270,100 +278,112 @@ def _label_groups(detections: _Detections) -> tuple[Ints, Ints]:
 
 
 def _clusters(group: Ints, message: Ints, x: Ints, y: Ints) -> Ints:
-    """Returns the spot of each detection within its group; -1 where it has too many.
+    """Returns the spot of each detection within its group; -1 for detections of too many spots.
 
-    Detections are ordered by group, and by message. Each is of the nearest spot, no two of a
-    message of one. Mostly a group is one spot: all lie near the mean of those before.
+    Detections are ordered by group and by message. Each goes to the nearest spot, no two of a
+    message to one. Mostly a group is one spot, as each of its detections lies near the mean of
+    those before: only the other groups are clustered one by one.
     """
     begins = run_starts(group)
     start = np.repeat(begins, np.diff(begins, append=len(group)))
     nth = np.arange(len(group)) - start
-    away = np.zeros(len(group))
+    squared = np.zeros(len(group))
     for column in (x, y):
         off = column - column[start]
         before = np.cumsum(off) - off
-        away += (off - (before - before[start]) / np.maximum(nth, 1)) ** 2
-    is_hard = (nth > 0) & (away > _GATE_SQUARED)
-    is_hard[1:] |= (group[1:] == group[:-1]) & (message[1:] == message[:-1])
+        squared += (off - (before - before[start]) / np.maximum(nth, 1)) ** 2
+    is_apart = (nth > 0) & (squared > _GATE_SQUARED)
+    is_apart[1:] |= (group[1:] == group[:-1]) & (message[1:] == message[:-1])
     spots = np.zeros(len(group), np.int64)
-    for which in np.unique(group[is_hard]).tolist():
-        begin, end = np.searchsorted(group, (which, which + 1)).tolist()
-        of_group = slice(begin, end)
-        places = [*zip(x[of_group].tolist(), y[of_group].tolist(), strict=True)]
-        spots[of_group] = _cluster_label(message[of_group].tolist(), places)
+    for number in np.unique(group[is_apart]).tolist():
+        rows = slice(*np.searchsorted(group, (number, number + 1)).tolist())
+        places = [*zip(x[rows].tolist(), y[rows].tolist(), strict=True)]
+        spots[rows] = _cluster_label(message[rows].tolist(), places)
     return spots
 
 
 def _cluster_label(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[int]:
-    """Returns the spot of each detection of one label, which are ordered by message."""
+    """Returns the spot of each detection of one label; -1 if there are too many spots.
+
+    `messages` are the indices of the detections' messages, ascending.
+    """
     spots: list[_Sums] = []
     together: Counter[tuple[int, int]] = Counter()
     assigned: list[int] = []
     for _, in_message in groupby(range(len(messages)), key=messages.__getitem__):
-        chosen = _assign(spots, [places[nth] for nth in in_message])
-        assigned += chosen
-        together.update(combinations(sorted(spot for spot in chosen if spot >= 0), 2))
-    # What has no spot, at -1, stays so.
-    into = [*_merge_spots(spots, together), -1]
-    return [into[spot] for spot in assigned]
+        own_places = [places[nth] for nth in in_message]
+        nearest = _nearest_spots(spots, own_places)
+        own_spots: list[int] = []
+        for nth, (x, y) in enumerate(own_places):
+            spot = nearest.get(nth, -1)
+            if spot < 0 and len(spots) < MAX_SPOTS:
+                spot = len(spots)
+                spots.append((0, 0, 0))
+            if spot >= 0:
+                spots[spot] = _added(spots[spot], (1, x, y))
+            own_spots.append(spot)
+        assigned += own_spots
+        together.update(combinations(sorted(spot for spot in own_spots if spot >= 0), 2))
+    merged_into = _merged_spots(spots, together)
+    return [spot if spot < 0 else merged_into[spot] for spot in assigned]
 
 
-def _assign(spots: list[_Sums], places: Sequence[tuple[int, int]]) -> list[int]:
-    """Adds the detections of a message to spots, and returns these; -1 where there are too many."""
+def _nearest_spots(spots: Sequence[_Sums], places: Sequence[tuple[int, int]]) -> dict[int, int]:
+    """Returns the spots that the detections of a message go to, by the index of the detection.
+
+    The nearest pairs are matched first, each spot and each detection once.
+    """
+    pairs: list[tuple[float, int, int]] = []
     if len(spots) * len(places) < _MANY_PAIRS:
-        pairs = [
-            (squared, nth, which)
-            for nth, (x, y) in enumerate(places)
-            for which, (n, sum_x, sum_y) in enumerate(spots)
-            if (squared := (sum_x / n - x) ** 2 + (sum_y / n - y) ** 2) <= _GATE_SQUARED
-        ]
+        for nth, (x, y) in enumerate(places):
+            for spot, (n, sum_x, sum_y) in enumerate(spots):
+                squared = (sum_x / n - x) ** 2 + (sum_y / n - y) ** 2
+                if squared <= _GATE_SQUARED:
+                    pairs.append((squared, nth, spot))
     else:
         sums = np.array(spots)
-        away = ((sums[:, 1:] / sums[:, :1] - np.array(places)[:, None]) ** 2).sum(axis=2)
-        near = np.nonzero(away <= _GATE_SQUARED)
-        pairs = [*zip(away[near].tolist(), *(column.tolist() for column in near), strict=True)]
-    taken: dict[int, int] = {}
-    others: set[int] = set()
-    for _, nth, which in sorted(pairs):
-        if nth not in taken and which not in others:
-            taken[nth] = which
-            others.add(which)
-    chosen = []
-    for nth, place in enumerate(places):
-        which = taken.get(nth, -1)
-        if which < 0 and len(spots) < MAX_SPOTS:
-            which = len(spots)
-            spots.append((0, 0, 0))
-        if which >= 0:
-            spots[which] = _added(spots[which], (1, *place))
-        chosen.append(which)
-    return chosen
+        squares = ((sums[:, 1:] / sums[:, :1] - np.array(places)[:, None]) ** 2).sum(axis=2)
+        near = np.nonzero(squares <= _GATE_SQUARED)
+        pairs += zip(squares[near].tolist(), *(column.tolist() for column in near), strict=True)
+    spot_of: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, nth, spot in sorted(pairs):
+        if nth not in spot_of and spot not in taken:
+            spot_of[nth] = spot
+            taken.add(spot)
+    return spot_of
 
 
 def _added(one: _Sums, other: _Sums) -> _Sums:
     return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
-def _merge_spots(spots: list[_Sums], together: Mapping[tuple[int, int], int]) -> list[int]:
-    """Returns into which spot each goes: those that lie together, and no messages have both of."""
-    into = [*range(len(spots))]
-    for first, other in combinations(range(len(spots)), 2):
-        if into[first] != first or into[other] != other:
+def _merged_spots(spots: Sequence[_Sums], together: Mapping[tuple[int, int], int]) -> list[int]:
+    """Returns the spot that each spot is merged into, often itself.
+
+    Spots that lie together are merged, unless messages have both. `together` counts the messages
+    that have a pair of spots.
+    """
+    sums = [*spots]
+    merged_into = [*range(len(sums))]
+    for first, other in combinations(range(len(sums)), 2):
+        if merged_into[first] != first or merged_into[other] != other:
             continue
-        (n, x, y), (more, to_x, to_y) = spots[first], spots[other]
-        squared = (x / n - to_x / more) ** 2 + (y / n - to_y / more) ** 2
+        (n, x, y), (other_n, other_x, other_y) = sums[first], sums[other]
+        squared = (x / n - other_x / other_n) ** 2 + (y / n - other_y / other_n) ** 2
         both = together.get((first, other), 0)
-        if both <= _TOGETHER_SHARE * min(n, more) and squared < _SAME_SQUARED:
-            spots[first] = _added(spots[first], spots[other])
-            into[other] = first
-    return into
+        if both <= _TOGETHER_SHARE * min(n, other_n) and squared < _SAME_SQUARED:
+            sums[first] = _added(sums[first], sums[other])
+            merged_into[other] = first
+    return merged_into
 
 
 def _spots(detections: _Detections, spot: Ints, times: Ints, together: Ints) -> Ints:
+    """Returns the table of spots; `spot` and `together` are for each detection."""
     by = Groups.of(spot)
     n, firsts = by.sizes, by.firsts
     x, y, z = (by.sums(column) // n for column in (detections.x, detections.y, detections.z))
-    # From the first of each: squares of far places are more than 63 bits.
+    # Relative to the first detection of each: squares of far places are beyond 63 bits.
     dx, dy = (column - column[firsts][spot] for column in (detections.x, detections.y))
     spread = n * by.sums(dx * dx + dy * dy) - by.sums(dx) ** 2 - by.sums(dy) ** 2
     dev = np.sqrt(np.maximum(spread, 0)).astype(np.int64) // n
@@ -375,34 +395,39 @@ def _spots(detections: _Detections, spot: Ints, times: Ints, together: Ints) -> 
     return np.stack((detections.slice[firsts], topic, detections.label[firsts], *columns), axis=1)
 
 
-def _unplaced(lost: _Detections, times: Ints) -> Ints:
-    rows, group = distinct_rows((lost.slice, lost.label))
+def _unplaced(detections: _Detections, times: Ints) -> Ints:
+    """Returns the table of detections without a place."""
+    rows, group = distinct_rows((detections.slice, detections.label))
     by = Groups.of(group)
-    first, last = by.ends(_rounded(times[lost.message]))
+    first, last = by.ends(_rounded(times[detections.message]))
     topic = np.zeros(len(rows), np.int64)
     return np.stack((rows[:, 0], topic, rows[:, 1], by.sizes, first, last), axis=1)
 
 
 def _labels_beside(detections: _Detections) -> tuple[Ints, Ints]:
-    """Returns detections and another label that is beside each, each pair once."""
+    """Returns pairs of a detection and another label that is beside it, each pair once.
+
+    Detections of a message are compared in order of x, each with the next one, then each with the
+    next but one, and so on, until none are near enough in x.
+    """
     order = np.lexsort((detections.x, detections.message))
     ones, others = [order[:0]], [order[:0]]
     for step in range(1, _MAX_COMPARED):
         a, b = order[:-step], order[step:]
-        near = detections.message[a] == detections.message[b]
-        near &= detections.x[b] - detections.x[a] < _BESIDE_MM
-        if not near.any():
+        is_near = detections.message[a] == detections.message[b]
+        is_near &= detections.x[b] - detections.x[a] < _BESIDE_MM
+        if not is_near.any():
             break
-        near &= detections.label[a] != detections.label[b]
-        near &= np.abs(detections.y[a] - detections.y[b]) < _BESIDE_MM
-        ones += [a[near], b[near]]
-        others += [b[near], a[near]]
+        is_near &= detections.label[a] != detections.label[b]
+        is_near &= np.abs(detections.y[a] - detections.y[b]) < _BESIDE_MM
+        ones += [a[is_near], b[is_near]]
+        others += [b[is_near], a[is_near]]
     rows, _ = distinct_rows((np.concatenate(ones), detections.label[np.concatenate(others)]))
     return rows[:, 0], rows[:, 1]
 
 
-def _tallied(first: Ints, other: Ints) -> Ints:
-    """Returns the distinct pairs, and how often there is each."""
+def _pair_counts(first: Ints, other: Ints) -> Ints:
+    """Returns the distinct pairs, and how often each occurs, as rows of three."""
     rows, nth = distinct_rows((first, other))
     return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
 
@@ -417,7 +442,7 @@ def _decideg(radians: Floats) -> Ints:
 
 
 def _thousandths(scores: Floats) -> Ints:
-    """Returns scores in thousandths: float32 has 0.7 as 0.69999999."""
+    """Returns scores in whole thousandths, so that 0.69999999, a float32 of 0.7, is 700."""
     return np.rint(np.clip(np.nan_to_num(scores), 0.0, _MAX_SCORE) * 1000).astype(np.int64)
 
 
@@ -427,6 +452,6 @@ def bin_of(thousandths: Ints) -> Ints:
 
 
 def _rounded(times: Ints) -> Ints:
-    """Rounds log times (ns) up to 1 us: a message is never later than the time that is shown."""
-    # The last microsecond is not whole: its end is no time.
+    """Rounds log times (ns) up to microseconds: no message is later than the time that is shown."""
+    # The greatest time lies inside of a microsecond, whose end would overflow.
     return np.minimum(-(-times // NS_PER_US), MAX_NS // NS_PER_US) * NS_PER_US

@@ -1,7 +1,7 @@
 """The events that follow from what the messages of a topic state.
 
-Objects came into view and left, a state changed, errors and warnings were reported. Where a history
-is cut changes nothing, as long as nothing is left out for being too much.
+Objects come into view and leave, states change, errors and warnings are reported. How a history is
+cut into bags changes nothing, unless there are so many events that some are left out.
 """
 
 from __future__ import annotations
@@ -19,26 +19,29 @@ from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
 
 MAX_PER_BAG: Final = 64
-"""Intervals, changes and errors of one topic in one bag that a lake holds; the rest is counted."""
-MAX_HELD: Final = 20_000
-"""Changes, errors and the like of a topic that a question about a week may hold."""
-MAX_SEEN: Final = 100_000
-"""Intervals likewise; they are held as numbers."""
+"""How many intervals, changes and errors of a topic in a bag a lake has; the rest is counted."""
+MAX_EVENTS: Final = 20_000
+"""How many states, changes, errors or reports of a topic a question may have in memory."""
+MAX_INTERVALS: Final = 100_000
+"""How many intervals, which take less memory."""
 REPEATED_NS: Final = 2 * NS_PER_S
-"""A log entry that follows its like sooner is the same report."""
+"""A log entry that follows a similar one within this time belongs to the same report."""
 
 _BYTES: Final = 190
-"""About how much memory a change, an error or a state takes, and what each topic's events do."""
+"""About how much memory a state, a change or a report takes."""
 _NOTHING_VISIBLE: Final = IntervalTable()
 _DIGITS: Final = re.compile(r"\d+")
 
 
 class KnownState(NamedTuple):
-    """A state: its value in the first message that has it, and in the last; see `facts.Word`."""
+    """A state and its values in the first message that has it (at log time `at`), and in the last.
+
+    `kind`, `name` and `text` are as in `facts.Word`; `text` describes the first value.
+    """
 
     kind: str
     name: str
@@ -49,7 +52,7 @@ class KnownState(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A state that is `value` from `time` on, and was another before."""
+    """A state that has `value` from log time `time` on, and had another value before."""
 
     kind: str
     name: str
@@ -59,7 +62,7 @@ class Change(NamedTuple):
 
 
 class Report(NamedTuple):
-    """Sentences that are alike, and the log times of the first and last of them (inclusive)."""
+    """Similar sentences: the first one, the log times of the first and the last, and how many."""
 
     text: str
     first: Ns
@@ -69,21 +72,20 @@ class Report(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TopicEvents:
-    """The events of one topic in some time, to be joined with those before and after.
+    """The events of one topic in a part of a history.
 
     Attributes:
-        first: log time of the first message.
-        last: of the last.
+        first: log time of the first message; after `last` if no message can be decoded.
+        last: log time of the last message.
         visible: the intervals in which objects were visible.
-        known: each state's value at either end.
-        changes: of states, in order.
-        errors: by the time of their first report.
-        reports: log entries of WARN and above, likewise: those alike but for their numbers.
-        left_out: events and states beyond what is kept: the longest intervals are, and the earliest
-            of the others.
-        undecodable: messages that cannot be decoded; where there are no others, `first` is after
-            `last`.
-        beyond: facts of one message that are not tracked, at most.
+        known: the states, with their values at both ends.
+        changes: the changes of states, in order of time.
+        errors: the errors, in order of their first report.
+        reports: the log entries of WARN and above, in order; similar ones differ in digits alone.
+        left_out: how many events and states are left out because there are too many. The longest
+            intervals and the earliest other events stay.
+        undecodable: how many messages cannot be decoded.
+        beyond: the most facts of one message that are not tracked.
     """
 
     first: Ns
@@ -99,7 +101,7 @@ class TopicEvents:
 
     @property
     def memory_bytes(self) -> int:
-        """About how much memory it takes."""
+        """About how much memory the events take."""
         lists = (self.known, self.changes, self.errors, self.reports, self.visible.labels)
         return _BYTES * (1 + sum(map(len, lists))) + len(self.visible.rows)
 
@@ -111,11 +113,11 @@ class TopicEvents:
         )
 
     def without_sights(self) -> TopicEvents:
-        """Returns states, changes and reports alone: what was visible, and errors, are left out."""
+        """Returns the events without intervals and errors."""
         return replace(self, visible=_NOTHING_VISIBLE, errors=())
 
     def limited(self, at_most: int, intervals: int) -> TopicEvents:
-        """Returns these with so many intervals, and so many of each other kind, at most."""
+        """Returns at most so many intervals, and `at_most` changes, errors and reports each."""
         lists = (self.changes, self.errors, self.reports)
         left_out = sum(max(0, len(events) - at_most) for events in lists)
         return replace(
@@ -129,19 +131,20 @@ class TopicEvents:
 
 
 def events_of(stated: Stated) -> TopicEvents | None:
-    """Returns the events of messages in order of log time; None without any."""
+    """Returns the events of the messages of one topic; None without a message."""
     times, undecodable = stated.times, stated.undecodable.size
     if not times.size:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = stated.facts.of_kinds({LABEL})
     labels = [word.name for word in seen.words]
-    states, changes = _states_and_changes(stated)
+    log = _StateLog()
+    log.add(_new_states(stated))
     return TopicEvents(
         int(times[0]),
         int(times[-1]),
         visible_in(times, seen.rows, seen.codes, seen.values, labels),
-        states,
-        changes,
+        log.states,
+        tuple(log.changes),
         _merge_errors(_reports_of(stated, ERROR)),
         _merge_log_entries(_reports_of(stated, REPORT)),
         0,
@@ -151,113 +154,117 @@ def events_of(stated: Stated) -> TopicEvents | None:
 
 
 def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
-    """Returns the events of times that follow each other as those of one; None without a message.
+    """Joins the events of consecutive parts of a history; returns None without a message.
 
-    Where they are too many, the longest intervals are kept, and the earliest of the others.
+    At most `MAX_INTERVALS` intervals and `MAX_EVENTS` of other events stay.
     """
     undecodable = sum(part.undecodable for part in parts)
     parts = [part for part in parts if part.first <= part.last]
     if not parts:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = [IntervalPart(part.first, part.last, part.visible) for part in parts]
-    states, changes, more = _joined_states(parts)
+    log = _StateLog()
+    for part in parts:
+        log.add(part.known, part.changes)
+        log.limit(MAX_EVENTS)
     whole = TopicEvents(
         parts[0].first,
         parts[-1].last,
         join_parts(seen).visible,
-        states,
-        changes,
+        log.states,
+        tuple(log.changes),
         _merge_errors(error for part in parts for error in part.errors),
         _merge_log_entries(report for part in parts for report in part.reports),
-        more + sum(part.left_out for part in parts),
+        log.left_out + sum(part.left_out for part in parts),
         undecodable,
         max(part.beyond for part in parts),
     )
-    return whole.limited(MAX_HELD, MAX_SEEN)
+    return whole.limited(MAX_EVENTS, MAX_INTERVALS)
 
 
-def _states_and_changes(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
-    """Returns what each state was first and last, and its changes."""
+class _StateLog:
+    """The states of consecutive messages, or of consecutive parts, and their changes.
+
+    Attributes:
+        changes: the changes, in order of time part by part.
+        left_out: how many states were left out.
+    """
+
+    def __init__(self) -> None:
+        self._states: dict[tuple[str, str], KnownState] = {}
+        self.changes: list[Change] = []
+        self.left_out = 0
+
+    @property
+    def states(self) -> tuple[KnownState, ...]:
+        """The states, with their first and last values."""
+        return tuple(self._states.values())
+
+    def add(self, states: Iterable[KnownState], changes: Iterable[Change] = ()) -> None:
+        """Adds the states of what comes next, and the changes within it."""
+        added = [*changes]
+        for state in states:
+            key = state.kind, state.name
+            before = self._states.get(key)
+            if before is None:
+                self._states[key] = state
+                continue
+            self._states[key] = before._replace(last=state.last)
+            if before.last != state.first:
+                added.append(Change(*key, state.at, state.first, state.text))
+        self.changes += sorted(added, key=lambda change: change.time)
+
+    def limit(self, at_most: int) -> None:
+        """Leaves out states that were added after the first `at_most`."""
+        self.left_out += max(len(self._states) - at_most, 0)
+        self._states = dict(islice(self._states.items(), at_most))
+
+
+def _new_states(stated: Stated) -> Iterator[KnownState]:
+    """Yields each state when a message first has it, and when its value differs, in order."""
     facts = stated.facts.of_kinds(STATES)
     names, _ = joined_codes([(facts.codes, [word[:2] for word in facts.words])])
     order = np.argsort(names, kind="stable")
     values = facts.values.astype(np.int64)
     is_new = (np.diff(names[order], prepend=-1) != 0) | (np.diff(values[order], prepend=0) != 0)
-    news = np.sort(order[is_new])
-    columns = facts.codes[news], stated.times[facts.rows[news]], values[news]
-    rows = zip(*(column.tolist() for column in columns), strict=True)
-    states: dict[tuple[str, str], KnownState] = {}
-    words = facts.words
-    changes = _changed(
-        states,
-        (
-            KnownState(words[code].kind, words[code].name, at, value, value, words[code].text)
-            for code, at, value in rows
-        ),
-    )
-    return tuple(states.values()), tuple(changes)
-
-
-def _changed(
-    states: dict[tuple[str, str], KnownState], following: Iterable[KnownState]
-) -> list[Change]:
-    """Returns the changes from states to what follows them, which `states` then have, too."""
-    changes: list[Change] = []
-    for held in following:
-        before = states.get(held[:2])
-        states[held[:2]] = held if before is None else before._replace(last=held.last)
-        if before is not None and before.last != held.first:
-            changes.append(Change(held.kind, held.name, held.at, held.first, held.text))
-    return changes
-
-
-def _joined_states(
-    parts: Sequence[TopicEvents],
-) -> tuple[tuple[KnownState, ...], tuple[Change, ...], int]:
-    """Returns the states in times that follow each other, and the changes in and between them.
-
-    The changes are in order of time, part by part. With them how much more was held than is kept.
-    """
-    states: dict[tuple[str, str], KnownState] = {}
-    changes: list[Change] = []
-    left_out = 0
-    for part in parts:
-        between = _changed(states, part.known)
-        left_out += max(len(states) - MAX_HELD, 0)
-        states = dict(islice(states.items(), MAX_HELD))
-        changes += sorted([*between, *part.changes], key=lambda change: change.time)
-    return tuple(states.values()), tuple(changes), left_out
+    new = np.sort(order[is_new])
+    codes, times = facts.codes[new].tolist(), stated.times[facts.rows[new]].tolist()
+    for code, at, value in zip(codes, times, values[new].tolist(), strict=True):
+        kind, name, text = facts.words[code]
+        yield KnownState(kind, name, at, value, value, text)
 
 
 def _reports_of(stated: Stated, kind: str) -> list[Report]:
-    """Returns each sentence of a kind as a report."""
+    """Returns a report of each sentence of a kind."""
     facts = stated.facts.of_kinds({kind})
     cells = zip(facts.codes.tolist(), stated.times[facts.rows].tolist(), strict=True)
     return [Report(facts.words[code].name, time, time, 1) for code, time in cells]
 
 
-def _merge_errors(reports: Iterable[Report]) -> tuple[Report, ...]:
-    alike = _merge_reports(reports, str, MAX_NS)
-    return tuple(sorted(alike, key=lambda error: (error.first, error.text)))
+def _merge_errors(errors: Iterable[Report]) -> tuple[Report, ...]:
+    """Merges equal errors into one report each, in order of the first."""
+    merged = _merge_reports(errors, str, MAX_NS)
+    return tuple(sorted(merged, key=lambda error: (error.first, error.text)))
 
 
 def _merge_log_entries(reports: Iterable[Report]) -> tuple[Report, ...]:
+    """Merges log entries that differ in digits alone and follow within `REPEATED_NS`."""
     return tuple(_merge_reports(reports, lambda text: _DIGITS.sub("#", text), REPEATED_NS))
 
 
 def _merge_reports(
-    reports: Iterable[Report], likeness: Callable[[str], str], apart: Ns
+    reports: Iterable[Report], key_of: Callable[[str], str], within: Ns
 ) -> list[Report]:
-    """Returns reports in order, each joined to the newest one like it, where that is recent."""
-    joined: list[Report] = []
+    """Merges each report with the newest one of the same key that is at most `within` before it."""
+    merged: list[Report] = []
     newest: dict[str, int] = {}
     for report in reports:
-        alike = likeness(report.text)
-        nth = newest.get(alike)
-        if nth is not None and report.first - joined[nth].last <= apart:
-            before = joined[nth]
-            joined[nth] = before._replace(last=report.last, reports=before.reports + report.reports)
+        key = key_of(report.text)
+        nth = newest.get(key)
+        if nth is not None and report.first - merged[nth].last <= within:
+            before = merged[nth]
+            merged[nth] = before._replace(last=report.last, reports=before.reports + report.reports)
         else:
-            newest[alike] = len(joined)
-            joined.append(report)
-    return joined
+            newest[key] = len(merged)
+            merged.append(report)
+    return merged

@@ -89,8 +89,8 @@ def test_values_of_columns_are_those_of_the_messages(rows: list[float]) -> None:
 def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(topic_events, "MAX_HELD", 10)
-    monkeypatch.setattr(topic_events, "MAX_SEEN", 10)
+    monkeypatch.setattr(topic_events, "MAX_EVENTS", 10)
+    monkeypatch.setattr(topic_events, "MAX_INTERVALS", 10)
     parts = []
     for nth in range(15):
         at = nth * 100 * NS_PER_S

@@ -1,8 +1,8 @@
 """Distance, speed, gaps, jumps and resets along poses in log-time order.
 
-Paths can be joined: what is measured of some poses and of those that follow them gives what all of
-them together give. Lengths so joined differ a little from those of the same poses in other parts,
-since noise is estimated in each part; without noise they do not.
+The measurements of consecutive parts of a path can be joined. Without noise the result does not
+depend on where the path is cut. Noise is estimated in each part, so with noise lengths differ a
+little.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ros2_memory.analysis.motion.path_length import (
     FEWEST,
     SPEED_STEPS,
     End,
-    measured,
+    measure,
 )
 from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors, row_sums
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
@@ -29,35 +29,33 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Vector3
 
 ARRIVAL_JITTER_NS: Final = 100 * NS_PER_MS
-"""The jitter of arrivals: the shortest time that the distance of two poses is divided by.
+"""The shortest time by which the distance of two poses is divided.
 
 Log time is the time of arrival. Transports and a busy recorder deliver in bursts: public bags
 contain poses 3 ms apart in time and 0.2 m in space, which is GNSS noise and not 72 m/s.
 """
 
 GAP_NS: Final = NS_PER_S
-"""Poses are consecutive up to this far apart, or up to `GAP_PERIODS` of their usual periods."""
+"""Poses farther apart than this, and than `GAP_PERIODS` usual periods, have a gap between them."""
 GAP_PERIODS: Final = 5
 _NEARBY: Final = 8
 """The usual period around a pair of poses is the median of so many intervals on either side."""
 
 MOVED_M: Final = 1.0
-"""Odometry that is reset begins within this of its origin, having been farther away."""
+"""After a reset, odometry begins within this distance of its origin; before, it was farther."""
 
 _RESTART_M: Final = 0.25
-"""A longer step may be a reset of odometry by comparison with its neighbours alone."""
+"""A longer step, which is neither a jump nor a gap, may be a reset by its length alone."""
 _AT_ORIGIN_M: Final = 0.05
-"""Odometry that is reset begins so near its origin, or within two steps of it."""
+"""Such a reset leads this near to the origin, or within two steps of it."""
 _LONGER: Final = 4.0
 _FASTER: Final = 2.0
-"""A step to the origin is a reset if it is so many times longer, and faster, than those near it."""
+"""Such a reset is so many times longer, and faster, than the steps near it."""
 _DENSE_NS: Final = 250 * NS_PER_MS
-_HARD_MPS2: Final = (2.0, 10.0)
-"""Accelerations (m/s^2) that such a step would need at least, to be a reset.
-
-The first among poses that follow closely, where no whole start and stop fits between two of them;
-the second among others: more than wheels can transmit.
-"""
+_HARD_MPS2: Final = 10.0
+"""Such a reset would need this acceleration at least: more than wheels can transmit."""
+_HARD_DENSE_MPS2: Final = 2.0
+"""The same among poses that follow closely: no robot starts and stops between two of them."""
 
 FARTHEST_M: Final = 1e12
 """Coordinates beyond this (m) are no place on Earth but memory that was never initialised."""
@@ -67,21 +65,21 @@ _DOUBTFUL: Final = 0.25
 
 _MAX_RESETS: Final = 1000
 _UNCERTAIN: Final = 4.0
-"""Standard deviations by which a step must exceed its neighbours to be longer than them."""
+"""A step that exceeds the expected length by so many standard deviations is longer."""
 
 Link: TypeAlias = Literal["driven", "gap", "jump", "reset"]
 """What is between two consecutive poses; only `driven` counts as distance."""
 
 
 class TimedPosition(NamedTuple):
-    """Where the robot was (m), and when."""
+    """Where the robot was (m), and when (log time)."""
 
     time: Ns
     position: Vector3
 
 
 class NearbyMotion(NamedTuple):
-    """How a robot moves near a pose: its longest step (m) and its highest speed."""
+    """How a robot moves near a pose: its longest step (m) and its highest speed (m/s)."""
 
     step_m: float
     speed_mps: float
@@ -103,10 +101,16 @@ def link(
 ) -> Link:
     """Returns what is between two consecutive poses.
 
-    A jump is faster than plausible. A gap is time in which nothing was recorded: more than a
-    second, and more than five usual periods (ns), where these are known. A jump or a gap to the
-    origin of odometry is a reset, and so is a step to it that the robot, by its motion near the
-    step, cannot have driven.
+    A jump is faster than plausible. A gap is longer than `GAP_NS` and `GAP_PERIODS` usual periods.
+    A jump or a gap to the origin of odometry is a reset. So is another step to the origin, if the
+    robot cannot have driven it, by its motion near the step.
+
+    Args:
+        before: the first pose.
+        after: the second pose.
+        usual_ns: the usual time between poses; None if it is not known.
+        fastest_mps: the highest plausible speed.
+        near: the motion near the step; None if there are too few poses.
     """
     elapsed = after.time - before.time
     step_m, elapsed_s = _step(before, after)
@@ -119,17 +123,15 @@ def link(
         return "jump" if is_jump else "gap"
     if near is None or usual_ns is None or from_origin_m > max(_AT_ORIGIN_M, 2 * near.step_m):
         return "driven"
-    # From rest to rest, half of the time faster and half of it slower.
-    hardest_m = _HARD_MPS2[usual_ns > _DENSE_NS] * elapsed_s * elapsed_s / 4
+    hard_mps2 = _HARD_MPS2 if usual_ns > _DENSE_NS else _HARD_DENSE_MPS2
+    # From rest to rest: half of the time the robot accelerates, the other half it brakes.
+    hardest_m = hard_mps2 * elapsed_s * elapsed_s / 4
     usual_m = max(_LONGER * near.step_m, _FASTER * near.speed_mps * elapsed_s)
     return "reset" if step_m > max(_RESTART_M, usual_m, hardest_m) else "driven"
 
 
 def _step(before: TimedPosition, after: TimedPosition) -> tuple[float, float]:
-    """Returns the length (m) of a step, and how long it took (s).
-
-    A burst shortens the time between two poses to nothing, which is neither a jump nor fast.
-    """
+    """Returns the length (m) of a step, and how long it took (s), at least `ARRIVAL_JITTER_NS`."""
     elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
     return math.dist(before.position, after.position), elapsed_s
 
@@ -139,7 +141,7 @@ def _is_jump(step_m: float, elapsed_s: float, fastest_mps: float) -> bool:
 
 
 def _motion_of(path: Sequence[TimedPosition]) -> NearbyMotion:
-    """Returns the longest step of consecutive poses, and the highest speed over half of them."""
+    """Returns the longest step of some poses, and the highest speed over half of them."""
     if len(path) < 2:
         return _STATIONARY
     half = max(len(path) // 2, 1)
@@ -153,13 +155,13 @@ class Leg(NamedTuple):
     Attributes:
         first: its first pose.
         last: its last pose.
-        poses: how many it has.
-        period_ns: the usual time between two of them; None for one alone.
+        poses: how many poses it has.
+        period_ns: the usual time between two poses; None for a single pose.
         length_m: its length except for the creeps at its ends (see `path_length`).
         sum_m: the sum of the distances between its poses.
         head: how it begins.
         tail: how it ends.
-        still: whether it is one creep from end to end: that of the head and of the tail.
+        still: whether one creep, that of the head and of the tail, is the whole leg.
         near_first: the motion near its first pose.
         near_last: the motion near its last pose.
     """
@@ -178,48 +180,47 @@ class Leg(NamedTuple):
 
     @property
     def total_m(self) -> float:
-        """Its length, if nothing more is joined to it."""
+        """Its length with the creeps at its ends."""
         ends = (self.head,) if self.still else (self.head, self.tail)
         return self.length_m + sum(end.creep.length_m for end in ends if end.creep is not None)
 
     @property
     def is_uncertain(self) -> bool:
-        """Whether noise may be much of its length: poses too rare to distinguish it from turns."""
+        """Whether noise may be much of its length, since rare poses do not tell it from turns."""
         if self.poses < FEWEST or self.period_ns is None or self.period_ns <= _DENSE_NS:
             return False
         noise_m = max(self.head.noise_m, self.tail.noise_m)
         return self.total_m > MOVED_M and noise_m > _DOUBTFUL * self.sum_m / (self.poses - 1)
 
     def joined(self, later: Leg) -> Leg:
-        """Returns this leg continued, without a break, by a later one."""
+        """Returns this leg and a later one, which continues it without a break, as one."""
         step_m = math.dist(self.last.position, later.first.position)
-        is_bridged = (self.poses < FEWEST) != (later.poses < FEWEST)
-        head, tail, length_m, still = (
-            self._bridged(later, step_m) if is_bridged else self._linked(later, step_m)
-        )
-        # In one step: a path has a leg for each bag, and thousands of bags.
+        if (self.poses < FEWEST) == (later.poses < FEWEST):
+            extent = self._linked(later, step_m)
+        else:
+            extent = self._bridged(later, step_m)
+        longer, shorter = (self, later) if self.poses >= later.poses else (later, self)
+        near_first, near_last = self.near_first, later.near_last
+        if self.poses <= _NEARBY:
+            near_first = near_first.or_more(later.near_first)
+        if later.poses <= _NEARBY:
+            near_last = near_last.or_more(self.near_last)
         return Leg(
             first=self.first,
             last=later.last,
             poses=self.poses + later.poses,
-            period_ns=(self if self.poses >= later.poses else later).period_ns
-            or self.period_ns
-            or later.period_ns,
-            length_m=length_m,
+            period_ns=longer.period_ns or shorter.period_ns,
+            length_m=extent.length_m,
             sum_m=self.sum_m + step_m + later.sum_m,
-            head=head,
-            tail=tail,
-            still=still,
-            near_first=self.near_first
-            if self.poses > _NEARBY
-            else self.near_first.or_more(later.near_first),
-            near_last=later.near_last
-            if later.poses > _NEARBY
-            else later.near_last.or_more(self.near_last),
+            head=extent.head,
+            tail=extent.tail,
+            still=extent.still,
+            near_first=near_first,
+            near_last=near_last,
         )
 
-    def _linked(self, later: Leg, step_m: float) -> tuple[End, End, float, bool]:
-        """Returns the ends, the length and whether it is still of this leg and a later one."""
+    def _linked(self, later: Leg, step_m: float) -> _Extent:
+        """Returns the extent of two legs whose noise is known in both, or in neither."""
         head, tail, length_m = self.head, later.tail, self.length_m + later.length_m
         before, after = self.tail.creep, later.head.creep
         if before is not None and after is not None:
@@ -230,17 +231,20 @@ class Leg(NamedTuple):
                 tail = tail._replace(creep=creep)
             if not (self.still or later.still):
                 length_m += creep.length_m
-            return head, tail, length_m, self.still and later.still
+            return _Extent(head, tail, length_m, self.still and later.still)
         inner_m = _step_m(self.tail, later.head, 1, step_m, step_m)
         # A creep that filled its leg reaches only one end of the whole.
         if before is not None and not self.still:
             inner_m += before.length_m
         if after is not None and not later.still:
             inner_m += after.length_m
-        return head, tail, length_m + inner_m, False
+        return _Extent(head, tail, length_m + inner_m, False)
 
-    def _bridged(self, later: Leg, step_m: float) -> tuple[End, End, float, bool]:
-        """Does as `_linked`, where one of the legs has too few poses to estimate its noise."""
+    def _bridged(self, later: Leg, step_m: float) -> _Extent:
+        """Returns the extent of two legs, one of which has too few poses to estimate its noise.
+
+        The ends of the other one stay the ends of both.
+        """
         if later.poses < FEWEST:
             net_m = math.dist(self.last.position, later.last.position)
             end, short, long = self.tail, later, self
@@ -248,13 +252,29 @@ class Leg(NamedTuple):
             net_m = math.dist(self.first.position, later.first.position)
             end, short, long = later.head, self, later
         added_m = _step_m(end, end, short.poses, net_m, step_m + short.sum_m)
-        return long.head, long.tail, long.length_m + added_m, long.still
+        return _Extent(long.head, long.tail, long.length_m + added_m, long.still)
+
+
+class _Extent(NamedTuple):
+    """The ends and the length of a leg; see `Leg`."""
+
+    head: End
+    tail: End
+    length_m: float
+    still: bool
 
 
 def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -> float:
-    """Returns the length of some steps between two ends: their paces, unless it is clearly more.
+    """Returns the length (m) of steps between two ends.
 
-    `net_m`: the distance from end to end; `plain_m`: the sum of the distances between.
+    It is expected from the paces of the ends, unless the distance is clearly longer than that.
+
+    Args:
+        before: the end of what lies before the steps.
+        after: the begin of what lies after them.
+        steps: how many there are.
+        net_m: the distance from the first to the last position.
+        plain_m: the sum of the distances of all positions.
     """
     if before.plain and after.plain:
         return plain_m
@@ -267,20 +287,20 @@ def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -
 
 @dataclass(slots=True)
 class MotionTotals:
-    """What was driven, and what is left out of it: the legs of a path, summed up.
+    """Sums over the legs of a path, and what is left out between them.
 
     Attributes:
         head: the first leg; None without a pose.
-        tail: the last leg; None where the first is the only one.
-        length_m: of the legs between these.
-        sum_m: the sum of the distances between poses, of the legs between these.
-        jumps: steps that were faster than plausible; some of them are resets too.
-        jumped_m: their total length.
-        gaps: times in which nothing was recorded.
-        gap_m: the distance across them in straight lines.
-        gap_ns: how long they last, and other steps of more than a second that are left out.
-        resets: the first pose after each reset of odometry; the earliest, of very many.
-        speed_mps: the highest speed measured; None where the poses are too few.
+        tail: the last leg; None if the first is the only one.
+        length_m: the length of the legs between these two.
+        sum_m: the sum of the distances between poses of the legs between these two.
+        jumps: how many steps were faster than plausible; some are resets, too.
+        jumped_m: the length of these steps.
+        gaps: how many times nothing was recorded.
+        gap_m: the distance across gaps, in straight lines.
+        gap_ns: how long gaps last, and other steps of more than a second that are left out.
+        resets: log times of the first pose after each reset, of at most `_MAX_RESETS`.
+        speed_mps: the highest measured speed; None if there are too few poses.
     """
 
     head: Leg | None = None
@@ -297,22 +317,22 @@ class MotionTotals:
 
     @property
     def newest(self) -> Leg | None:
-        """The last leg, be it the only one."""
+        """The last leg, which may be the first one."""
         return self.tail or self.head
 
     @property
     def distance_m(self) -> float:
-        """The length of all that was driven: gaps, jumps and resets left out."""
+        """The driven length, without gaps, jumps and resets."""
         return self.length_m + sum(leg.total_m for leg in self._ends())
 
     @property
     def path_sum_m(self) -> float:
-        """The sum of the distances between the poses of `distance_m`, noise included."""
+        """The sum of the distances between poses of all legs, noise included."""
         return self.sum_m + sum(leg.sum_m for leg in self._ends())
 
     @property
     def is_uncertain(self) -> bool:
-        """Whether noise may be much of the length of its first or last leg."""
+        """Whether noise may be much of the length of the first or the last leg."""
         return any(leg.is_uncertain for leg in self._ends())
 
     @property
@@ -326,15 +346,15 @@ class MotionTotals:
 
 
 class MeasuredPath(NamedTuple):
-    """What is measured of poses in order.
+    """The measurements of poses in order.
 
     Attributes:
-        totals: what was driven.
-        step_mps: the highest speed from one pose to the next, where these are too few to measure
+        totals: sums over the legs.
+        step_mps: the highest speed from one pose to the next, in legs with too few poses to measure
             a speed.
-        parted: which poses a jump or a reset led to.
-        begins: which poses a gap, a jump or a reset led to.
-        steps_m: what was driven from each pose to the next.
+        parted: the indices of poses that a jump or a reset led to.
+        begins: the indices of poses that a gap, a jump or a reset led to.
+        steps_m: the driven length from each pose to the next.
     """
 
     totals: MotionTotals
@@ -349,7 +369,7 @@ def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> Measur
 
     Args:
         times: log times (ns), ascending; at least one.
-        positions: x, y and z (m) of each as a row; places.
+        positions: rows of x, y and z (m); all are places.
         fastest_mps: a step that would take a higher speed is a jump.
     """
     motion, steps_m = Motion(fastest_mps), np.zeros(len(times) - 1)
@@ -365,25 +385,70 @@ def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> Measur
         are_enough = len(earlier) + len(later) >= _NEARBY
         near = _motion_of(earlier).or_more(_motion_of(later)) if are_enough else None
         here, there = earlier[-1], later[0]
-        before = motion.totals.newest
-        usual_ns = _usual_ns(apart, index, None if before is None else before.period_ns)
+        leg_before = motion.totals.newest
+        usual_ns = _usual_ns(apart, index, None if leg_before is None else leg_before.period_ns)
         kind = link(here, there, usual_ns, fastest_mps, near)
         if kind == "driven":
             continue
-        steps_m[begin:index] = motion.add_leg(
-            times[begin : index + 1], positions[begin : index + 1]
-        )
+        measured_leg = _measured_leg(times[begin : index + 1], positions[begin : index + 1])
+        steps_m[begin:index] = measured_leg.steps_m
+        motion.add(measured_leg)
         motion.count_break(kind, here, there)
         begin = index + 1
         begins.append(begin)
         if kind != "gap":
             parted.append(begin)
-    steps_m[begin:] = motion.add_leg(times[begin:], positions[begin:])
+    measured_leg = _measured_leg(times[begin:], positions[begin:])
+    steps_m[begin:] = measured_leg.steps_m
+    motion.add(measured_leg)
     return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), tuple(begins), steps_m)
 
 
+class _MeasuredLeg(NamedTuple):
+    """A leg, and what is measured in it alone.
+
+    Attributes:
+        leg: the leg.
+        speed_mps: the highest speed; None if there are too few poses.
+        step_mps: the highest speed from one pose to the next, if there are too few; else 0.
+        steps_m: the driven length from each pose to the next.
+    """
+
+    leg: Leg
+    speed_mps: float | None
+    step_mps: float
+    steps_m: Floats
+
+
+def _measured_leg(times: Ints, positions: Vectors) -> _MeasuredLeg:
+    """Measures poses without a gap, a jump or a reset between them."""
+    apart = np.diff(times)
+    measured = measure((times - times[0]) / NS_PER_S, positions)
+    head = _poses(times, positions, 0, _NEARBY + 1)
+    tail = _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times))
+    leg = Leg(
+        first=head[0],
+        last=tail[-1],
+        poses=len(times),
+        period_ns=int(np.median(apart)) if len(apart) else None,
+        length_m=measured.length_m,
+        sum_m=measured.sum_m,
+        head=measured.head,
+        tail=measured.tail,
+        still=measured.still,
+        near_first=_motion_of(head),
+        near_last=_motion_of(tail),
+    )
+    step_mps = 0.0
+    if len(times) <= SPEED_STEPS:
+        for (step_m, elapsed_s), apart_ns in zip(map(_step, head, head[1:]), apart, strict=True):
+            if apart_ns >= ARRIVAL_JITTER_NS:
+                step_mps = max(step_mps, step_m / elapsed_s)
+    return _MeasuredLeg(leg, measured.speed_mps, step_mps, measured.steps_m)
+
+
 def _odd_steps(apart: Ints, steps_m: Floats, fastest_mps: float) -> list[int]:
-    """Returns after which poses a gap, a jump or a reset may be."""
+    """Returns the indices of poses after which a gap, a jump or a reset may be."""
     plausible_m = fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
     beside_m = np.maximum(
         np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
@@ -398,43 +463,46 @@ def _poses(times: Ints, positions: Vectors, begin: int, end: int) -> list[TimedP
 
 
 class Motion:
-    """Adds up what was driven.
+    """Adds up the legs of a path.
 
     Attributes:
-        totals: so far.
-        step_mps: the highest speed from one pose to the next where these were too few to measure
+        totals: the sums so far.
+        step_mps: the highest speed from one pose to the next, in legs with too few poses to measure
             a speed.
+        is_parted: whether a jump or a reset led to what was joined last.
     """
 
-    def __init__(self, max_plausible_speed_mps: float) -> None:
-        self._fastest_mps = max_plausible_speed_mps
+    def __init__(self, fastest_mps: float) -> None:
+        self._fastest_mps = fastest_mps
         self.totals = MotionTotals()
         self.step_mps = 0.0
+        self.is_parted = False
 
-    def add_leg(self, times: Ints, positions: Vectors) -> Floats:
-        """Takes a leg that does not go on from the one before; returns the length of its steps."""
-        apart = np.diff(times)
-        seconds = (times - times[0]) / NS_PER_S
-        length_m, sum_m, head, tail, still, speed_mps, steps_m = measured(seconds, positions)
-        begin = _poses(times, positions, 0, _NEARBY + 1)
-        end = _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times))
-        period_ns = int(np.median(apart)) if len(apart) else None
-        motion = _motion_of(begin), _motion_of(end)
-        count, first, last = len(times), begin[0], end[-1]
-        leg = Leg(first, last, count, period_ns, length_m, sum_m, head, tail, still, *motion)
-        if len(times) <= SPEED_STEPS:
-            steps = zip(map(_step, begin, begin[1:]), apart >= ARRIVAL_JITTER_NS, strict=False)
-            speeds = (step_m / elapsed_s for (step_m, elapsed_s), is_known in steps if is_known)
-            self.step_mps = max(self.step_mps, *speeds, 0.0)
-        self._go_on(None, leg, speed_mps)
-        return steps_m
+    def add(self, measured: _MeasuredLeg) -> None:
+        """Adds a leg that does not continue the newest one; `count_break` counts the break."""
+        self.step_mps = max(self.step_mps, measured.step_mps)
+        self._add_speed(measured.speed_mps)
+        self._begin_leg(measured.leg)
 
-    def join(self, later: MotionTotals) -> bool:
-        """Takes the legs that come next; returns whether a jump or reset led there."""
+    def join(self, later: MotionTotals) -> None:
+        """Adds the legs of a later part, the first of which may continue the newest leg."""
+        self.is_parted = False
         if later.head is None:
-            return False
-        totals = self.totals
-        parted = self._go_on(totals.newest, later.head, later.speed_mps)
+            return
+        totals, newest = self.totals, self.totals.newest
+        self._add_speed(later.speed_mps)
+        if newest is None:
+            self._begin_leg(later.head)
+        else:
+            kind = self._link_between(newest, later.head)
+            self.is_parted = kind in {"jump", "reset"}
+            if kind != "driven":
+                self.count_break(kind, newest.last, later.head.first)
+                self._begin_leg(later.head)
+            elif totals.tail is None:
+                totals.head = newest.joined(later.head)
+            else:
+                totals.tail = newest.joined(later.head)
         totals.jumps += later.jumps
         totals.jumped_m += later.jumped_m
         totals.gaps += later.gaps
@@ -446,31 +514,17 @@ class Motion:
             totals.length_m += later.length_m
             totals.sum_m += later.sum_m
             totals.tail = later.tail
-        return parted
 
-    def _go_on(self, before: Leg | None, leg: Leg, speed_mps: float | None) -> bool:
-        """Takes the leg that comes next; returns whether a jump or reset led to it.
-
-        `before` is the one before it, unless what ended that is counted already.
-        """
-        totals = self.totals
+    def _add_speed(self, speed_mps: float | None) -> None:
         if speed_mps is not None:
-            totals.speed_mps = max(totals.speed_mps or 0.0, speed_mps)
-        kind = None if before is None else self._link_between(before, leg)
-        if before is not None and kind is not None:
-            if kind == "driven":
-                if totals.tail is None:
-                    totals.head = before.joined(leg)
-                else:
-                    totals.tail = before.joined(leg)
-                return False
-            self.count_break(kind, before.last, leg.first)
-        if totals.head is None:
-            totals.head = leg
+            self.totals.speed_mps = max(self.totals.speed_mps or 0.0, speed_mps)
+
+    def _begin_leg(self, leg: Leg) -> None:
+        if self.totals.head is None:
+            self.totals.head = leg
         else:
             self._end_leg()
-            totals.tail = leg
-        return kind in ("jump", "reset")
+            self.totals.tail = leg
 
     def _link_between(self, before: Leg, after: Leg) -> Link:
         periods = [leg.period_ns for leg in (before, after) if leg.period_ns is not None]
@@ -481,7 +535,7 @@ class Motion:
         return link(before.last, after.first, usual_ns, self._fastest_mps, near)
 
     def _end_leg(self) -> None:
-        """Adds the last leg to those between."""
+        """Adds the last leg to the legs between the first and the last."""
         totals = self.totals
         if totals.tail is not None:
             totals.length_m += totals.tail.total_m
@@ -489,7 +543,7 @@ class Motion:
             totals.tail = None
 
     def count_break(self, kind: Link, before: TimedPosition, after: TimedPosition) -> None:
-        """Counts what ends a leg."""
+        """Counts a gap, a jump or a reset, which ends a leg."""
         totals = self.totals
         step_m = math.dist(before.position, after.position)
         if after.time - before.time > GAP_NS:
@@ -506,15 +560,18 @@ class Motion:
 
 
 def _usual_ns(apart: Ints, index: int, known: Ns | None) -> Ns:
-    """Returns the usual time between poses around an interval, which itself counts least."""
+    """Returns the usual time (ns) between poses around one interval.
+
+    It is the median of the intervals beside it. Without any, it is `known` or the interval itself.
+    """
     near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
     own_ns = near.pop(min(index, _NEARBY))
     return median_low(near or [known or own_ns])
 
 
 def are_places(positions: Vectors) -> Flags:
-    """Returns which coordinates, as rows, are a place: finite, and on Earth."""
+    """Returns which rows of x, y and z (m) are a place: finite, and on Earth."""
     x, y, z = np.abs(positions).T
-    # A comparison with NaN is false, so this one refuses all three kinds.
+    # A comparison with NaN is false.
     marks: Flags = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
     return marks

@@ -45,48 +45,49 @@ FEWEST: Final = 16
 _WIDTHS: Final = (2, 4, 8, 16, 32)
 _ORDER: Final = 4
 _NOISE_SPAN: Final = 32
-"""Fourth differences on either side of a position whose mean is the noise there."""
+"""The noise at a position is the mean of so many fourth differences on either side."""
 _SLOPE_SPAN: Final = 6
-"""Slopes on either side of a step whose mean square is compared with their noise."""
+"""The mean square of so many slopes on either side of a step is compared with their noise."""
 _CLEAR: Final = 12.0
-"""A mean square slope is clear of noise from so many times the variance of a slope on."""
+"""A mean square slope of so many times the variance of a slope is clear of noise."""
 _STATIONARY: Final = 9.0
-"""The widest slopes below so many times their variance are those of a stationary robot.
+"""The widest slopes of a stationary robot are below so many times their variance.
 
-Of noise alone they are above it once in some 10^5 independent windows (chi-square, 3 degrees).
+Slopes of noise alone are above it once in some 10^5 independent windows (chi-square, 3 degrees).
 """
 _PLAIN: Final = 0.002
-"""Where noise adds less than this share, the distance of two positions stays as it is."""
+"""If noise adds less than this share, the plain distance of two positions is the length."""
 _STATIONARY_STEPS: Final = _WIDTHS[-1]
 _MEAN_SPAN: Final = 16
 _DENSE_S: Final = 0.25
 """Fourth differences of positions farther apart in time take turns of the robot for noise."""
 _SPREAD: Final = (0.6, 2.0)
-"""How far positions that far apart spread around a place, in units of their noise."""
+"""Positions so rare are of one place if they spread by so many times their noise around it."""
 _LEFT: Final = 6.0
-"""A robot left a place when it is more than so many standard deviations away."""
+"""A robot has left a place when it is more than so many standard deviations away."""
 _AHEAD: Final = 64
-"""So many positions are searched at first for the next place, then twice as many."""
+"""The next place is searched in so many positions, then in twice as many, and so on."""
 _ROOT_MEAN: Final = (2**0.25 * math.gamma(0.75) / math.sqrt(math.pi)) ** 2
-"""The squared mean square root of a standard normal variable's magnitude."""
+"""The squared mean of the square root of a standard normal variable's magnitude."""
 _GROWTH: Final = math.sqrt(math.comb(2 * _ORDER, _ORDER))
-"""The standard deviation of a difference of this order of independent unit noise."""
+"""The standard deviation of a difference of this order, of independent unit noise."""
 
 SPEED_WINDOW_S: Final = 1.0
 SPEED_STEPS: Final = 8
 _JITTER_S: Final = 0.1
+"""The shortest time by which a distance is divided: log times may come in bursts."""
 _SLACK_S: Final = 1e-6
 
 
 class Creep(NamedTuple):
-    """The path of a robot that stands or creeps: from place to place that it clearly left.
+    """The path of a robot that stands or creeps, from place to place.
 
     Attributes:
-        start: the first place.
-        second: the next one; None where it never left the first.
+        start: the first place (m).
+        second: the place after it; None if the robot never clearly left the first one.
         middle_m: length from the second place to the last.
-        end: the last place.
-        reach_m: how far off a place must be to count.
+        end: the last place (m).
+        reach_m: how far from the last place another one must be to count.
     """
 
     start: Vector3
@@ -101,7 +102,7 @@ class Creep(NamedTuple):
         return 0.0 if self.second is None else math.dist(self.start, self.second) + self.middle_m
 
     def to(self, place: Vector3) -> Creep:
-        """Returns the creep with one more place, if that is off the last one."""
+        """Returns the creep with one more place, if that is out of reach of the last one."""
         step = math.dist(self.end, place)
         if step <= self.reach_m:
             return self
@@ -137,6 +138,20 @@ class End(NamedTuple):
     creep: Creep | None
 
 
+class _StepLengths(NamedTuple):
+    """The lengths of the steps of a path.
+
+    Attributes:
+        lengths: for each step, its length (m) without noise.
+        as_plain: whether it is the plain distance of two positions.
+        stationary: whether it is noise of a robot that stands or creeps.
+    """
+
+    lengths: Floats
+    as_plain: Flags
+    stationary: Flags
+
+
 class Measured(NamedTuple):
     """The measurements of a path in one piece.
 
@@ -159,15 +174,15 @@ class Measured(NamedTuple):
     steps_m: Floats
 
 
-def measured(seconds: Floats, positions: Vectors) -> Measured:
+def measure(seconds: Floats, positions: Vectors) -> Measured:
     """Measures the length of a path and the highest speed on it.
 
     Args:
-        seconds: when each position was taken, ascending.
-        positions: x, y and z (m) of each as a row; at least one.
+        seconds: the time of each position (s), ascending.
+        positions: rows of x, y and z (m); at least one.
     """
     points = positions - positions[0]
-    # What is the same everywhere, as z mostly is, adds nothing.
+    # An axis on which nothing moves, mostly z, adds nothing.
     varies = points.any(axis=0)
     varies[0] = True
     points = points[:, varies]
@@ -187,7 +202,7 @@ def measured(seconds: Floats, positions: Vectors) -> Measured:
     averaged = min(2 * _MEAN_SPAN + 1, len(points))
     reach = _LEFT * math.sqrt(2 / averaged) * row_maxima(noise)
     moved, steps, inside_m = lengths.copy(), lengths.copy(), 0.0
-    before = after = None
+    first_creep = last_creep = None
     for begin, end in _runs(stationary):
         if end - begin < min(_STATIONARY_STEPS, len(plain)):
             continue
@@ -195,35 +210,33 @@ def measured(seconds: Floats, positions: Vectors) -> Measured:
         creep = _creep(places[run], reach[run], positions[0], varies)
         moved[begin:end] = 0.0
         steps[begin:end] = creep.length_m / (end - begin)
-        before = creep if begin == 0 else before
-        after = creep if end == len(plain) else after
+        if begin == 0:
+            first_creep = creep
+        if end == len(plain):
+            last_creep = creep
         if begin > 0 and end < len(plain):
             inside_m += creep.length_m
     spread = np.sqrt(row_sums(noise**2))
-    head, tail = (
-        End(float(moved[at]), float(spread[at]), bool(as_plain[at]), creep)
-        for at, creep in ((0, before), (-1, after))
-    )
     return Measured(
         total if as_plain.all() else float(moved.sum()) + inside_m,
         total,
-        head,
-        tail,
-        still=before is not None and before is after,
+        End(float(moved[0]), float(spread[0]), bool(as_plain[0]), first_creep),
+        End(float(moved[-1]), float(spread[-1]), bool(as_plain[-1]), last_creep),
+        still=first_creep is not None and first_creep is last_creep,
         speed_mps=_highest_speed(seconds, moved),
         steps_m=plain if as_plain.all() else steps,
     )
 
 
 def _noise(points: Vectors) -> Vectors:
-    """Returns the standard deviation of each axis at each position."""
+    """Returns the standard deviation (m) of each axis at each position."""
     roots = np.sqrt(np.abs(np.diff(points, _ORDER, axis=0)))
     means = _moving_mean(roots, _NOISE_SPAN) ** 2 / (_ROOT_MEAN * _GROWTH)
     return _extended(means, _ORDER // 2, len(points))
 
 
-def _steps(points: Vectors, plain: Floats, noise: Vectors) -> tuple[Floats, Flags, Flags]:
-    """Returns the length of each step, whether it is the plain one, and whether it is noise."""
+def _steps(points: Vectors, plain: Floats, noise: Vectors) -> _StepLengths:
+    """Returns the lengths of steps, each by the narrowest slope that is clear of noise."""
     variance = (noise[1:] ** 2 + noise[:-1] ** 2) / 2
     whole = row_sums(variance)
     lengths = np.zeros(len(plain))
@@ -236,10 +249,10 @@ def _steps(points: Vectors, plain: Floats, noise: Vectors) -> tuple[Floats, Flag
         slopes = np.diff(points, axis=0) if width == 2 else _slopes(points, width)
         square = row_sums(slopes**2)
         energy = _moving_mean(square[:, None], _SLOPE_SPAN)[:, 0]
-        of_slope = 12 / (width * (width * width - 1))
-        share = of_slope * whole
+        slope_variance = 12 / (width * (width * width - 1))
+        share = slope_variance * whole
         along = row_sums(variance * slopes**2) / np.where(square > 0, square, 1.0)
-        across = of_slope * (whole - along)
+        across = slope_variance * (whole - along)
         settled = unsettled & (energy >= _CLEAR * share)
         if width == 2:
             as_plain = settled & (share <= 2 * _PLAIN * energy)
@@ -247,16 +260,17 @@ def _steps(points: Vectors, plain: Floats, noise: Vectors) -> tuple[Floats, Flag
         lengths[unsettled] = np.sqrt(np.maximum(square - across, 0.0))[unsettled]
         unsettled &= ~settled
     lengths[as_plain] = plain[as_plain]
-    # A wide slope beside a sudden start counts part of the steps after it, which count already.
+    # A wide slope before a sudden start reaches into the steps after it, which count by themselves.
+    # So no run may be longer than its plain length.
     for begin, end in _runs(~as_plain):
         most, summed = plain[begin:end].sum(), lengths[begin:end].sum()
         if summed > most:
             lengths[begin:end] *= most / summed
-    return lengths, as_plain, unsettled & (energy < _STATIONARY * share)
+    return _StepLengths(lengths, as_plain, unsettled & (energy < _STATIONARY * share))
 
 
 def _scatters(points: Vectors, places: Vectors, noise: Vectors) -> Flags:
-    """Returns at which steps the positions spread around one place as far as their noise does."""
+    """Returns whether positions at both ends of a step scatter around a place as noise does."""
     spread = _moving_mean(points**2, _MEAN_SPAN) - places**2
     ratio = row_sums(spread) / np.maximum(row_sums(noise**2), 1e-300)
     low, high = _SPREAD
@@ -265,9 +279,9 @@ def _scatters(points: Vectors, places: Vectors, noise: Vectors) -> Flags:
 
 
 def _slopes(points: Vectors, width: int) -> Vectors:
-    """Returns for each step the slope of the line fitted to the `width` positions around it.
+    """Returns, for each step, the slope of the line fitted to the `width` positions around it.
 
-    Near an end of the path it is fitted to the first or last ones.
+    Near an end of the path the line is fitted to the first or last positions.
     """
     weights = np.arange(width) - (width - 1) / 2
     weights /= weights @ weights
@@ -276,7 +290,10 @@ def _slopes(points: Vectors, width: int) -> Vectors:
 
 
 def _moving_mean(rows: Vectors, span: int) -> Vectors:
-    """Returns means over each row and `span` ones to either side; over as many at the ends."""
+    """Returns, for each row, the mean over it and `span` rows to either side.
+
+    Near an end, the mean over the first or last `2 * span + 1` rows.
+    """
     width = min(2 * span + 1, len(rows))
     sums = np.zeros((len(rows) + 1, rows.shape[1]))
     np.cumsum(rows, axis=0, out=sums[1:])
@@ -284,7 +301,7 @@ def _moving_mean(rows: Vectors, span: int) -> Vectors:
 
 
 def _extended(rows: Vectors, before: int, count: int) -> Vectors:
-    """Returns so many rows: the first also so often before them, the last at their end."""
+    """Returns `count` rows: the first one repeated `before` times, all, and the last repeated."""
     extended = np.empty((count, rows.shape[1]))
     extended[:before] = rows[0]
     inner = extended[before : before + len(rows)]
@@ -294,15 +311,19 @@ def _extended(rows: Vectors, before: int, count: int) -> Vectors:
 
 
 def _runs(marks: Flags) -> list[list[int]]:
-    """Returns the half-open ranges in which marks are set."""
+    """Returns the half-open ranges in which all marks are set."""
     edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
     return edges.reshape(-1, 2).tolist()
 
 
 def _creep(places: Vectors, reach: Floats, origin: Floats, varies: Flags) -> Creep:
-    """Returns which of the places a robot left: was farther from than its noise explains.
+    """Returns the creep through mean places: each is out of reach of the one before.
 
-    They are relative to an origin, along the axes that vary.
+    Args:
+        places: the mean places (m), relative to the origin, along the axes that vary.
+        reach: for each place, how far noise alone moves it (m).
+        origin: x, y and z of the origin (m).
+        varies: which of the axes vary.
     """
     left_at, begin, count = [0], 0, _AHEAD
     while begin < len(places):
@@ -315,15 +336,15 @@ def _creep(places: Vectors, reach: Floats, origin: Floats, varies: Flags) -> Cre
             begin, count = left_at[-1], _AHEAD
     whole = np.tile(origin, (len(left_at), 1))
     whole[:, varies] += places[left_at]
-    left = [(x, y, z) for x, y, z in whole.tolist()]
-    middle_m = math.fsum(math.dist(here, there) for here, there in pairwise(left[1:]))
-    second = left[1] if len(left) > 1 else None
-    return Creep(left[0], second, middle_m, left[-1], float(reach.max()))
+    path = [(x, y, z) for x, y, z in whole.tolist()]
+    middle_m = math.fsum(math.dist(here, there) for here, there in pairwise(path[1:]))
+    second = path[1] if len(path) > 1 else None
+    return Creep(path[0], second, middle_m, path[-1], float(reach.max()))
 
 
 def _highest_speed(seconds: Floats, lengths: Floats) -> float:
-    """Returns the highest speed over windows of a second, and of eight steps at least."""
-    # A single step far longer than those around it is a correction of the position, not speed.
+    """Returns the highest speed (m/s) over windows of a second, and of at least eight steps."""
+    # A step far longer than those around it corrects the position: it counts as twice the usual.
     usual = _moving_mean(np.sqrt(lengths)[:, None], SPEED_STEPS)[:, 0] ** 2
     travelled = np.concatenate(([0.0], np.cumsum(np.minimum(lengths, 2 * usual))))
     begin = np.arange(len(lengths) - SPEED_STEPS + 1)
@@ -332,10 +353,8 @@ def _highest_speed(seconds: Floats, lengths: Floats) -> float:
     begin, end = begin[dense], end[dense]
     sparse_mps = _sparse_speed(lengths, np.diff(seconds))
     if len(begin):
-        highest = float(
-            ((travelled[end] - travelled[begin]) / (seconds[end] - seconds[begin])).max()
-        )
-        return max(highest, sparse_mps or 0.0)
+        speeds = (travelled[end] - travelled[begin]) / (seconds[end] - seconds[begin])
+        return max(float(speeds.max()), sparse_mps or 0.0)
     if sparse_mps is not None:
         return sparse_mps
     # The path takes less than a second.
@@ -343,11 +362,14 @@ def _highest_speed(seconds: Floats, lengths: Floats) -> float:
 
 
 def _sparse_speed(lengths: Floats, apart: Floats) -> float | None:
-    """Returns the highest median speed of eight steps that take a second or longer, if any do."""
+    """Returns the highest median speed (m/s) of eight steps that take at least a second.
+
+    None if no eight steps do.
+    """
     if len(lengths) < SPEED_STEPS:
         return None
-    long = np.convolve(apart, np.ones(SPEED_STEPS), "valid") >= SPEED_WINDOW_S - _SLACK_S
-    if not long.any():
+    is_long = np.convolve(apart, np.ones(SPEED_STEPS), "valid") >= SPEED_WINDOW_S - _SLACK_S
+    if not is_long.any():
         return None
-    windows = sliding_window_view(lengths / np.maximum(apart, _JITTER_S), SPEED_STEPS)[long]
+    windows = sliding_window_view(lengths / np.maximum(apart, _JITTER_S), SPEED_STEPS)[is_long]
     return float(np.median(windows, axis=1).max())

@@ -293,7 +293,8 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
     jumped: list[bool] = []
     added: list[float] = []
     for part in slices:
-        jumped.append(motion.join(part.totals))
+        motion.join(part.totals)
+        jumped.append(motion.is_parted)
         # What joining adds to the slice's own length is driven up to its first vertex.
         added.append(motion.totals.distance_m - part.totals.distance_m)
     line = stacked([part.line for part in slices])
