@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, jumps
-from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Line, Waypoint, drawn, mean_speed
+from ros2_memory.analysis.motion.trajectory import (
+    MAX_WAYPOINTS,
+    Line,
+    Waypoint,
+    draw_waypoints,
+    mean_speed,
+)
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import yaw
@@ -185,7 +191,7 @@ def _way_inside(line: Line, stays: Sequence[Stay], at_most: int) -> tuple[Waypoi
     if not stays:
         return ()
     inside = stacked([_line_during(line, stay) for stay in stays])
-    waypoints, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
+    waypoints, _ = draw_waypoints(inside, max(at_most, _FEWEST_WAYPOINTS))
     return waypoints if at_most >= _FEWEST_WAYPOINTS else waypoints[len(waypoints) - at_most :]
 
 

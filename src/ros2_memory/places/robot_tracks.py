@@ -147,7 +147,7 @@ class TrackReader:
 
         def robot_track(vertices: Mask) -> RobotTrack:
             index = np.flatnonzero(vertices)
-            return track_by(whole.some(index), recordings[index], fastest_mps)
+            return track_by(whole.vertices(index), recordings[index], fastest_mps)
 
         numbers = np.unique(recordings[is_beside])
         others = (robot_track(is_beside & (recordings == number)) for number in numbers)
@@ -213,7 +213,7 @@ class TrackReader:
             stored = None if key is None else self._view.memory.scanner.fragments(TRACKS).get(key)
             inside = positions_in(rows.times, window)
             if stored is not None and not stored.left_out:
-                yield rows.first, stored.some(positions_in(stored.times, window))
+                yield rows.first, stored.vertices(positions_in(stored.times, window))
             elif inside.size:
                 lent_spans = self._lent_spans(rows, window)
                 yield rows.first, self._track_by(rows.some(inside), None, lent_spans)
@@ -512,7 +512,7 @@ def _joined_recordings(
             else:
                 is_repeated[vertices] |= is_overlapping
     own = np.flatnonzero(~is_repeated)
-    return _JoinedRecordings(whole.some(own), numbers[own], is_beside[own])
+    return _JoinedRecordings(whole.vertices(own), numbers[own], is_beside[own])
 
 
 def _merged_back(

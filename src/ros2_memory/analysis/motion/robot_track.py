@@ -1,13 +1,13 @@
 """The path of the robot in one frame with few vertices, each with its time.
 
-Between two vertices the robot is taken to move evenly; no pose is farther than `TOLERANCE_M` from
-where that has it *at its time*. So a track answers where the robot was, and when it entered a
-region, which a path that is drawn in space alone does not. Vertices are poses.
+Vertices are poses. Between two vertices the robot is taken to move evenly. Every pose is within
+`TOLERANCE_M` of where the track has the robot *at its time*. So a track says where the robot was,
+and when it entered a region, which a path that is drawn in space alone does not.
 
-Which poses are vertices is decided in each *slice* of the clock by itself, so it does not depend
-on how a history was cut: the first and the last pose of a slice are vertices, and what lies
-farthest from the line between two of them is another. Poses of a table whose first or last slice
-other tables may share are all kept there until the tables are joined.
+In each *slice* of the clock the first and the last pose are vertices, and so is the pose farthest
+from the line between two vertices, until none is too far. Slices do not depend on how a history
+is cut. Other tables may share the first and the last slice of a table, so all its poses stay there
+until the tables are joined.
 """
 
 from __future__ import annotations
@@ -36,32 +36,33 @@ TOLERANCE_M: Final = 0.05
 TOLERANCE_RAD: Final = 0.15
 TRACK_SLICE_NS: Final = 10 * NS_PER_S
 _SLOT_NS: Final = NS_PER_S // 5
-"""Of the poses in a slot of the clock the first and the last count: nothing bends a way between."""
+"""In each slot of the clock only the first and the last pose count: a robot hardly bends between.
+"""
 
 _JUMP_NS: Final = 2 * NS_PER_S
-"""A step that is faster, and not longer than this, is a jump."""
+"""A step that is faster than plausible, and takes at most this time, is a jump."""
 _MAX_M: Final = 1e8
-"""Poses beyond are no place; northings of UTM are up to 1e7."""
+"""A coordinate beyond this is no place; northings of UTM are up to 1e7."""
 _PER_M: Final = 10_000
 """Vertices are rounded to 0.1 mm, as the store has poses."""
 _WEIGHT: Final = TOLERANCE_M / TOLERANCE_RAD
-"""Metres that count as much as a radian."""
+"""How many metres count as much as a radian."""
 _TURN: Final = 1 << 22
-"""Headings are counted in such parts of a turn, so that many turns add up exactly."""
+"""Headings are whole numbers of such parts of a turn, so that many turns add up exactly."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotTrack:
-    """Vertices ascending in time.
+    """The path of the robot, by vertices that ascend in time.
 
     Attributes:
-        times: log times.
+        times: log times (ns).
         x: metres.
         y: metres.
-        heading: about Z (rad), continuous from vertex to vertex; NaN where it is not known.
-        begins: whether a piece begins at the vertex: the robot was not seen between it and the one
-            before for longer than `SILENCE_NS`.
-        fastest_mps: the highest plausible speed; what is faster is a jump.
+        heading: yaw (rad), continuous from vertex to vertex; NaN if it is not known.
+        begins: whether a piece begins at the vertex. Between pieces there is no pose for more than
+            `SILENCE_NS`.
+        fastest_mps: the highest plausible speed; a faster step is a jump.
     """
 
     times: Times
@@ -82,8 +83,8 @@ class RobotTrack:
         return self.times[self.begins], self.times[self.ends]
 
     def at(self, times: Times) -> tuple[Floats, Floats, Floats]:
-        """Returns x, y (m) and heading (rad) at some times; there must be a vertex."""
-        # From the first vertex, so that numbers are small enough for a double to be exact.
+        """Returns x, y (m) and heading (rad) at log times; the track has at least one vertex."""
+        # Relative to the first vertex, a time is small enough to be exact as a float.
         since = self.times[0]
         columns = (self.x, self.y, self.heading)
         x, y, heading = (np.interp(times - since, self.times - since, axis) for axis in columns)
@@ -91,17 +92,17 @@ class RobotTrack:
 
 
 class PartialTrack(NamedTuple):
-    """The track by some poses, in order of time, before it is joined with those before and after.
+    """The track of one table of poses, to be joined with those of other tables.
 
     Attributes:
-        times: log times.
+        times: log times (ns), ascending.
         x: metres.
         y: metres.
-        turns: headings in whole parts of a turn, continuous from one to the next.
+        turns: headings in parts of a turn (`_TURN`), continuous from vertex to vertex.
         known: whether the heading is known.
-        settled: whether no other pose can be in the slice of this one.
-        left_out: poses that could not be placed.
-        recording: the folder of the recording that they are of.
+        settled: whether no other table can have a pose in the slice of the vertex.
+        left_out: how many poses could not be placed.
+        recording: the folder of the recording.
     """
 
     times: Times
@@ -123,16 +124,16 @@ class PartialTrack(NamedTuple):
         """The arrays of its vertices."""
         return self[:6]
 
-    def some(self, index: NDArray[np.intp]) -> PartialTrack:
-        """Returns some vertices of it, in the order given."""
+    def vertices(self, index: NDArray[np.intp]) -> PartialTrack:
+        """Returns the vertices at an index array, in the order given."""
         columns = (column[index] for column in self.columns)
         return PartialTrack._make((*columns, self.left_out, self.recording))
 
 
 def settled_tracks(parts: Sequence[PartialTrack]) -> list[PartialTrack]:
-    """Returns one track for each recording that parts are of, which no other part overlaps.
+    """Returns one track for each recording of some parts, if these are all of a stretch of time.
 
-    Only in the first and in the last slice of all there may be other poses.
+    Only the first and the last slice of the stretch stay unsettled.
     """
     by_recording: dict[str, list[PartialTrack]] = defaultdict(list)
     for part in parts:
@@ -140,12 +141,12 @@ def settled_tracks(parts: Sequence[PartialTrack]) -> list[PartialTrack]:
     recordings = [*by_recording.values()]
     whole, numbers = joined_tracks(recordings, keeps_ends=True)
     bounds = np.searchsorted(numbers, np.arange(len(recordings) + 1)).tolist()
-    return [
-        whole.some(np.arange(*span))._replace(
-            left_out=sum(part.left_out for part in own), recording=own[0].recording
-        )
-        for own, span in zip(recordings, pairwise(bounds), strict=True)
-    ]
+    tracks = []
+    for own_parts, (begin, end) in zip(recordings, pairwise(bounds), strict=True):
+        left_out = sum(part.left_out for part in own_parts)
+        track = whole.vertices(np.arange(begin, end))
+        tracks.append(track._replace(left_out=left_out, recording=own_parts[0].recording))
+    return tracks
 
 
 def empty_track() -> RobotTrack:
@@ -154,9 +155,10 @@ def empty_track() -> RobotTrack:
 
 
 def thinned(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
-    """Returns which of some poses count: the first and last of each slot.
+    """Returns the indices of the first and the last pose in each slot; of equal times the first.
 
-    Of several of one time the first. They are in order of time, or of recordings and then of time.
+    Poses are in order of time or, with the numbers of their recordings, of recordings and then of
+    time.
     """
     numbers = np.broadcast_to(recordings, times.shape)
     first = np.flatnonzero(_is_new(times, numbers))
@@ -165,46 +167,56 @@ def thinned(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
 
 
 def _is_new(*columns: Times) -> Mask:
-    """Returns which rows differ from the row before; the first one does."""
+    """Returns which rows differ from the row before; the first row does."""
     differ = np.ones(len(columns[0]), np.bool_)
     differ[1:] = np.logical_or.reduce([np.diff(column) != 0 for column in columns])
     return differ
 
 
 def _is_last(is_first: Mask) -> Mask:
-    """Returns which rows are the last of a group."""
+    """Returns which rows are the last of a group, by which are the first."""
     return np.append(is_first[1:], [True])[: len(is_first)]
 
 
 def partial_track(
     times: Times, x: Floats, y: Floats, heading: Floats, left_out: int = 0
 ) -> PartialTrack:
-    """Returns the track by poses in log-time order; those that are no place are left out."""
-    fine = np.flatnonzero((np.abs(x) < _MAX_M) & (np.abs(y) < _MAX_M))  # false for NaN
-    fine = fine[thinned(times[fine])]
-    times, heading = times[fine], heading[fine]
-    x, y = (np.rint(column[fine] * _PER_M) / _PER_M for column in (x, y))
+    """Returns the track of a table of poses in log-time order.
+
+    Poses with NaN or a coordinate beyond `_MAX_M` are no place, and dropped.
+    """
+    rows = np.flatnonzero((np.abs(x) < _MAX_M) & (np.abs(y) < _MAX_M))
+    rows = rows[thinned(times[rows])]
+    times, heading = times[rows], heading[rows]
+    x, y = (np.rint(column[rows] * _PER_M) / _PER_M for column in (x, y))
     known = np.isfinite(heading)
     turns = np.rint(np.where(known, heading, 0.0) / math.tau * _TURN).astype(np.int64)
-    slices = times // TRACK_SLICE_NS
-    settled = (slices > slices[:1].sum()) & (slices < slices[-1:].sum())
+    settled = _in_inner_slice(times)
     turns = _continuous(turns, np.zeros(len(times), np.bool_))
     part = PartialTrack(times, x, y, turns, known, settled, left_out)
-    return part.some(_vertices(part, ~settled, np.zeros(len(times), np.int64)))
+    return part.vertices(_vertices(part, ~settled, np.zeros(len(times), np.int64)))
+
+
+def _in_inner_slice(times: Times) -> Mask:
+    """Returns which times are neither in the first nor in the last slice of all."""
+    slices = times // TRACK_SLICE_NS
+    first, last = slices.min(initial=MAX_NS), slices.max(initial=MIN_NS)
+    is_inner: Mask = (slices > first) & (slices < last)
+    return is_inner
 
 
 def track_of(times: Times, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
-    """Returns the track of poses in log-time order; those that are no place are left out."""
+    """Returns the track of all poses (m, rad), which are in log-time order."""
     return track_by(*joined_tracks([[partial_track(times, x, y, heading)]]))
 
 
 def track_by(whole: PartialTrack, recordings: Times, fastest_mps: float = math.inf) -> RobotTrack:
-    """Returns the track by the vertices of recordings; of two of one time the first counts.
+    """Returns the track of all vertices in order of time; of equal times the first one counts.
 
-    `recordings`: the number of the recording of each vertex.
+    `recordings` has the number of the recording of each vertex.
     """
     _, order = np.unique(whole.times, return_index=True)
-    whole, recordings = whole.some(order), recordings[order]
+    whole, recordings = whole.vertices(order), recordings[order]
     turns = _continuous(whole.turns, ~_is_new(recordings))
     heading = np.where(whole.known, turns * (math.tau / _TURN), np.nan)
     begins = np.append([True], np.diff(whole.times) > SILENCE_NS)[: len(whole.times)]
@@ -214,75 +226,81 @@ def track_by(whole: PartialTrack, recordings: Times, fastest_mps: float = math.i
 def joined_tracks(
     recordings: Sequence[Sequence[PartialTrack]], *, keeps_ends: bool = False
 ) -> tuple[PartialTrack, Times]:
-    """Returns the tracks by the poses of all tables of recordings, one track after the other.
+    """Joins the tables of each recording, and returns all vertices, recording by recording.
 
-    With the number of the recording of each vertex. All at once: a week has thousands of them. If
-    it `keeps_ends`, the first and the last slice of all are not settled.
+    Returns also the number of the recording of each vertex. Recordings are joined at once, since a
+    week may have thousands. With `keeps_ends` the first and the last slice of all stay unsettled.
     """
     parts_in_order = [part for parts in recordings for part in parts]
     if not parts_in_order:
-        times, none = np.zeros(0, np.int64), np.zeros(0)
-        return partial_track(times, none, none, none), times
+        times, empty = np.zeros(0, np.int64), np.zeros(0)
+        return partial_track(times, empty, empty, empty), times
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
     columns = map(np.concatenate, zip(*(part.columns for part in parts_in_order), strict=True))
     whole = PartialTrack._make((*columns, 0, ""))
     numbers = np.repeat(np.arange(len(recordings)), sizes)
     order = np.lexsort((whole.times, numbers))
     order = order[thinned(whole.times[order], numbers[order])]
-    whole, numbers = whole.some(order), numbers[order]
-    are_known = whole.settled & ~_is_new(numbers)
-    are_known[1:] &= whole.settled[:-1]
-    whole = whole._replace(turns=_continuous(whole.turns, are_known))
+    whole, numbers = whole.vertices(order), numbers[order]
+    is_continuous = whole.settled & ~_is_new(numbers)
+    is_continuous[1:] &= whole.settled[:-1]
+    whole = whole._replace(turns=_continuous(whole.turns, is_continuous))
     keeps = whole.settled
     if keeps_ends:
-        slices = whole.times // TRACK_SLICE_NS
-        settled = (slices > slices.min(initial=MAX_NS)) & (slices < slices.max(initial=MIN_NS))
+        settled = _in_inner_slice(whole.times)
         keeps, whole = keeps | ~settled, whole._replace(settled=settled)
     vertices = _vertices(whole, keeps, numbers)
-    return whole.some(vertices), numbers[vertices]
+    return whole.vertices(vertices), numbers[vertices]
 
 
-def _continuous(turns: Times, are_known: Mask) -> Times:
-    """Returns headings without jumps by whole turns; the steps that are known have none."""
-    steps = np.diff(turns, prepend=turns[:1])
+def _continuous(turns: Times, is_continuous: Mask) -> Times:
+    """Returns headings that change by less than half a turn from each to the next.
+
+    Steps that are continuous already stay as they are.
+    """
+    steps = np.diff(turns, prepend=0)
     short = (steps + _TURN // 2) % _TURN - _TURN // 2
-    first = (turns[:1].sum() + _TURN // 2) % _TURN - _TURN // 2
-    whole: Times = first + np.cumsum(np.where(are_known, steps, short))
+    is_step_kept = is_continuous & (np.arange(len(turns)) > 0)
+    whole: Times = np.cumsum(np.where(is_step_kept, steps, short))
     return whole
 
 
 def _vertices(part: PartialTrack, keeps: Mask, recordings: Times) -> NDArray[np.intp]:
-    """Returns which poses are vertices: those to keep, and what their slices need besides."""
+    """Returns the indices of poses that are vertices.
+
+    They are the poses to keep, the first and the last of each slice and, again and again, the pose
+    farthest from the line between two vertices, if it is beyond the tolerance.
+    """
     times = part.times
     is_first = _is_new(times // TRACK_SLICE_NS, recordings)
-    kept = keeps | is_first | _is_last(is_first)
+    is_vertex = keeps | is_first | _is_last(is_first)
     turned = part.turns * (math.tau / _TURN * _WEIGHT)
-    waiting = np.flatnonzero(~kept)
+    waiting = np.flatnonzero(~is_vertex)
     while waiting.size:
-        vertices = np.flatnonzero(kept)
+        vertices = np.flatnonzero(is_vertex)
         after = np.searchsorted(vertices, waiting)
         start, end = vertices[after - 1], vertices[after]
         share = (times[waiting] - times[start]) / np.maximum(times[end] - times[start], 1)
-        off = np.zeros(waiting.size)
+        squared = np.zeros(waiting.size)
         for column in (part.x, part.y):
             away = column[waiting] - column[start] - (column[end] - column[start]) * share
-            off += away * away
+            squared += away * away
         away = turned[waiting] - turned[start] - (turned[end] - turned[start]) * share
-        off = np.maximum(off, away * away)
+        squared = np.maximum(squared, away * away)
         first = run_starts(after)
-        worst = np.maximum.reduceat(off, first)
+        worst = np.maximum.reduceat(squared, first)
         worst_here = np.repeat(worst, np.diff(first, append=waiting.size))
         is_bent = worst_here > TOLERANCE_M * TOLERANCE_M
-        splits = np.flatnonzero(is_bent & (off == worst_here))
+        splits = np.flatnonzero(is_bent & (squared == worst_here))
         splits = splits[run_starts(after[splits])]
-        kept[waiting[splits]] = True
+        is_vertex[waiting[splits]] = True
         is_bent[splits] = False
         waiting = waiting[is_bent]
-    return np.flatnonzero(kept)
+    return np.flatnonzero(is_vertex)
 
 
 def jumps(track: RobotTrack) -> Mask:
-    """Returns after which vertices the robot jumped to the next one: nobody drives as fast."""
+    """Returns after which vertices the robot jumped to the next one, faster than plausible."""
     lasted = np.diff(track.times)
     far = np.hypot(np.diff(track.x), np.diff(track.y)) * 1e9 > track.fastest_mps * lasted
     jumped = far & (lasted > 0) & (lasted <= _JUMP_NS) & ~track.begins[1:]
@@ -290,9 +308,10 @@ def jumps(track: RobotTrack) -> Mask:
 
 
 def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, float] | None:
-    """Returns where the robot was (m); None before the track.
+    """Returns where the robot was (x, y in m) at a log time; None before the track.
 
-    Behind the end of a piece it is still there, for `silence` and until the next one begins.
+    After the end of a piece it stays there for `silence` (ns), or until the next one begins; None
+    after that.
     """
     after = int(np.searchsorted(track.times, time, side="right"))
     if not after:
@@ -308,9 +327,9 @@ def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, 
 
 
 def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
-    """Returns a track in a window: where it goes on beyond an end, with a point at that end.
+    """Returns a track in a window, with a vertex at each end of the window that it crosses.
 
-    Such a first point does not begin a piece.
+    A vertex at the start of the window does not begin a piece.
     """
     times = track.times
     first, last = np.searchsorted(times, (window.start, window.stop)).tolist()

@@ -1,36 +1,34 @@
 """Where the robot stood still, and where it suddenly slowed down.
 
-A standstill is a time of at least `SHORTEST_NS` in which the robot moves no faster than odometry
-drifts. It begins with the first pose at that place and ends with the last.
+A standstill lasts at least `SHORTEST_NS`, in which the robot moves no faster than odometry drifts.
+It begins with the first pose at its place and ends with the last one.
 
-Poses are averaged in slots of `SLOT_NS`, counted from the epoch, so that noise averages out.
-Consecutive slots are linked where their means are no farther apart than a drift of `DRIFT_MPS` or
-the noise of their own poses explains, and linked slots form a chain, whose first and last slot may
-be half motion and are left out. Slow motion that noise hides from two slots shows in blocks of
-`BLOCK_NS`: a block whose means spread farther than drift and noise explain is motion, and splits
-the chain. So are still blocks that lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. What
-takes longer is drift: the odometry of a camera wanders while the robot is at its dock. A standstill
-that drifts out of `DRIFTED_M` ends there, and the next one begins.
+- **Slots.** Poses are averaged in slots of `SLOT_NS`, so that noise averages out. Consecutive slots
+  are linked if a drift of `DRIFT_MPS`, or the noise of their poses, explains the distance of their
+  means. Linked slots form a chain. Its first and last slot may be half motion and are left out.
+- **Blocks.** Noise may hide slow motion from two slots, but not from the slots of a block of
+  `BLOCK_NS`. A block whose means spread farther than drift and noise explain is motion, and splits
+  the chain.
+- **Creeps.** Still blocks that lead `LARGEST_M` away within `CREEP_NS` are motion, too: the robot
+  creeps. What takes longer is drift, as of a camera's odometry while the robot is at its dock. A
+  standstill that drifts out of `DRIFTED_M` ends there, and the next one begins.
+- **Ends.** The ends of a row of still blocks are found pose by pose. Some slots just inside give
+  the place and its noise. From there poses are followed outwards until one is elsewhere. The last
+  pose before it that is clearly at the place is the end.
 
-The ends of still blocks in a row are found pose by pose: some slots just inside give the place and
-its noise, and poses are followed outwards until one is elsewhere. The last one before that is
-clearly there is the end: between the two, noise hides that the robot moves.
+All this depends on poses a few slots around, and slots and blocks are counted from the epoch. The
+`Blocks` of a stretch of time follow from its poses and those `BESIDE_NS` beside it. So a standstill
+is the same in every window, and however a history is cut.
 
-All of this depends only on poses a few slots around, and slots and blocks are counted from the
-epoch. So the `Blocks` of stretches of time, each made of its poses and of those `BESIDE_NS` beside
-it, are together those of all the time; and a standstill is the same whatever window is asked about,
-and however a history is cut.
+The noise of a slot is estimated from second differences, which a steady motion leaves at zero.
+Their variance is six times that of the noise. For first differences see J. von Neumann et al., "The
+mean square successive difference", Ann. Math. Statist. 12 (1941).
 
-The noise of a slot is estimated from second differences, which a steady motion leaves at zero: see
-J. von Neumann et al., "The mean square successive difference", Ann. Math. Statist. 12 (1941), for
-first differences; those of second order have six times the variance of the noise.
-
-Of sudden losses of speed the first pose of every slot of `DROP_SLOT_NS`, counted from the epoch,
-counts. A robot moves clearly where it goes `MOVING_MPS` or faster from slot to slot. It slows down
-suddenly where its speed falls, from one slot to the next but one, to `FRACTION` of that or less,
-and stays there for two slots. A robot that turns meanwhile is taken to do so on purpose: nearly all
-slow down to turn. That depends on `_DROP_SLOTS` slots in a row. Poses that come less often than
-once a slot, and a position that jumps for a moment, show no drop.
+Sudden losses of speed are found in the first poses of slots of `DROP_SLOT_NS`. The robot goes
+`MOVING_MPS` or faster from slot to slot. Then its speed falls, within two slots, to `FRACTION` of
+that or less, and stays there for two slots. If it turns meanwhile it slows down on purpose, as
+nearly all robots do. A drop depends on `_DROP_SLOTS` slots in a row: poses that come less often
+than once a slot, and a position that jumps for a moment, show none.
 """
 
 from __future__ import annotations
@@ -71,47 +69,50 @@ SILENCE_NS: Final = 5 * NS_PER_S // 2
 SLOT_NS: Final = 2 * NS_PER_S // 5
 BLOCK_NS: Final = 5 * SLOT_NS
 BESIDE_NS: Final = SHORTEST_NS + 3 * NS_PER_S
-"""Poses so far beside a stretch of time decide what its blocks are: those of the block beside."""
+"""Poses so far before and after a stretch of time take part in its blocks."""
 CREEP_NS: Final = 15 * BLOCK_NS
 """A robot that moves farther than `LARGEST_M` in this time creeps; a slower one drifts."""
 CONTEXT_NS: Final = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
 """Poses so far outside a window decide whether the robot stood still inside it."""
 DRIFT_MPS: Final = 0.008
-"""The mean position of a still robot may move so fast: odometry drifts."""
+"""How fast odometry may drift while the robot stands."""
 LARGEST_M: Final = 0.1
 DRIFTED_M: Final = 1.0
-"""So far odometry may drift while the robot stands."""
+"""How far odometry may drift in one standstill."""
 CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
 """A slower robot cannot be distinguished from one that stands still."""
 
 _NOISE_FACTOR: Final = 5.5
+"""Noise explains a distance of two means of up to so many of its standard deviations."""
+_BOX_NOISE_FACTOR: Final = 4.5
+"""Noise explains a box around the means of a block of up to so many of its standard deviations."""
 _NEAREST_M: Final = 0.0003
 """Poses without noise are at one place if they are no farther apart than this."""
 _ELSEWHERE: Final = 3.0
-"""Poses so many standard deviations from a place are elsewhere."""
+"""Poses more than so many standard deviations from a place are elsewhere."""
 _CLEARLY: Final = 2.0
-"""Those that are so many nearer are clearly there."""
+"""Poses that are so many standard deviations nearer are clearly there."""
 _OWN_BENDS: Final = 4
-"""Poses of a slot that give its noise by themselves."""
+"""So many poses of a slot give its noise by themselves."""
 _SPARSE_NS: Final = 11 * NS_PER_S // 10
-"""Over longer a bend shows how the robot turned, rather than noise."""
+"""Over a longer time, a second difference shows how the robot turned, not noise."""
 _PLACE_SLOTS: Final = 4
-"""Slots that give the place at an end of a standstill."""
+"""How many slots give the place at an end of a standstill."""
 _OUTWARDS: Final = SILENCE_NS // SLOT_NS + 1
-"""Slots beyond, in which the robot may still be there."""
+"""In how many slots outside of it the robot may still be there."""
 PER_METRE: Final = 10_000
-"""Means of positions are rounded: nothing depends on the order in which they are added up."""
+"""Means of positions are rounded, so that the order of their sums does not matter."""
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
 _BLOCKS_AT_ONCE: Final = 128
 _STILL_M: Final = DRIFT_MPS * unix_from_ns(BLOCK_NS)
-"""How far the means of a block spread without noise."""
+"""How far drift alone spreads the means of a block."""
 
 DROP_SLOT_NS: Final = NS_PER_S // 2
 MOVING_MPS: Final = 0.15
 FRACTION: Final = 0.4
 TURNS_RAD: Final = 0.35
 _DROP_SLOTS: Final = 7
-"""Slots that decide whether there is a drop at the fourth of them, and none at the third."""
+"""How many slots decide whether there is a drop at the fourth of them, and none at the third."""
 
 
 class Box3(NamedTuple):
@@ -122,20 +123,20 @@ class Box3(NamedTuple):
 
     @property
     def centre(self) -> Vector3:
-        """Its middle."""
+        """The middle (m)."""
         (a, b, c), (d, e, f) = self
         return ((a + d) / 2, (b + e) / 2, (c + f) / 2)
 
     @property
     def diagonal(self) -> float:
-        """The distance of its far corners."""
+        """The distance (m) of opposite corners."""
         return math.dist(self.low, self.high)
 
 
 class Standstill(NamedTuple):
-    """A time in which the robot stood still: from its first pose there to its last (inclusive).
+    """A standstill, from the first pose to the last (log times, inclusive).
 
-    `box` is around the mean positions of its slots.
+    `box` is the box around the mean positions of its slots.
     """
 
     start: Ns
@@ -145,21 +146,21 @@ class Standstill(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blocks:
-    """Blocks of time with slots that are linked, in order; a block may hold parts of two chains.
+    """Blocks of linked slots, in order; a row for each block and chain, which may share a block.
 
-    In few bytes, since a week has 300,000.
+    Rows take few bytes, since a week has 300,000 blocks.
 
     Attributes:
-        numbers: which block, counted from the epoch.
-        firsts: when the first pose of each is, in the chain that it is of: ns from its begin.
-        lasts: when the last one is, likewise.
-        noises: the highest standard deviation (m) of a slot's mean that noise of poses explains.
-        lows: x, y, z of the lower corner of the box around the slots' means, as rows, in
-            1 / `PER_METRE`.
-        sizes: of the box, likewise.
-        starts: of the first of still blocks in a row, the log time of the first pose at that place;
-            else `MIN_NS`.
-        ends: of the last of them, of the last pose there; else `MIN_NS`.
+        numbers: the number of the block, counted from the epoch.
+        firsts: the first pose of the chain in the block: ns from the begin of the block.
+        lasts: the last pose of the chain in the block: ns from the begin of the block.
+        noises: the greatest standard deviation (m) that noise gives to the mean of a slot.
+        lows: x, y, z of the lower corner of the box around the means of slots, in 1 / `PER_METRE`.
+        sizes: the size of this box, in 1 / `PER_METRE`.
+        starts: for the first block of a row of still blocks, the log time of the first pose at its
+            place; else `MIN_NS`.
+        ends: for the last block of a row of still blocks, the log time of the last pose at its
+            place; else `MIN_NS`.
     """
 
     numbers: Ints
@@ -176,19 +177,19 @@ class Blocks:
         return self.numbers.size
 
     def span(self) -> tuple[Ints, Ints]:
-        """Returns the log times (ns) of the first and of the last pose of each."""
+        """Returns the log times (ns) of the first and the last pose of each block."""
         begins = self.numbers.astype(np.int64) * BLOCK_NS
         return begins + self.firsts, begins + self.lasts
 
     def corners(self) -> tuple[Vectors, Vectors]:
-        """Returns the lower and the upper corners (m)."""
+        """Returns the lower and the upper corners (m) of the boxes."""
         lows = self.lows.astype(np.int64)
         return lows / PER_METRE, (lows + self.sizes) / PER_METRE
 
     def are_still(self) -> Flags:
-        """Returns whether drift and noise explain the boxes."""
+        """Returns in which blocks drift and noise explain the spread of the means."""
         lows, highs = self.corners()
-        explained_m = np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64))
+        explained_m = np.maximum(_STILL_M, _BOX_NOISE_FACTOR * self.noises.astype(np.float64))
         return _lengths(highs - lows) <= np.minimum(explained_m, LARGEST_M)
 
     @property
@@ -206,12 +207,12 @@ NO_BLOCKS: Final = Blocks(
 
 
 class Stands(NamedTuple):
-    """What shows where the robot stood in a stretch of time.
+    """What is stored of standstills and drops in a stretch of time.
 
     Attributes:
-        blocks: its blocks.
-        drops: sudden losses of speed; standstills may follow.
-        last: log time (ns) of the last pose at a place; `MIN_NS` without one.
+        blocks: the blocks of the stretch.
+        drops: its sudden losses of speed.
+        last: log time of the last valid pose; `MIN_NS` without one.
     """
 
     blocks: Blocks
@@ -220,12 +221,12 @@ class Stands(NamedTuple):
 
     @property
     def memory_bytes(self) -> int:
-        """About how much memory it takes."""
+        """About how much memory they take."""
         return 2000 + self.blocks.memory_bytes + 200 * len(self.drops)
 
 
 def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
-    """Returns what shows where the robot stood; see `blocks_of`."""
+    """Returns the blocks and drops of a stretch of time, with arguments as `blocks_of` takes."""
     inside = poses.between(start, stop)
     places = inside.times[are_places(inside.positions)]
     return Stands(
@@ -236,12 +237,12 @@ def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
 
 
 def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
-    """Returns the blocks of a stretch of time; chains that are surely too short have none.
+    """Returns the blocks of a stretch of time, without those of chains that are too short.
 
     Args:
-        poses: at least those of the stretch and `BESIDE_NS` beside it.
-        start: log time (ns) where the stretch begins; blocks begin there.
-        stop: where it ends, and blocks end.
+        poses: the poses of the stretch and `BESIDE_NS` before and after it; more do no harm.
+        start: log time (ns) at which the stretch begins, the begin of a block.
+        stop: log time (ns) at which it ends, the end of a block.
     """
     valid = are_places(poses.positions)
     if not valid.any():
@@ -251,10 +252,10 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
     to_previous, to_next = np.r_[False, links], np.r_[links, False]
     begins_chain = to_next & ~to_previous
     firsts, lasts = np.flatnonzero(begins_chain), np.flatnonzero(to_previous & ~to_next)
-    # The robot may stand in a part of the slot beside a chain, too.
+    # The robot may also stand in a part of the slots before and after a chain.
     previous, following = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
     is_long = slots.lasts[following] - slots.firsts[previous] >= SHORTEST_NS
-    # Each slot with links on both sides is of the newest chain that began.
+    # For each inner slot of a chain, this is the number of its chain.
     chains = np.cumsum(begins_chain)
     inner = np.flatnonzero(to_previous & to_next)
     blocks = _blocks(slots, inner[is_long[chains[inner] - 1]], chains)
@@ -263,6 +264,10 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
 
 
 def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
+    """Returns the blocks of the inner slots of chains, with the ends of rows of still blocks.
+
+    `inner` has the indices of these slots, `chains` the number of the chain of each slot.
+    """
     if not inner.size:
         return NO_BLOCKS
     numbers = slots.numbers[inner] * SLOT_NS // BLOCK_NS
@@ -290,9 +295,10 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
     )
     chain = chains[firsts]
     for begin, stop in zip(*_runs(blocks.are_still(), chain), strict=True):
+        # Between blocks of motion in one chain, noise may hide slow motion for so short a time.
         is_inside = begin > 0 and stop < chain.size and chain[begin - 1] == chain[stop]
         if is_inside and last_times[stop - 1] - first_times[begin] < SHORTEST_NS:
-            continue  # noise hides slow motion for as long
+            continue
         first, last = int(firsts[begin]), int(lasts[stop - 1])
         blocks.starts[begin] = slots.edge(first, last, -1)
         blocks.ends[stop - 1] = slots.edge(last, first, 1)
@@ -300,7 +306,18 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
 
 
 class _Slots:
-    """Poses, of which there is one at least, by their slots of time."""
+    """One or more poses by their slots of time.
+
+    Attributes:
+        times: log times of the poses (ns), ascending.
+        positions: rows of x, y and z (m) of the poses.
+        begins: for each slot, the index of its first pose.
+        stops: for each slot, the index after its last pose.
+        counts: for each slot, how many poses it has.
+        numbers: for each slot, its number since the epoch.
+        firsts: for each slot, the log time of its first pose.
+        lasts: for each slot, the log time of its last pose.
+    """
 
     def __init__(self, times: Ints, positions: Vectors) -> None:
         self.times, self.positions = times, positions
@@ -316,8 +333,8 @@ class _Slots:
 
     @cached_property
     def means(self) -> Vectors:
-        """The mean position of each slot."""
-        # Mostly the same in each part, so that sums are rounded alike.
+        """The mean position (m) of each slot."""
+        # Mostly the origin is the same in all parts of a history, so that sums are rounded alike.
         origin = np.rint(self.positions[0])
         sums = np.add.reduceat(self.positions - origin, self.begins)
         means: Vectors = origin + sums / self.counts[:, None]
@@ -325,10 +342,10 @@ class _Slots:
 
     @cached_property
     def _bends(self) -> tuple[Floats, Ints]:
-        """The squares (m2) of second differences of poses: each is of the slot of its middle pose.
+        """The squared second differences (m2) of poses, and the edges of those of each slot.
 
-        And where those of each slot begin, and the last one's stop. A slot with enough poses has
-        those inside of it alone.
+        A difference belongs to the slot of its middle pose. If a slot has enough poses, only
+        differences inside of it count.
         """
         bends = self.positions[:-2] - 2 * self.positions[1:-1] + self.positions[2:]
         slot = np.repeat(np.arange(len(self)), self.counts)
@@ -339,24 +356,25 @@ class _Slots:
         return row_sums(bends * bends)[is_counted], np.r_[0, np.cumsum(counts)]
 
     def noises(self, firsts: Ints, stops: Ints) -> Floats:
-        """Returns the standard deviation (m) of the poses in ranges of slots.
+        """Returns the standard deviation (m) of poses in half-open ranges of slots.
 
-        By a median, since a stopping robot bends once; 0 where there is no bend.
+        It follows from the median of the squared second differences, since a stopping robot makes
+        one large difference. 0 if there is no difference.
         """
         squares, edges = self._bends
         begins = edges[firsts]
         counts = edges[stops] - begins
-        middles = np.zeros(counts.size)
-        # Most ranges have as many: their rows are sorted at once.
+        medians = np.zeros(counts.size)
+        # Most ranges have equally many differences: their medians are computed at once.
         for count in np.unique(counts[counts > 0]).tolist():
-            which, middle = np.flatnonzero(counts == count), (count - 1) // 2
-            rows = squares[begins[which][:, None] + np.arange(count)]
-            middles[which] = np.partition(rows, middle, axis=1)[:, middle]
+            ranges, middle = np.flatnonzero(counts == count), (count - 1) // 2
+            rows = squares[begins[ranges][:, None] + np.arange(count)]
+            medians[ranges] = np.partition(rows, middle, axis=1)[:, middle]
         # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
-        return np.sqrt(middles / 6 / 0.6)
+        return np.sqrt(medians / 6 / 0.6)
 
     def links(self) -> Flags:
-        """Returns whether the robot may have stood still from each slot to the next with poses."""
+        """Returns whether the robot may have stood still from each slot to the next one."""
         follows = self.firsts[1:] - self.lasts[:-1] <= SILENCE_NS
         apart_m = _lengths(np.diff(self.means, axis=0))
         allowed_m = DRIFT_MPS * (np.diff(self.numbers) * SLOT_NS / NS_PER_S)
@@ -365,7 +383,7 @@ class _Slots:
         unsure = np.flatnonzero(follows & (apart_m > allowed_m) & (many > 0))
         if unsure.size:
             spread = np.sqrt(1 / self.counts[unsure] + 1 / self.counts[unsure + 1])
-            # Few of them may show much less noise than there is, hence the allowance.
+            # A few differences may show much less noise than there is, hence the allowance.
             factor = _NOISE_FACTOR * (1 + 4 / many[unsure]) * spread
             noise = self.noises(unsure, unsure + 2)
             allowed_m[unsure] = np.maximum(allowed_m[unsure], factor * noise)
@@ -373,29 +391,30 @@ class _Slots:
         return linked
 
     def edge(self, at: int, other: int, step: int) -> Ns:
-        """Returns when a standstill ends (`step` 1), or begins (-1), by its still slots there.
+        """Returns the log time (ns) at which a standstill begins or ends, by its poses.
 
         Args:
-            at: the outermost one.
-            other: that at its other end.
-            step: see above.
+            at: the outermost still slot at this end.
+            other: the outermost still slot at the other end.
+            step: 1 for the end, -1 for the begin.
         """
         low, high = sorted((at, at - step * min(_PLACE_SLOTS - 1, abs(at - other))))
-        at_end = self.positions[self.begins[low] : self.stops[high]]
-        place = at_end.mean(axis=0)
+        inside = self.positions[self.begins[low] : self.stops[high]]
+        place = inside.mean(axis=0)
         noise = float(self.noises(np.array([low]), np.array([high + 1]))[0])
-        reach = max(_NEAREST_M, _ELSEWHERE * noise, 1.2 * float(_lengths(at_end - place).max()))
+        reach = max(_NEAREST_M, _ELSEWHERE * noise, 1.2 * float(_lengths(inside - place).max()))
         far = np.searchsorted(self.numbers, self.numbers[at] + step * _OUTWARDS, side="left")
         low, high = sorted((at, int(far)))
-        rows = np.arange(self.begins[low], self.stops[min(high, len(self) - 1)])[::step]
-        away = _lengths(self.positions[rows] - place)
-        # None is there beyond a silence.
-        away[1:][np.abs(np.diff(self.times[rows])) > SILENCE_NS] = np.inf
+        outwards = np.arange(self.begins[low], self.stops[min(high, len(self) - 1)])[::step]
+        away = _lengths(self.positions[outwards] - place)
+        # Poses beyond a silence are elsewhere.
+        away[1:][np.abs(np.diff(self.times[outwards])) > SILENCE_NS] = np.inf
         elsewhere = np.flatnonzero(away > reach)
         if not elsewhere.size:
-            return int(self.times[rows[-1]])
-        there = np.flatnonzero(away[: elsewhere[0]] <= reach - _CLEARLY * noise)
-        return int(self.times[rows[there[-1] if there.size else 0]])
+            return int(self.times[outwards[-1]])
+        clearly_there = np.flatnonzero(away[: elsewhere[0]] <= reach - _CLEARLY * noise)
+        last = clearly_there[-1] if clearly_there.size else 0
+        return int(self.times[outwards[last]])
 
 
 def _lengths(vectors: Vectors) -> Floats:
@@ -403,45 +422,45 @@ def _lengths(vectors: Vectors) -> Floats:
 
 
 def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:
-    """Returns the standstills in blocks of stretches of time that follow each other, in order."""
+    """Returns the standstills in the blocks of consecutive stretches of time, in order."""
     blocks = stacked([NO_BLOCKS, *parts])
     if not len(blocks):
         return ()
     begins_chain = blocks.starts != MIN_NS
     firsts, lasts = blocks.span()
-    # Parts of a history that each go on may have a silence between them.
+    # The poses of two parts may have a silence between them that neither part shows.
     begins_chain[1:] |= firsts[1:] - lasts[:-1] > SILENCE_NS
     begins_chain[0] = True
     chain = np.cumsum(begins_chain)
-    still = blocks.are_still()
-    moves = _creeping(blocks, chain, still) | ~still
-    stands: list[Standstill] = []
+    is_still = blocks.are_still()
+    moves = _creeping(blocks, chain, is_still) | ~is_still
     begins, stops = _runs(~moves, chain)
     starts, ends = blocks.starts[begins], blocks.ends[stops - 1]
     starts = np.where(starts == MIN_NS, firsts[begins], starts)
     ends = np.where(ends == MIN_NS, lasts[stops - 1], ends)
     runs = (column.tolist() for column in (begins, stops, starts, ends))
     corners = blocks.corners()
-    until = MIN_NS
+    stands: list[Standstill] = []
+    newest_end = MIN_NS
     for begin, stop, since, end, box in zip(*runs, _boxes(corners, begins, stops), strict=True):
-        # Ends are followed into each other's slots.
-        start = max(since, until)
+        # The ends of two standstills may reach into each other's slots.
+        start = max(since, newest_end)
         if end - start < SHORTEST_NS:
             continue
         if box.diagonal <= DRIFTED_M:
             stands.append(Standstill(start, end, box))
         else:
             stands += _split_by_drift(corners, firsts[begin:stop], begin, start, end)
-        until = stands[-1].end
+        newest_end = stands[-1].end
     return tuple(stands)
 
 
 def _boxes(corners: tuple[Vectors, Vectors], begins: Ints, stops: Ints) -> Iterator[Box3]:
-    """Yields the boxes around some half-open ranges of blocks, which follow each other."""
+    """Yields the boxes around half-open ranges of blocks, which are in order and apart."""
     if not begins.size:
         return
     edges = np.stack([begins, stops], axis=1).reshape(-1)
-    # One row more, since the last range may end where the blocks do.
+    # `reduceat` takes no edge behind the last row, where the last range may stop: one row more.
     lows, highs = (np.append(corner, corner[-1:], axis=0) for corner in corners)
     lows, highs = np.minimum.reduceat(lows, edges)[::2], np.maximum.reduceat(highs, edges)[::2]
     for (a, b, c), (d, e, f) in zip(lows.tolist(), highs.tolist(), strict=True):
@@ -449,7 +468,7 @@ def _boxes(corners: tuple[Vectors, Vectors], begins: Ints, stops: Ints) -> Itera
 
 
 def _runs(marks: Flags, chain: Ints) -> tuple[Ints, Ints]:
-    """Returns where the ranges in one chain in which marks are set begin, and where they stop."""
+    """Returns the begins and the stops of half-open ranges of one chain in which marks are set."""
     is_new = np.r_[True, (np.diff(chain) != 0) | ~marks[:-1]]
     is_over = np.r_[(np.diff(chain) != 0) | ~marks[1:], True]
     return np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
@@ -458,14 +477,14 @@ def _runs(marks: Flags, chain: Ints) -> tuple[Ints, Ints]:
 def _split_by_drift(
     corners: tuple[Vectors, Vectors], firsts: Ints, first: int, start: Ns, end: Ns
 ) -> Iterator[Standstill]:
-    """Yields the standstills of consecutive still blocks, of a robot that drifts away.
+    """Yields the standstills of a run of still blocks that drifts out of `DRIFTED_M`.
 
     Args:
-        corners: of all blocks (m).
-        firsts: of those in the run, the log time (ns) of the first pose.
-        first: the position of the first of them among all.
-        start: when the robot began to stand.
-        end: when it ended.
+        corners: the corners (m) of all blocks.
+        firsts: the log times (ns) of the first poses of the blocks in the run.
+        first: the index of the first block of the run.
+        start: the log time (ns) at which the run begins.
+        end: the log time (ns) at which it ends.
     """
     lows, highs = (corner[first : first + firsts.size] for corner in corners)
     begin = 0
@@ -486,27 +505,34 @@ def _split_by_drift(
             start = until
 
 
-def _creeping(blocks: Blocks, chain: Ints, still: Flags) -> Flags:
-    """Returns which blocks are part of a creep: the shortest ones that lead `LARGEST_M` away."""
-    left = _left_blocks(blocks, chain, still)
-    creeping = np.zeros(len(blocks), np.bool_)
-    since, newest = MIN_NS, 0
-    for here in np.flatnonzero(left >= 0).tolist():
-        there = int(left[here])
-        if chain[here] != newest:
-            newest, since = chain[here], MIN_NS
-        if (begin := int(blocks.numbers[there])) > since:
-            creeping[there : here + 1] = True
-            since = begin
-    return creeping
+def _creeping(blocks: Blocks, chain: Ints, is_still: Flags) -> Flags:
+    """Returns which blocks are part of a creep, a row of blocks that leads `LARGEST_M` away.
+
+    Of creeps that end in one block, or that contain each other, the shortest counts.
+    """
+    left = _left_blocks(blocks, chain, is_still)
+    is_creeping = np.zeros(len(blocks), np.bool_)
+    newest_begin, newest_chain = MIN_NS, 0
+    for last in np.flatnonzero(left >= 0).tolist():
+        first = int(left[last])
+        if chain[last] != newest_chain:
+            newest_chain, newest_begin = chain[last], MIN_NS
+        begin = int(blocks.numbers[first])
+        if begin > newest_begin:
+            is_creeping[first : last + 1] = True
+            newest_begin = begin
+    return is_creeping
 
 
-def _left_blocks(blocks: Blocks, chain: Ints, still: Flags) -> Ints:
-    """Returns the newest block that each is `LARGEST_M` away from, within `CREEP_NS`; else -1."""
-    run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
+def _left_blocks(blocks: Blocks, chain: Ints, is_still: Flags) -> Ints:
+    """Returns, for each block, the newest one that it is `LARGEST_M` away from; else -1.
+
+    Only still blocks up to `CREEP_NS` before, in an unbroken row of still blocks, are compared.
+    """
+    run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(is_still[1:] & is_still[:-1])])
     low, high = blocks.corners()
     centres, noises = (low + high) / 2, blocks.noises.astype(np.float64)
-    # Mostly the robot stands: no block is that far from another one as near in time.
+    # Mostly the robot stands. Only groups of blocks whose centres spread far enough are compared.
     groups = np.arange(0, len(blocks), _CREEP_BLOCKS)
     lows, highs = (extreme.reduceat(centres, groups) for extreme in (np.minimum, np.maximum))
     lows[1:], highs[1:] = np.minimum(lows[1:], lows[:-1]), np.maximum(highs[1:], highs[:-1])
@@ -525,7 +551,7 @@ def _left_blocks(blocks: Blocks, chain: Ints, still: Flags) -> Ints:
 
 
 class SpeedDrop(NamedTuple):
-    """A sudden loss of speed: when it began, and the speeds (m/s) before and after."""
+    """A sudden loss of speed: the log time at which it began, and the speeds before and after."""
 
     time: Ns
     before_mps: float
@@ -533,16 +559,14 @@ class SpeedDrop(NamedTuple):
 
 
 def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
-    """Returns where the robot suddenly slowed down, in order."""
+    """Returns the sudden losses of speed, in order."""
     valid = np.flatnonzero(are_places(poses.positions))
-    slots = poses.times[valid] // DROP_SLOT_NS
-    # The first pose of each slot.
-    rows = valid[run_starts(slots)]
+    rows = valid[run_starts(poses.times[valid] // DROP_SLOT_NS)]
     if rows.size < _DROP_SLOTS:
         return ()
     times, places = poses.times[rows], poses.positions[rows]
     speeds = _lengths(np.diff(places, axis=0)) / (np.diff(times) / NS_PER_S)
-    # Of two slots: a robot whose position jumps, and is back, gets no farther.
+    # Over two slots, a robot whose position jumps for a moment gets no farther.
     ahead = _lengths(places[2:] - places[:-2]) / ((times[2:] - times[:-2]) / NS_PER_S)
     before = np.minimum(np.minimum(speeds[:-1], speeds[1:]), ahead)
     after = np.maximum(speeds[:-1], speeds[1:])
@@ -551,7 +575,7 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     in_a_row = slots[_DROP_SLOTS - 1 :] - slots[: 1 - _DROP_SLOTS] < _DROP_SLOTS
     drops = np.flatnonzero(in_a_row & falls[1:] & ~falls[:-1])
     turned = headings(poses.turns[rows[drops + 6]]) - headings(poses.turns[rows[drops + 2]])
-    # Where a heading is not known, it turns no more than others.
+    # A comparison with NaN is false: without a heading the robot is taken not to turn.
     drops = drops[~(np.abs(np.angle(np.exp(1j * turned))) > TURNS_RAD)]
     return tuple(
         SpeedDrop(int(times[at + 3]), float(before[at + 1]), float(after[at + 4]))

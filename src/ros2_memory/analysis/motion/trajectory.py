@@ -1,11 +1,12 @@
 """The driven path, measured and drawn.
 
-What is measured of poses depends on how many of them are measured together (see `path_length`). So
-a history is measured in slices of `SLICE_NS` of the clock, however it is cut into bags: a
-`PathSlice` is what is stored of one, and `joined_slices` joins those of a window. The drawn path is
-simplified twice. The deviations add up and do no more, since a vertex that the second drops is
-beside the same kept segment as its neighbours: so to at most the tolerance, unless a limit on the
-count of vertices widens it. Where the robot jumped, nothing is drawn.
+The length of a path depends on how many poses are measured together (see `path_length`). So a
+history is measured in slices of `SLICE_NS` of the clock, however it is cut into bags. A `PathSlice`
+is stored for each slice, and `joined_slices` joins the slices of a window.
+
+The drawn path is simplified twice, and the deviations of both add up: a vertex that the second
+simplification drops lies beside the same segment as its neighbours. The sum is at most the
+tolerance, unless a limit on the count of vertices widens it. Nothing is drawn along a jump.
 """
 
 from __future__ import annotations
@@ -41,19 +42,20 @@ SLICE_NS: Final = 300 * NS_PER_S
 TOLERANCE_M: Final = 0.05
 """How far a pose may be from the drawn path, unless a limit on count widens it."""
 MAX_WAYPOINTS: Final = 50
-"""Vertices of the path that is returned, unless more or fewer are asked for."""
+"""How many waypoints a path has, unless another number is asked for."""
 LEAST_OF_SPEED_S: Final = 0.5
-"""Of poses that span less, noise is as large as what was driven: they say no speed."""
+"""Poses over a shorter time give no speed: noise is as large as what was driven."""
 
 _MOST_VERTICES: Final = 400
-"""Vertices that a slice stores of its path, but for the ends of jumps and of gaps."""
-_KEPT_WITHIN_M: Final = 0.0175
-"""How far a pose may be from the path of a slice. Within 1.25 cm a position's noise of 4 mm keeps
-four times as many vertices."""
+"""How many vertices a slice stores, besides the ends of jumps and gaps."""
+_STORED_WITHIN_M: Final = 0.0175
+"""How far a pose may be from the path of a slice. Within 1.25 cm, noise of 4 mm would leave four
+times as many vertices."""
 _OF_TIME: Final = 0.7
-"""So the metres that a slice has driven up to a time are right within 2.5 cm."""
+"""The share of the tolerance that counts along the time, so that the metres driven up to any time
+are right within 2.5 cm."""
 _FEW: Final = 32
-"""Slices of no more poses are measured together with those beside them that have few, too."""
+"""Neighbouring slices with at most so many poses each are measured together."""
 _NOISY_SHARE: Final = 0.02
 _NOISY_M: Final = 0.001
 _BYTES: Final = 3000
@@ -62,9 +64,9 @@ _BYTES: Final = 3000
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """One vertex of the drawn path: a pose as recorded (m, rad; no yaw without orientation).
+    """A vertex of the drawn path: a pose as recorded (m, rad); no yaw without an orientation.
 
-    `jump`: the robot jumped here from the waypoint before, instead of driving.
+    `jump`: the robot did not drive here from the waypoint before, but jumped.
     """
 
     time: Ns
@@ -74,7 +76,7 @@ class Waypoint:
 
 
 def mean_speed(distance_m: float, duration_s: float) -> float | None:
-    """Returns metres by seconds; None of less than `LEAST_OF_SPEED_S`."""
+    """Returns the mean speed (m/s); None over less than `LEAST_OF_SPEED_S`."""
     return distance_m / duration_s if duration_s >= LEAST_OF_SPEED_S else None
 
 
@@ -83,17 +85,16 @@ class Trajectory:
     """The measurements of a driven path.
 
     Attributes:
-        totals: path length in 3D in log-time order, as far as its noise allows (see
-            `path_length`), and what is left out of it.
-        avg_speed: `distance_m / duration_s` (m/s); None of less than `LEAST_OF_SPEED_S`.
-        max_speed: the highest speed (m/s), from `max_speed_from`; None as `avg_speed`, unless
-            messages state it.
-        max_speed_from: `twist`: the messages' own; `positions`: over a second and eight poses.
+        totals: the length in 3D without noise (see `path_length`), and what is left out of it.
+        avg_speed: `distance_m / duration_s` (m/s); None over less than `LEAST_OF_SPEED_S`.
+        max_speed: the highest speed (m/s); None as `avg_speed`, unless messages state it.
+        max_speed_from: `twist` if messages state it, `positions` if it is measured over a second
+            and eight poses.
         waypoints: vertices of the path drawn in space and time: first and last pose, corners,
             turning points, ends of stops, and both ends of the longest jumps.
         waypoint_error_m: no pose is farther than this from the drawn path.
-        poses: how many valid poses.
-        invalid: poses left out, since a coordinate is NaN, infinite or beyond any place.
+        poses: how many poses are valid.
+        invalid: how many are not: a coordinate is NaN, infinite or beyond any place.
     """
 
     totals: MotionTotals
@@ -112,7 +113,7 @@ class Trajectory:
 
     @property
     def is_noisy(self) -> bool:
-        """Whether the plain sum is longer by more than 2 %, and by a millimetre."""
+        """Whether the sum of distances is longer than the length by 2 %, and by a millimetre."""
         distance_m = self.totals.distance_m
         more_m = self.totals.path_sum_m - distance_m
         return more_m > max(_NOISY_SHARE * distance_m, _NOISY_M)
@@ -124,10 +125,10 @@ class Line:
 
     Attributes:
         times: log times (ns), ascending.
-        metres: since the first vertex; without gaps, jumps and what noise adds.
-        places: x, y and z (m), as rows.
-        headings: about z (rad); NaN where it is not known.
-        jumps: whether the robot jumped to the vertex, instead of driving.
+        metres: metres driven since the first vertex, without gaps, jumps and noise.
+        places: rows of x, y and z (m).
+        headings: yaw (rad); NaN if it is not known.
+        jumps: whether the robot jumped to the vertex.
     """
 
     times: IntArray
@@ -141,15 +142,15 @@ class Line:
         return self.times.size
 
     def metres_at(self, times: IntArray) -> Floats:
-        """Returns the metres driven up to some log times (ns); there must be a vertex."""
+        """Returns the metres driven up to log times (ns), on a line with at least one vertex."""
         since = self.times[0]
         metres: Floats = np.interp(times - since, self.times - since, self.metres)
         return metres
 
     def at(self, times: IntArray) -> Line:
-        """Returns where the robot was at some log times (ns); beside a jump at the nearer vertex.
+        """Returns a line with vertices at log times (ns), interpolated between those of this one.
 
-        There must be a vertex.
+        During a jump the robot is at its nearer end. This line has at least one vertex.
         """
         after = np.searchsorted(self.times, times, side="right").clip(max=len(self) - 1)
         before = np.maximum(after - 1, 0)
@@ -168,20 +169,20 @@ class Line:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathSlice:
-    """The path of the poses of a stretch of time; a pose is valid where it is at a place.
+    """The path of consecutive poses.
 
     Attributes:
         first: log time (ns) of the first pose, valid or not.
-        last: of the last one.
-        poses: how many valid poses.
-        invalid: how many others.
-        totals: what was driven.
+        last: log time (ns) of the last pose.
+        poses: how many poses are valid (see `are_places`).
+        invalid: how many are not.
+        totals: the sums over the driven legs.
         step_mps: see `odometry.Motion`.
-        twist: the highest speed (m/s) that a message states; None where none states one.
+        twist: the highest speed (m/s) that a message states; None if none states one.
         frames: the frames of all poses, in order of appearance.
-        line: the drawn path from the first valid pose to the last; its metres are what was driven.
-        error_m: no valid pose is farther than this from it.
-        few: the poses, where they are so few that those beside them decide how they are measured.
+        line: the drawn path from the first valid pose to the last.
+        error_m: no valid pose is farther than this from the line.
+        few: the poses, if there are at most `_FEW`; else None.
     """
 
     first: Ns
@@ -202,26 +203,27 @@ class PathSlice:
         return _BYTES + 49 * len(self.line)
 
     def trajectory(self, max_waypoints: int = MAX_WAYPOINTS) -> Trajectory:
-        """Returns the measurements, and the path drawn with so many waypoints at most.
+        """Returns the measurements, and the path drawn with at most so many waypoints.
 
-        It is not drawn at all for 0; else with 2 at least.
+        No waypoints are drawn for 0, and two for 1.
         """
         distance_m, duration_s = self.totals.distance_m, self.totals.duration_s
         avg_speed = mean_speed(distance_m, duration_s)
-        # Drivers without a twist leave it zero, which is wrong where the robot moved.
-        stated = self.twist if self.twist or not distance_m else None
         step_mps = self.step_mps if self.poses <= SPEED_STEPS else 0.0
-        measured = self.totals.speed_mps or step_mps
-        fastest = None if avg_speed is None else max(measured, avg_speed)
+        max_speed = None
+        if avg_speed is not None:
+            max_speed = max(self.totals.speed_mps or step_mps, avg_speed)
+        # Drivers without a twist leave it zero, which is wrong if the robot moved.
+        is_stated = self.twist is not None and (self.twist != 0 or not distance_m)
         waypoints: tuple[Waypoint, ...] = ()
         error_m = 0.0
         if max_waypoints and len(self.line):
-            waypoints, error_m = drawn(self.line, max(max_waypoints, 2), self.error_m)
+            waypoints, error_m = draw_waypoints(self.line, max(max_waypoints, 2), self.error_m)
         return Trajectory(
             self.totals,
             avg_speed,
-            fastest if stated is None else stated,
-            "positions" if stated is None else "twist",
+            self.twist if is_stated else max_speed,
+            "twist" if is_stated else "positions",
             waypoints,
             error_m,
             self.poses,
@@ -230,7 +232,7 @@ class PathSlice:
 
 
 def path_slice(poses: Poses, fastest_mps: float, *, draws: bool = True) -> PathSlice:
-    """Measures poses, which are in order, and draws them within 1.75 cm, if it `draws`.
+    """Measures poses in order of log time and, if it `draws`, draws them within 1.75 cm.
 
     A step that would take a higher speed than `fastest_mps` is a jump.
     """
@@ -259,24 +261,24 @@ def path_slice(poses: Poses, fastest_mps: float, *, draws: bool = True) -> PathS
 
 
 def _line_through(poses: Poses, measured: MeasuredPath) -> tuple[Line, float]:
-    """Returns the drawn path of some poses, and how far (m) they may be off it."""
-    kept, error_m = np.arange(len(poses)), 0.0
+    """Returns the line through poses, and how far (m) a pose may be off it."""
+    vertices, error_m = np.arange(len(poses)), 0.0
     if len(poses) > _FEW:
         begins = np.array(measured.begins, np.intp)
-        kept, error_m = simplified(
+        vertices, error_m = simplified(
             poses.positions,
             (poses.times - poses.times[0]) / NS_PER_S,
             np.unique(np.concatenate(([0, len(poses) - 1], begins - 1, begins))),
-            tolerance_m=_KEPT_WITHIN_M,
+            tolerance_m=_STORED_WITHIN_M,
             at_most=_MOST_VERTICES,
             of_time=_OF_TIME,
         )
     line = Line(
-        poses.times[kept],
-        np.concatenate(([0.0], np.cumsum(measured.steps_m)))[kept],
-        poses.positions[kept],
-        headings(poses.turns[kept]),
-        np.isin(kept, measured.parted),
+        poses.times[vertices],
+        np.concatenate(([0.0], np.cumsum(measured.steps_m)))[vertices],
+        poses.positions[vertices],
+        headings(poses.turns[vertices]),
+        np.isin(vertices, measured.parted),
     )
     return line, error_m
 
@@ -287,8 +289,8 @@ NO_LINE: Final = Line(
 
 
 def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
-    """Joins slices in order, of which there is one at least; see `path_slice`."""
-    slices = [*_measured_together(slices, fastest_mps)]
+    """Joins one or more consecutive slices; see `path_slice`."""
+    slices = [*_with_few_joined(slices, fastest_mps)]
     motion = Motion(fastest_mps)
     jumped: list[bool] = []
     added: list[float] = []
@@ -303,7 +305,7 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
     jumps = line.jumps.copy()
     jumps[firsts] |= np.array(jumped)[vertices > 0]
     metres = line.metres + np.repeat(added, vertices)
-    # Where two places turn out to be one, joining takes some metres back.
+    # Joining may shorten a path: two places of a creep may turn out to be one.
     metres = np.maximum.accumulate(np.minimum(metres, motion.totals.distance_m))
     twists = [part.twist for part in slices if part.twist is not None]
     return PathSlice(
@@ -320,40 +322,47 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
     )
 
 
-def drawn(line: Line, at_most: int, error_m: float = 0.0) -> tuple[tuple[Waypoint, ...], float]:
-    """Draws a line with so many waypoints at most, 2 or more; then the longest jumps alone part it.
+def draw_waypoints(
+    line: Line, at_most: int, error_m: float = 0.0
+) -> tuple[tuple[Waypoint, ...], float]:
+    """Draws a line with at most so many waypoints (2 or more), and with the longest jumps alone.
 
     Args:
-        line: of one vertex at least.
-        at_most: see above.
-        error_m: how far poses may be off the line.
+        line: the line, which has at least one vertex.
+        at_most: how many waypoints to draw.
+        error_m: how far (m) a pose may be off the line.
 
     Returns:
-        The waypoints, and how far (m) poses may be off these.
+        The waypoints, and how far (m) a pose may be off the path through them.
     """
     jumps = np.flatnonzero(line.jumps[1:]) + 1
-    far_m = np.linalg.norm(line.places[jumps] - line.places[jumps - 1], axis=1)
-    parted = np.sort(jumps[np.argsort(-far_m, kind="stable")[: at_most // 2 - 1]])
-    ends = np.unique(np.concatenate(([0, len(line) - 1], parted - 1, parted)))
+    jump_m = np.linalg.norm(line.places[jumps] - line.places[jumps - 1], axis=1)
+    longest = np.sort(jumps[np.argsort(-jump_m, kind="stable")[: at_most // 2 - 1]])
+    ends = np.unique(np.concatenate(([0, len(line) - 1], longest - 1, longest)))
     seconds = (line.times - line.times[0]) / NS_PER_S
     left_m = max(TOLERANCE_M - error_m, TOLERANCE_M / 4)
-    kept, off_m = simplified(line.places, seconds, ends, tolerance_m=left_m, at_most=at_most)
-    chosen = rows_of(line, kept)
-    parts = (chosen.jumps & np.isin(kept, [0, *parted])).tolist()
-    columns = chosen.times.tolist(), chosen.places.tolist(), chosen.headings.tolist(), parts
+    vertices, off_m = simplified(line.places, seconds, ends, tolerance_m=left_m, at_most=at_most)
+    drawn = rows_of(line, vertices)
+    is_jump = drawn.jumps & np.isin(vertices, [0, *longest])
     waypoints = tuple(
         Waypoint(time, (x, y, z), None if math.isnan(heading) else heading, jump=jump)
-        for time, (x, y, z), heading, jump in zip(*columns, strict=True)
+        for time, (x, y, z), heading, jump in zip(
+            drawn.times.tolist(),
+            drawn.places.tolist(),
+            drawn.headings.tolist(),
+            is_jump.tolist(),
+            strict=True,
+        )
     )
     return waypoints, error_m + off_m
 
 
-def _measured_together(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:
-    """Yields the slices; of consecutive ones with few poses each one of all these poses."""
-    for are_few, run in groupby(slices, key=lambda part: part.few is not None):
+def _with_few_joined(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:
+    """Yields slices; consecutive slices with few poses are measured together, as one slice."""
+    for _, run in groupby(slices, key=lambda part: part.few is None):
         parts = [*run]
         few = [part.few for part in parts if part.few is not None]
-        if are_few and len(parts) > 1:
+        if len(few) > 1:
             yield path_slice(joined_poses(few), fastest_mps)
         else:
             yield from parts
