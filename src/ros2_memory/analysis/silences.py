@@ -5,8 +5,8 @@ from messages. The rules hold over the whole memory:
 
 - A topic has a usual rate if bags that hold it hold messages all along. Its period is the mean
   period of the bags around the median. A topic that is published on events has no usual rate.
-- It is silent if it has no message for `SHORTEST_NS` and for `PERIODS` of its periods, between two
-  of its messages or after the last one. Before the first one it is not silent.
+- It is silent if it has no message for `SHORTEST_NS` and for `SILENT_PERIODS` of its periods,
+  between two of its messages or after the last one. Before the first one it is not silent.
 - The robot is on if a third of the topics with a usual rate that are recorded together with the
   silent one are heard. While it is off nothing is recorded: that is a gap, and no part of a
   silence. A gap of more than `LONGEST_OFF_NS` ends a silence, since what follows may be a recording
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 SHORTEST_NS: Final = SHORTEST_SILENCE_NS
-PERIODS: Final = SILENT_PERIODS
+
 SELDOM: Final = 2
 HABIT_NS: Final = 3600 * NS_PER_S
 UNUSUAL: Final = 10
@@ -105,7 +105,7 @@ def joined(parts: Sequence[Pacing]) -> Pacing:
 
 def shortest_silence(period: Ns) -> Ns:
     """Returns how long (ns) a topic with this period must have no message to be silent."""
-    return max(SHORTEST_NS, PERIODS * period)
+    return max(SHORTEST_NS, SILENT_PERIODS * period)
 
 
 def usual_period(pacing: Pacing) -> Ns | None:

@@ -309,13 +309,11 @@ def _vertices_during(track: RobotTrack, spans: Sequence[Span]) -> tuple[Times, F
 
     Vertices that the robot jumped to and from are left out.
     """
-    parts = [cut(track, TimeWindow(first, last + 1)) for first, last in spans]
-    is_jumped_over = []
-    for part in parts:
+    points = []
+    for first, last in spans:
+        part = cut(track, TimeWindow(first, last + 1))
         jumped = jumps(part)
-        is_jumped_over.append(jumped & np.roll(jumped, 1))
-    rows = np.flatnonzero(~np.concatenate(is_jumped_over))
-    times = np.concatenate([part.times for part in parts])
-    x = np.concatenate([part.x for part in parts])
-    y = np.concatenate([part.y for part in parts])
-    return times[rows], x[rows], y[rows]
+        on_way = ~(jumped & np.roll(jumped, 1))
+        points.append((part.times[on_way], part.x[on_way], part.y[on_way]))
+    times, x, y = (np.concatenate(column) for column in zip(*points, strict=True))
+    return times, x, y

@@ -119,13 +119,6 @@ def stays(track: RobotTrack, region: Region) -> list[Stay]:
     piece_starts, piece_stops = (ends[piece] for ends in track.pieces)
     is_apart = (starts[1:] - stops[:-1] >= FLICKER_NS) | (piece[1:] != piece[:-1])
     is_first, is_last = np.append([True], is_apart), np.append(is_apart, [True])
-    return [
-        Stay(start, stop, entered, left)
-        for start, stop, entered, left in zip(
-            starts[is_first].tolist(),
-            stops[is_last].tolist(),
-            (starts > piece_starts)[is_first].tolist(),
-            (stops < piece_stops)[is_last].tolist(),
-            strict=True,
-        )
-    ]
+    entered, left = starts > piece_starts, stops < piece_stops
+    columns = (starts[is_first], stops[is_last], entered[is_first], left[is_last])
+    return [Stay(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]

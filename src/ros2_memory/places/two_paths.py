@@ -77,8 +77,9 @@ def _steps(track: RobotTrack, window: TimeWindow) -> _TrackSteps:
     part = cut(track, window)
     jumped = jumps(part)
     ends = part.ends | jumped
-    is_alone = ends & np.append([True], ends[:-1])[: len(ends)]
-    is_jumped_over = jumped & np.append([False], jumped[:-1])[: len(ends)]
+    # The last vertex is an end, and not jumped from: it may stand before the first one.
+    is_alone = ends & np.roll(ends, 1)
+    is_jumped_over = jumped & np.roll(jumped, 1)
     first = np.flatnonzero(~ends | (is_alone & ~is_jumped_over))
     last = first + ~ends[first]
     places = np.column_stack((part.x, part.y))

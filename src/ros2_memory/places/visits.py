@@ -17,7 +17,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import FLICKER_NS
-from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, TRACK_SLICE_NS, RobotTrack
+from ros2_memory.analysis.motion.robot_track import (
+    TOLERANCE_M,
+    TRACK_SLICE_NS,
+    RobotTrack,
+    place_at,
+)
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Region, Steps
@@ -200,12 +205,12 @@ def asked_place(
         raise InvalidArgumentsError(f"radius_m must be more than 0, and was {radius_m}")
     x, y = point
     if where is not None:
-        if x is not None or y is not None:
+        if point != (None, None):
             raise InvalidArgumentsError("give either where or x and y")
         return parse_where(limits, where, radius)
     if x is not None and y is not None:
         return Where(Circle(x, y, radius))
-    if x is not None or y is not None:
+    if point != (None, None):
         raise InvalidArgumentsError("x and y must both be given, or neither")
     if not limits.places:
         raise InvalidArgumentsError(
@@ -456,15 +461,11 @@ class ConfirmedStays:
         )
 
     def _is_clearly_inside(self, visit: TrackedStay) -> bool:
-        """Returns whether a pose within `TOLERANCE_M` of the middle of a visit must be inside."""
-        track, at = visit.track, (visit.whole.start + visit.whole.stop) // 2
-        after = min(max(int(np.searchsorted(track.times, at)), 1), len(track.times) - 1)
-        step = slice(after - 1, after + 1)
-        since = track.times[after - 1]
-        x, y = (
-            float(np.interp(at - since, track.times[step] - since, axis[step]))
-            for axis in (track.x, track.y)
-        )
+        """Returns whether all poses near the track in the middle of a visit must be inside."""
+        middle = place_at(visit.track, (visit.whole.start + visit.whole.stop) // 2)
+        if middle is None:
+            return False
+        x, y = middle
         off = (-TOLERANCE_M, TOLERANCE_M)
         return all(self._region.contains(x + dx, y + dy) for dx in off for dy in off)
 

@@ -198,11 +198,18 @@ class Blocks:
         return sum(getattr(self, column.name).nbytes for column in fields(self))
 
 
-_NONE: Final = np.empty(0, np.int64)
-_NOWHERE: Final = narrowed(np.empty((0, 3), np.int64))
-_OFFSETS: Final = np.empty(0, np.uint32)
+_NO_INTS: Final = np.empty(0, np.int64)
+_NO_OFFSETS: Final = np.empty(0, np.uint32)
+_NO_PLACES: Final = narrowed(np.empty((0, 3), np.int64))
 NO_BLOCKS: Final = Blocks(
-    narrowed(_NONE), _OFFSETS, _OFFSETS, np.empty(0, np.float32), _NOWHERE, _NOWHERE, _NONE, _NONE
+    numbers=narrowed(_NO_INTS),
+    firsts=_NO_OFFSETS,
+    lasts=_NO_OFFSETS,
+    noises=np.empty(0, np.float32),
+    lows=_NO_PLACES,
+    sizes=_NO_PLACES,
+    starts=_NO_INTS,
+    ends=_NO_INTS,
 )
 
 
