@@ -33,7 +33,7 @@ Scalar: TypeAlias = bool | int | float | str
 POSITION_KEYS: Final = ("position", "point", "translation")
 """Keys under which a value holds a place; x and y under other keys may be a velocity or an axis."""
 
-# Bounded, since int() refuses texts of thousands of digits.
+# int() refuses texts of thousands of digits.
 _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
 _DECIMAL: Final = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _AXES: Final = {"0": "x", "1": "y", "2": "z"}
@@ -248,10 +248,7 @@ class Condition:
         return self if path == self.field else replace(self, field=path)
 
     def is_unstated(self, value: JsonValue) -> bool:
-        """Returns whether a value names elements, but not the one that the field asks for.
-
-        Several nodes may publish joint states of some joints each.
-        """
+        """Returns whether a value names elements (joints), but not the one that is asked for."""
         names = names_beside(value, self.field or "")
         return bool(names) and self.element not in names
 
@@ -274,10 +271,7 @@ class Condition:
 
     @property
     def least_score(self) -> float:
-        """The score from which on detections count.
-
-        Most detectors store a float32, so the rounded limit counts, too.
-        """
+        """The score from which on detections count: the limit, or as a float32 stores it."""
         return min(self.min_score, _float32(self.min_score))
 
     def _passes(self, value: JsonValue) -> bool:
@@ -304,9 +298,9 @@ class Condition:
 
     @property
     def looks_at_numbers(self) -> bool:
-        """Whether numbers in arrays are compared, which summaries lack.
+        """Whether numbers in arrays, which summaries lack, are compared.
 
-        In a whole value, "equals 1" looks for the boolean true and not at numbers in arrays.
+        In a whole value, "equals 1" means the boolean true.
         """
         test = self.test
         if isinstance(test, NearPosition) or plain_text(test) is not None:
@@ -318,8 +312,7 @@ class Condition:
     def can_be_refused(self) -> bool:
         """Whether values of some shapes cannot match; see `refusal_for`.
 
-        A number or boolean that any part of a value may equal is never refused: another message may
-        have one, for instance in a text that is JSON.
+        Not so if a number or boolean may be anywhere in a value: even a text may have it as JSON.
         """
         test = self.test
         return (
@@ -582,8 +575,7 @@ def _text_of(needle: Scalar) -> str | None:
 def stored_as(number: float) -> float:
     """Returns the number that a float32 field stores in place of this one.
 
-    A number beyond 24 bits is returned as it is: a float32 would round it to another whole number,
-    such as a Unix time to that of a minute later.
+    A number from 2**24 to 2**53 stays as it is: a float32 would round a Unix time to minutes.
     """
     rounded = _float32(number)
     return number if rounded == 0.0 or _SINGLE_BELOW <= abs(number) < _EXACT_BELOW else rounded

@@ -17,7 +17,6 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import combinations, groupby
-from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -102,7 +101,6 @@ AHEAD_MM: Final = 2_000
 """The usual distance of a thing, by which errors of the heading are weighed."""
 TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
 """The columns of each table of `Sights`."""
-_NAMES: Final = ("spots", "looks", "hits", "scores", "beside", "unplaced", "fixes")
 
 
 class DetectorMessages(NamedTuple):
@@ -157,7 +155,15 @@ class Sights:
     @property
     def tables(self) -> tuple[Ints, ...]:
         """All tables, in the order of `TABLES`."""
-        return attrgetter(*_NAMES)(self)
+        return (
+            self.spots,
+            self.looks,
+            self.hits,
+            self.scores,
+            self.beside,
+            self.unplaced,
+            self.fixes,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,11 +226,15 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
 
 
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
-    """Returns the look of each message (-1 if the robot's pose is not known), and the table."""
+    """Returns the look of each message (-1 if the robot's pose is not known), and the table.
+
+    All messages of a slice without a known pose have one look, at 0 and with `NO_YAW`.
+    """
     is_known = ~np.isnan(seen.robot.sum(axis=1))
     x, y, z, yaw, pan = np.where(is_known[:, None], seen.robot, 0.0).T
     turned = np.rint(_decideg(pan) / CELL_DECIDEG).astype(np.int64) * CELL_DECIDEG % 3600
     facing = np.where(is_known, _decideg(yaw) % 3600, NO_YAW)
+    # Floors are at 0, 2 m, ...: half of a storey below and above is on the same one.
     columns = (_mm(x), _mm(y), _mm(z) + STOREY_MM // 2, facing, turned)
     cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
     _, number = distinct_rows((slices, *cells))

@@ -125,10 +125,10 @@ class TimeBins:
     def lengths(self, starts: ArrayLike, stops: ArrayLike) -> Ints:
         """Returns the length (ns) of all half-open spans together in each piece."""
         start_times = np.asarray(starts, np.int64)
-        elapsed_until_edges = _summed_ages(self.edges, start_times) - _summed_ages(
-            self.edges, np.maximum(start_times, np.asarray(stops, np.int64))
-        )
-        return np.diff(elapsed_until_edges)
+        stop_times = np.maximum(start_times, np.asarray(stops, np.int64))
+        # Up to an edge, a span lasts as long as its start is before it, minus as its stop is.
+        until_edges = _summed_ages(self.edges, start_times) - _summed_ages(self.edges, stop_times)
+        return np.diff(until_edges)
 
 
 def _summed_ages(edges: Ints, times: Ints) -> Ints:

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
@@ -78,6 +79,26 @@ class _TopicBlock(NamedTuple):
 
     topic: str
     detected: Detected
+
+
+class _DetectionFilter(NamedTuple):
+    """Which detections count: those of wanted labels in a scope, from a least score on."""
+
+    is_wanted: Callable[[str], bool]
+    scope: Scope
+    least_score: float
+
+    def counting(self, detected: Detected) -> Flags:
+        """Returns which detections of some messages count."""
+        detections = detected.found
+        labels = detections.labels
+        is_wanted = np.array([self.is_wanted(label) for label in labels.words], np.bool_)
+        counts: Flags = is_wanted[labels.codes] & ~(detections.scores < self.least_score)
+        if self.scope.is_bounded:
+            # A scope reads what the other topics said from the newest message back.
+            holds = [self.scope.holds_at(time) for time in detected.log_times[::-1].tolist()]
+            counts &= np.array(holds[::-1], np.bool_)[detections.rows]
+        return counts
 
 
 class _SeenBlock(NamedTuple):
@@ -144,20 +165,7 @@ def count_labels(
     note_robots_on(view, topics, window)
     note_unread(view, asked, nothing=not rows, search=True)
     note_edges(view, asked)
-    if unknown := elapsed.among(scope.unknown):
-        view.notes.add(
-            f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "
-            "or without messages of the other topic"
-        )
-    texts = [topic for topic in topics if view.timeline.types_of(topic) == (_TEXT,)]
-    if texts and not rows:
-        view.notes.add(
-            f"{listed(texts)} has texts: by label counts those that are JSON, an object with a "
-            "label or a list of such, alone or in an object, and nothing deeper; leave by out to "
-            "search texts"
-        )
-    if len(rows) > _MOST_LABELS:
-        view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
+    _note_labels(view, topics, elapsed.among(scope.unknown), len(rows))
     start, end = shown_span(view.snapshot, asked)
     return Bins(
         by=BY_LABEL,
@@ -169,6 +177,24 @@ def count_labels(
         all=_row(seen.visible.intervals(), elapsed, seen.most_of_all),
         notes=view.notes.sentences(),
     )
+
+
+def _note_labels(view: View, topics: Sequence[str], unknown: Ns, labels: int) -> None:
+    """Notes why labels may be missing among the rows, of which there are so many."""
+    if unknown:
+        view.notes.add(
+            f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "
+            "or without messages of the other topic"
+        )
+    texts = [topic for topic in topics if view.timeline.types_of(topic) == (_TEXT,)]
+    if texts and not labels:
+        view.notes.add(
+            f"{listed(texts)} has texts: by label counts those that are JSON, an object with a "
+            "label or a list of such, alone or in an object, and nothing deeper; leave by out to "
+            "search texts"
+        )
+    if labels > _MOST_LABELS:
+        view.notes.add(f"the {_MOST_LABELS} of {labels} labels that were seen most often")
 
 
 def _label_rows(seen: SeenLabels, elapsed: Elapsed) -> list[tuple[str, _LabelRow]]:
@@ -212,8 +238,8 @@ def read_labels(
         QueryTimeoutError: the call's time runs out before any result.
     """
     least_score = condition.least_score if condition.min_score > 0 else -math.inf
-    newest_first = _seen_blocks(view, topics, scope, least_score, is_wanted)
-    seen_blocks, since = in_time(view, newest_first, READING_S)
+    detection_filter = _DetectionFilter(is_wanted, scope, least_score)
+    seen_blocks, since = in_time(view, _seen_blocks(view, topics, detection_filter), READING_S)
     parts: defaultdict[str, list[IntervalPart]] = defaultdict(list)
     most_at_once = Counter[str]()
     for block in seen_blocks:
@@ -228,24 +254,20 @@ def read_labels(
 
 
 def _seen_blocks(
-    view: View,
-    topics: Sequence[str],
-    scope: Scope,
-    least_score: float,
-    is_wanted: Callable[[str], bool],
+    view: View, topics: Sequence[str], detection_filter: _DetectionFilter
 ) -> Iterator[tuple[Ns, _SeenBlock]]:
     """Yields what was in view in each block, newest first, and a log time.
 
-    Blocks that follow hold nothing that is later than this time.
+    Nothing that is later than this time follows.
     """
-    for nth, window in enumerate(scope.narrowed()):
+    for nth, window in enumerate(detection_filter.scope.narrowed()):
         by_topic = (_topic_blocks(view, topic, window) for topic in topics)
         newest_first = heapq.merge(*by_topic, key=lambda block: -block.detected.log_times[-1])
         for topic, detected in newest_first:
-            seen = _seen_in_block(f"{nth} {topic}", detected, scope, least_score, is_wanted)
+            counts = detection_filter.counting(detected)
             # Blocks of different topics may overlap.
             reached = detected.log_times[0 if len(topics) == 1 else -1]
-            yield int(reached), seen
+            yield int(reached), _seen_in_block(f"{nth} {topic}", detected, counts)
 
 
 def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_TopicBlock]:
@@ -261,22 +283,10 @@ def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Topic
         view.notes.add_lack(f"messages of {topic} that could not be decoded: {left_out}")
 
 
-def _seen_in_block(
-    source: str,
-    detected: Detected,
-    scope: Scope,
-    least_score: float,
-    is_wanted: Callable[[str], bool],
-) -> _SeenBlock:
-    """Returns when wanted labels were in view in a block, by the detections that count."""
+def _seen_in_block(source: str, detected: Detected, counts: Flags) -> _SeenBlock:
+    """Returns when labels were in view in a block, by the detections that count."""
     times, detections = detected.log_times, detected.found
     labels = detections.labels.words
-    wanted = np.array([is_wanted(label) for label in labels], np.bool_)
-    counts = wanted[detections.labels.codes] & ~(detections.scores < least_score)
-    if scope.is_bounded:
-        # A scope reads what the other topics said from the newest message back.
-        holds = [scope.holds_at(time) for time in times[::-1].tolist()]
-        counts &= np.array(holds[::-1], np.bool_)[detections.rows]
     rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
     most_at_once = Counter[str]()
     pairs, sizes = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)

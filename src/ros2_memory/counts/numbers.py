@@ -24,7 +24,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, Un
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
-from ros2_memory.counts.values import count_values
+from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import note_no_fix, note_summarised
@@ -44,8 +44,7 @@ if TYPE_CHECKING:
 
 _LARGEST: Final = sys.float_info.max
 SUM_SCALE: Final = 2.0**-64
-"""Sums are scaled by this power of two: sums of the largest floats stay finite, and no digit is
-lost."""
+"""Sums are scaled by a power of two: the largest floats have a finite sum, and no digit is lost."""
 LEAST: Final = 1
 GREATEST: Final = -1
 """Numbers are multiplied by one of these signs, so that the greatest is found as a least one."""
@@ -178,7 +177,7 @@ class PieceNumbers:
         note_summarised(self._view, self._topic, self._fields, window)
 
     def parts(self, field: int, piece: int) -> Sequence[Part]:
-        """Returns the parts of a piece, in any order; `field` is an index into `fields`."""
+        """Returns the parts of a piece, in any order; `field` is an index of `fields`."""
         return self._parts.get((field, piece), ())
 
     def extreme(self, field: int, pieces: Iterable[int], sign: int) -> tuple[float, Ns] | None:
@@ -479,7 +478,7 @@ def _exact_least(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extreme:
 
 
 class _FieldCell(NamedTuple):
-    """The numbers of a field in a bin: its columns in the reply. Times are log times (ns)."""
+    """The numbers of a field in a bin; `min_at` and `max_at` are log times."""
 
     min: float
     min_at: Ns
@@ -488,11 +487,16 @@ class _FieldCell(NamedTuple):
     mean: float
 
 
-_CELL_KINDS: Final[tuple[BinColumn, ...]] = ("number", "time", "number", "time", "number")
-"""The kinds of the columns of `_FieldCell`."""
+_CELL_COLUMNS: Final[dict[str, BinColumn]] = {
+    "min": "number",
+    "min_at": "time",
+    "max": "number",
+    "max_at": "time",
+    "mean": "number",
+}
+"""The columns of a field in the reply, which are the attributes of `_FieldCell`."""
 _MEAN_DIGITS: Final = 12
-"""So many digits do not depend on how a window is cut into bags: rounding of sums does not reach
-them."""
+"""So many digits are the same however a window is cut into bags: rounding does not reach them."""
 
 
 def count_range(
@@ -539,9 +543,9 @@ def count_range(
             _require_field(view, name, field, binned.counted.stop)
             view.notes.add(f"{field} holds no number in the window")
             continue
-        for nth, (column, kind) in enumerate(zip(_FieldCell._fields, _CELL_KINDS, strict=True)):
-            values = [None if cell is None else cell[nth] for cell in cells]
-            binned.add(f"{field}.{column}", kind, values, window_cell[nth])
+        for column, kind in _CELL_COLUMNS.items():
+            values = [None if cell is None else getattr(cell, column) for cell in cells]
+            binned.add(f"{field}.{column}", kind, values, getattr(window_cell, column))
     note_robots(view, name, binned.counted)
     return binned.answer()
 

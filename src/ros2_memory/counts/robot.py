@@ -155,21 +155,23 @@ def count_visits(
         _add_visits(binned, stays)
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)
-    stays_of_places = [
-        (place, _stays(view, place.frame_id, place.region, window))
+    # Two places may have one name.
+    named_stays = [
+        (place.name, _stays(view, place.frame_id, place.region, window))
         for place, _ in places_in(view, named, placement, window)
     ]
     if by == "place":
-        _add_visits_by_place(binned, [stays for _, stays in stays_of_places])
+        _add_visits_by_place(binned, [stays for _, stays in named_stays])
         return binned.answer()
-    if len(stays_of_places) * len(binned.bins.names) > MOST_CELLS:
+    bins = len(binned.bins.names)
+    if len(named_stays) * bins > MOST_CELLS:
         raise InvalidArgumentsError(
-            f"{len(stays_of_places)} places by {by} in {len(binned.bins.names)} bins are too many "
-            "for one reply: name one in where, or ask about a shorter window"
+            f"{len(named_stays)} places by {by} in {bins} bins are too many for one reply: name "
+            "one in where, or ask about a shorter window"
         )
-    for named_place, stays in stays_of_places:
-        binned.add_counts(f"{named_place.name}.entries", _entry_times(stays))
-        binned.add_lengths(f"{named_place.name}.minutes", "minutes", _stay_spans(stays))
+    for name, stays in named_stays:
+        binned.add_counts(f"{name}.entries", _entry_times(stays))
+        binned.add_lengths(f"{name}.minutes", "minutes", _stay_spans(stays))
     return binned.answer()
 
 

@@ -103,9 +103,9 @@ def visits(
         return _visits_of_places(view, window, placement, mixed, now)
     confirmed = ConfirmedStays(view, placement.frame_id, place.region, window)
     newest = _newest_pose_time(view, topic, confirmed.known.track, window, now + FUTURE_NS)
-    current = newest if newest is not None and newest >= _oldest_current(view, now) else None
+    is_current = newest is not None and newest >= _oldest_current(view, now)
     shown = tuple(
-        _at_asked_bounds(confirmed.shown(visit, current), window)
+        _at_asked_bounds(confirmed.shown(visit, newest if is_current else None), window)
         for visit in confirmed.visits[:limit]
     )
     if not placement.is_map:
@@ -129,7 +129,7 @@ def visits(
         all_counted=confirmed.known.since is None,
         where=place.name,
         unknown=_unknown(view, window, [confirmed.known.track], mixed),
-        is_current=current is not None,
+        is_current=is_current,
         notes=view.notes.sentences(),
     )
 

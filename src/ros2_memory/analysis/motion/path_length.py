@@ -201,6 +201,7 @@ def measure(seconds: Floats, positions: Vectors) -> Measured:
         lengths, as_plain = plain, ~stationary
     averaged = min(2 * _MEAN_SPAN + 1, len(points))
     reach = _LEFT * math.sqrt(2 / averaged) * row_maxima(noise)
+    # Creeps replace the steps in them. Those at the ends are counted once the path is joined.
     moved, steps, inside_m = lengths.copy(), lengths.copy(), 0.0
     first_creep = last_creep = None
     for begin, end in _runs(stationary):
