@@ -202,7 +202,7 @@ class _StateLog:
 
     def add(self, states: Iterable[KnownState], changes: Iterable[Change] = ()) -> None:
         """Adds the states of what comes next, and the changes within it."""
-        added = [*changes]
+        between: list[Change] = []
         for state in states:
             key = state.kind, state.name
             before = self._states.get(key)
@@ -211,8 +211,8 @@ class _StateLog:
                 continue
             self._states[key] = before._replace(last=state.last)
             if before.last != state.first:
-                added.append(Change(*key, state.at, state.first, state.text))
-        self.changes += sorted(added, key=lambda change: change.time)
+                between.append(Change(*key, state.at, state.first, state.text))
+        self.changes += sorted([*between, *changes], key=lambda change: change.time)
 
     def limit(self, at_most: int) -> None:
         """Leaves out states that were added after the first `at_most`."""
