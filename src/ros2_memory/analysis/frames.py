@@ -426,29 +426,32 @@ class FrameTree:
 
     def _no_path_at(self, name: str, time: Ns) -> NoDataError:
         """Returns the error for two known frames without a transform between them at a time."""
-        pair = f"frames '{self.target}' and '{name}'"
-        if self.reaches(name):
-            link_error = self._link_error(name, self.target, time)
-            link_error = link_error or self._link_error(self.target, name, time)
-            if link_error is not None:
-                return link_error
-            at = np.array(time, np.int64)
-            # In a loop, the last frame of a chain is the one before the loop closes.
-            target_root, root = ([*self._chain(frame, at)][-1] for frame in (self.target, name))
-            detail = (
-                f"{pair} were not connected at {_unix(time)}, because the tree changes or contains"
-                f" a loop; then their roots were '{target_root}' and '{root}'; ask about another"
-                " time"
-            )
-        else:
-            target_root, root = ([*self._newest_chain(frame)][-1] for frame in (self.target, name))
-            others = sorted(connected_with(name, self._pairs) - {name})
-            detail = (
-                f"{pair} are not connected: '{self.target}' is in the tree of '{target_root}',"
-                f" '{name}' in that of '{root}', and no recorded transform joins them; connected"
-                f" to '{name}': {listed(others, at_most=_MAX_NAMES)}"
-            )
-        return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
+        if not self.reaches(name):
+            return self._never_connected(name)
+        link_error = self._link_error(name, self.target, time)
+        link_error = link_error or self._link_error(self.target, name, time)
+        if link_error is not None:
+            return link_error
+        at = np.array(time, np.int64)
+        # In a loop, the last frame of a chain is the one before the loop closes.
+        target_root, root = ([*self._chain(frame, at)][-1] for frame in (self.target, name))
+        return NoDataError(
+            NoDataReason.FRAMES_NOT_CONNECTED,
+            f"frames '{self.target}' and '{name}' were not connected at {_unix(time)}, because the"
+            f" tree changes or contains a loop; then their roots were '{target_root}' and '{root}';"
+            " ask about another time",
+        )
+
+    def _never_connected(self, name: str) -> NoDataError:
+        """Returns the error for two known frames that are in different trees at all times."""
+        target_root, root = ([*self._newest_chain(frame)][-1] for frame in (self.target, name))
+        others = sorted(connected_with(name, self._pairs) - {name})
+        return NoDataError(
+            NoDataReason.FRAMES_NOT_CONNECTED,
+            f"frames '{self.target}' and '{name}' are not connected: '{self.target}' is in the tree"
+            f" of '{target_root}', '{name}' in that of '{root}', and no recorded transform joins"
+            f" them; connected to '{name}': {listed(others, at_most=_MAX_NAMES)}",
+        )
 
     def _link_error(self, frame: str, other: str, time: Ns) -> NoDataError | None:
         """Returns the error of the first link that has no transform at a time, if there is one.

@@ -226,17 +226,17 @@ def _boolean_held(
     if spans is None:
         return None
     _note_uncounted(view, topic, parts)
-    counted: list[_HeldSpan] = []
+    in_scope: list[_HeldSpan] = []
     try:
         # A scope reads what the other topics said from the newest message back.
         for start, stop, is_begun in reversed(spans):
             for first, last in scope.parts_of(start, stop):
-                counted.append(_HeldSpan(first, last, is_begun and first == start))
+                in_scope.append(_HeldSpan(first, last, is_begun and first == start))
     except QueryTimeoutError:
-        if not counted:
+        if not in_scope:
             raise
-        since = min(span.start for span in counted)
-    return _HeldTimes(held_spans(sorted(counted)), since)
+        since = min(span.start for span in in_scope)
+    return _HeldTimes(held_spans(sorted(in_scope)), since)
 
 
 def _has_lists(view: View, topic: str) -> bool:
@@ -391,14 +391,15 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     view = binned.view
     if view.limits.latching.is_latched(view.snapshot, topic):
         return binned.gaps
-    # A bag that has the topic before and after a gap does not prolong it.
     firsts, lasts = binned.bounds([topic])
     order = np.argsort(lasts)
-    earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
     begins, ends = np.array(binned.gaps, np.int64).reshape(-1, 2).T
+    # The topic is heard again in the bags that end after the gap. If one of them begins before the
+    # gap, or if there are none, the gap is not prolonged.
     following = np.searchsorted(lasts[order], ends)
-    heard = np.append(earliest, MIN_NS)[following].clip(ends)
-    return [*zip(begins.tolist(), heard.tolist(), strict=True)]
+    earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
+    heard_again = np.append(earliest, MIN_NS)[following].clip(ends)
+    return [*zip(begins.tolist(), heard_again.tolist(), strict=True)]
 
 
 def _without_gaps(span: _HeldSpan, gaps: Sequence[Span]) -> list[_HeldSpan]:

@@ -193,6 +193,7 @@ class PieceNumbers:
         )
         least = _NO_NUMBER
         for extreme in candidates:
+            # Candidates ascend by their lower bounds: no later one can be less.
             if extreme.low > least.low:
                 break
             if extreme.low < least.low or extreme.first < least.first:

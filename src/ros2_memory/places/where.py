@@ -99,14 +99,13 @@ class Where:
     @property
     def shown(self) -> JsonValue:
         """The argument as a reply repeats it: the name of the place, or its bounds (m)."""
-        match self.region:
-            case _ if self.name is not None:
-                return self.name
-            case Circle(x, y, radius_m):
-                return {"x": x, "y": y, "radius_m": radius_m}
-            case region:
-                min_x, max_x, min_y, max_y = region.bounds
-                return {"x": [min_x, max_x], "y": [min_y, max_y]}
+        region = self.region
+        if self.name is not None:
+            return self.name
+        if isinstance(region, Circle):
+            return {"x": region.x, "y": region.y, "radius_m": region.radius_m}
+        min_x, max_x, min_y, max_y = region.bounds
+        return {"x": [min_x, max_x], "y": [min_y, max_y]}
 
 
 def parse_where(

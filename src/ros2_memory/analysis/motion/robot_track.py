@@ -242,6 +242,7 @@ def joined_tracks(
     order = np.lexsort((whole.times, numbers))
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.vertices(order), numbers[order]
+    # In the middle of a table, headings are continuous already.
     is_continuous = whole.settled & ~_is_new(numbers)
     is_continuous[1:] &= whole.settled[:-1]
     whole = whole._replace(turns=_continuous(whole.turns, is_continuous))
