@@ -391,7 +391,7 @@ class FrameTree:
         return chain
 
     def _split_by_parent(self, times: Times, frames: Iterable[str]) -> list[Mask]:
-        """Returns masks of times, in each of which the first frame with several parents has one.
+        """Splits times so that the first frame with several parents has one parent in each mask.
 
         Empty if no frame has several.
         """

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = NDArray[np.float64]
 _Sums: TypeAlias = tuple[int, int, int]
-"""Of a spot: the number of its detections, and the sums of x and of y (mm)."""
+"""The number of detections in a spot, and the sums of their x and y (mm)."""
 
 CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100
@@ -457,7 +457,7 @@ def _thousandths(scores: Floats) -> Ints:
 
 
 def bin_of(thousandths: Ints) -> Ints:
-    """Returns the bin of each score; -1 where there is no score."""
+    """Returns the bin of each score (thousandths); -1 for a negative one, which stands for none."""
     return np.minimum(thousandths * SCORE_BINS // 1000, SCORE_BINS - 1)
 
 

@@ -180,7 +180,7 @@ def count_labels(
 
 
 def _note_labels(view: View, topics: Sequence[str], unknown: Ns, labels: int) -> None:
-    """Notes why labels may be missing among the rows, of which there are so many."""
+    """Notes why labels may be missing; `unknown` is in ns, `labels` is the number of all rows."""
     if unknown:
         view.notes.add(
             f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "

@@ -108,8 +108,8 @@ def newest_pose(
 def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Path | None:
     """Returns the recording of a topic around a log time; `own` if it is one, or if there is none.
 
-    Of several it is the shortest: one that began with an unset clock spans years. Whole recordings
-    are compared, since their bags depend on how they were split.
+    The shortest one is chosen: a recording that began with an unset clock spans years. Whole
+    recordings are compared, since their bags depend on how they were split.
     """
     spans = view.timeline.recordings(topic)
     around = {path: last - first for path, (first, last) in spans.items() if first <= at <= last}
@@ -316,8 +316,8 @@ def known_placement(view: View) -> MapPlacement | None:
 def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
     """Returns whether all poses in some windows are of one run of odometry.
 
-    They are if they are of one session, or of several of which each overlaps the ones before and
-    repeats them, as a copy does.
+    Poses of one session are. So are poses of several sessions, if each overlaps the sessions before
+    it and repeats them, as a copy does.
     """
     asked = tuple(windows)
     spans = sorted(

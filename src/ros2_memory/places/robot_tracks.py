@@ -481,10 +481,11 @@ class _JoinedRecordings(NamedTuple):
 def _joined_recordings(
     tracks: Sequence[PartialTrack], apart: Collection[str] | None
 ) -> _JoinedRecordings:
-    """Joins the tracks of recordings; where two overlap, the one that began first counts.
+    """Joins the tracks of recordings. Where two overlap, the one that began first counts.
 
-    If both began at one time, the first by name counts. The other one repeats it and is left out
-    there; if both are among the recordings `apart` (None: any may be), it is of another robot.
+    If both began at the same time, the first by name counts. The overlap of the other one is left
+    out as a repetition, unless both are among the recordings `apart`, which are of several robots
+    (None: any may be).
     """
     by_recording: dict[str, list[PartialTrack]] = defaultdict(list)
     for track in tracks[::-1]:

@@ -148,7 +148,7 @@ def placed_standstills(
 ) -> Iterator[PlacedStandstill]:
     """Yields standstills with their places on the track; only those in a region, if it is given.
 
-    Standstills of which the track has no sample are left out.
+    Standstills outside of the track's pieces are left out.
     """
     ends = np.array([*spans], np.int64).reshape(-1, 2)
     if not len(track.times) or not len(ends):

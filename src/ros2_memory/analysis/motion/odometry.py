@@ -161,7 +161,7 @@ class Leg(NamedTuple):
         sum_m: the sum of the distances between its poses.
         head: how it begins.
         tail: how it ends.
-        still: whether one creep, that of the head and of the tail, is the whole leg.
+        still: whether the whole leg is one creep, which the head and the tail share.
         near_first: the motion near its first pose.
         near_last: the motion near its last pose.
     """

@@ -160,7 +160,7 @@ class Measured(NamedTuple):
         sum_m: the sum of the distances between its positions.
         head: how it begins.
         tail: how it ends.
-        still: whether it is one creep from end to end: that of the head and of the tail.
+        still: whether the whole path is one creep, which the head and the tail share.
         speed_mps: the highest speed over a second and eight steps; None for too few positions.
         steps_m: the length of each step; they add up to `length_m` and the creeps at the ends.
     """
