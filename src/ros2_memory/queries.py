@@ -105,7 +105,13 @@ from ros2_memory.insights.status import (
     undecodable_types,
 )
 from ros2_memory.places.driven_inside import farthest_from
-from ros2_memory.places.pose_frames import axes_of, note_runs, placed, placed_waypoints, with_place
+from ros2_memory.places.pose_frames import (
+    axes_of,
+    note_runs,
+    placed_waypoints,
+    pose_in_map,
+    with_place,
+)
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
@@ -256,7 +262,7 @@ def _place_pose(view: View, stored: StoredMessage, pose: Pose, frame_id: str | N
     if is_thinned(stored.bag.file):
         _note_reach(view, stored, pose)
     if frame_id is not None:
-        pose = placed(view, pose, stored.time, recording, frame_id)
+        pose = pose_in_map(view, pose, stored.time, recording, frame_id)
     view.notes.add(*axes_of(pose.frame_id))
     if view.limits.places:
         pose = with_place(view, pose, stored.time, recording)

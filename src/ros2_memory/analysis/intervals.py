@@ -245,7 +245,7 @@ def join_parts(parts: Sequence[IntervalPart]) -> IntervalPart:
     return IntervalPart(parts[0].first, parts[-1].last, visible)
 
 
-def united(tables: Sequence[IntervalTable]) -> IntervalTable:
+def united_tables(tables: Sequence[IntervalTable]) -> IntervalTable:
     """Returns when objects were visible on any of several topics, by a table of each topic."""
     return _merge_tables(tables, np.zeros(len(tables), np.bool_))
 

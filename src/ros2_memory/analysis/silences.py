@@ -89,7 +89,7 @@ class Silence(NamedTuple):
         return Silence(self.topic, first, last, min(self.length, last - first), goes_on)
 
 
-def joined(parts: Sequence[Pacing]) -> Pacing:
+def joined_pacings(parts: Sequence[Pacing]) -> Pacing:
     """Returns the pacing of a topic in several parts of a memory together."""
     spacings: dict[int, Spacing] = {}
     for part in parts:
@@ -150,7 +150,7 @@ def silences(
     for topic, period in periods.items():
         others = frozenset(companions.get(topic, ()))
         if others not in robot_on:
-            robot_on[others] = heard([runs_of[other] for other in sorted(others)])
+            robot_on[others] = robot_on_times([runs_of[other] for other in sorted(others)])
         limit = shortest_silence(period)
         runs = united(runs_of[topic], limit)
         all_silences = _silences_of(topic, runs, robot_on[others], limit, gaps)
@@ -158,7 +158,7 @@ def silences(
     return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
-def heard(runs_of_topics: Sequence[Sequence[Span]]) -> list[Span]:
+def robot_on_times(runs_of_topics: Sequence[Sequence[Span]]) -> list[Span]:
     """Returns the spans in which one in `_HEARD_ONE_IN` of the topics is heard.
 
     One topic, the silent one, is not counted among them.
@@ -180,7 +180,7 @@ def heard(runs_of_topics: Sequence[Sequence[Span]]) -> list[Span]:
     return united(spans, SHORTEST_NS)
 
 
-def prolonged(
+def prolonged_silence(
     silence: Silence, robot_on: Sequence[Span], runs: Sequence[Span], gaps: Sequence[Span]
 ) -> Silence:
     """Returns a silence of deleted bags, with what later bags show of it.

@@ -21,11 +21,11 @@ from ros2_memory.analysis.intervals import (
     IntervalTable,
     VisibleInterval,
     join_parts,
-    united,
+    united_tables,
     visible_in,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.spans import united as united_spans
+from ros2_memory.core.spans import united
 from ros2_memory.core.text import listed, named
 from ros2_memory.counts.bins import HELD_COLUMNS
 from ros2_memory.history.clock_steps import elapsed_in
@@ -211,7 +211,7 @@ def _label_rows(seen: SeenLabels, elapsed: Elapsed) -> list[tuple[str, _LabelRow
 
 def _row(intervals: Sequence[VisibleInterval], elapsed: Elapsed, most_at_once: int) -> _LabelRow:
     """Returns the row of intervals. Time in which several overlap counts once."""
-    spans = united_spans((interval.first, interval.last) for interval in intervals)
+    spans = united((interval.first, interval.last) for interval in intervals)
     scores = [interval.best for interval in intervals if interval.best is not None]
     return _LabelRow(
         len(intervals),
@@ -246,7 +246,7 @@ def read_labels(
         parts[block.source].append(block.visible)
         most_at_once |= block.most_at_once
     return SeenLabels(
-        united([join_parts(newest_first[::-1]).visible for newest_first in parts.values()]),
+        united_tables([join_parts(newest_first[::-1]).visible for newest_first in parts.values()]),
         most_at_once,
         max((block.most_of_all for block in seen_blocks), default=0),
         since,

@@ -27,10 +27,10 @@ from ros2_memory.analysis.silences import (
     SHORTEST_NS,
     Pacing,
     Silence,
-    heard,
-    joined,
+    joined_pacings,
     length_in,
-    prolonged,
+    prolonged_silence,
+    robot_on_times,
     shortest_silence,
     silences,
     usual_periods,
@@ -149,7 +149,7 @@ class Snapshot:
                 by_topic.setdefault(topic, []).append(pacing)
         is_log = self.timeline.is_log
         return usual_periods(
-            {topic: joined(parts) for topic, parts in by_topic.items() if not is_log(topic)}
+            {topic: joined_pacings(parts) for topic, parts in by_topic.items() if not is_log(topic)}
         )
 
     @cached_property
@@ -173,12 +173,14 @@ class Snapshot:
         """Returns a silence that deleted bags showed, as it went on in later ones."""
         if not silence.goes_on:
             return silence
-        return prolonged(silence, self._robot_on, self._runs.get(silence.topic, ()), self.gaps)
+        return prolonged_silence(
+            silence, self._robot_on, self._runs.get(silence.topic, ()), self.gaps
+        )
 
     @cached_property
     def _robot_on(self) -> Sequence[Span]:
         """When the robot was on, by all topics that have a usual rate."""
-        return heard([self._runs[topic] for topic in self._periods])
+        return robot_on_times([self._runs[topic] for topic in self._periods])
 
     def shortest_silence(self, topic: str) -> Ns:
         """Returns how long a topic must have no message to count as silent."""

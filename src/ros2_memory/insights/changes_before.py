@@ -46,7 +46,7 @@ from ros2_memory.insights.topic_events import (
     note_left_out,
     toggle_sentence,
 )
-from ros2_memory.places.pose_frames import newest_pose, placed, with_place
+from ros2_memory.places.pose_frames import newest_pose, pose_in_map, with_place
 from ros2_memory.results import Before, PastChange
 
 if TYPE_CHECKING:
@@ -424,7 +424,7 @@ def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | No
     if pose is None:
         return None, speed_mps
     recording = message.bag.recording
-    placed_pose = placed(view, pose, message.time, recording, frame_id)
+    placed_pose = pose_in_map(view, pose, message.time, recording, frame_id)
     return with_place(view, placed_pose, message.time, recording), speed_mps
 
 

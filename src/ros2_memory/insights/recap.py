@@ -15,7 +15,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import FLAG, has_events
-from ros2_memory.analysis.intervals import IntervalTable, united
+from ros2_memory.analysis.intervals import IntervalTable, united_tables
 from ros2_memory.analysis.motion.standstills import SHORTEST_NS
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
@@ -396,7 +396,7 @@ def _things_in_view(
         view.notes.add(
             f"{counted(below, 'sighting')} left out: no score in it reaches min_score {min_score:g}"
         )
-    things = united(tables)
+    things = united_tables(tables)
     if region_stays is None:
         things = things.without(throughout)
     else:

@@ -26,7 +26,7 @@ from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_M,
     RobotTrack,
-    cut,
+    cut_track,
     empty_track,
     place_at,
 )
@@ -204,7 +204,7 @@ class RowMaker:
         if places is None:
             return []
         tracks = [
-            (frame, cut(self._track(frame, around, window), window))
+            (frame, cut_track(self._track(frame, around, window), window))
             for frame in dict.fromkeys((places.map_frame, places.pose_frame))
         ]
         return [(frame, track) for frame, track in tracks if len(track.times)]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, jumps
+from ros2_memory.analysis.motion.robot_track import RobotTrack, cut_track, jumps
 from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
     Line,
@@ -311,7 +311,7 @@ def _vertices_during(track: RobotTrack, spans: Sequence[Span]) -> tuple[Times, F
     """
     points = []
     for first, last in spans:
-        part = cut(track, TimeWindow(first, last + 1))
+        part = cut_track(track, TimeWindow(first, last + 1))
         jumped = jumps(part)
         on_way = ~(jumped & np.roll(jumped, 1))
         points.append((part.times[on_way], part.x[on_way], part.y[on_way]))

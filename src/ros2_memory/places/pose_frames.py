@@ -132,12 +132,14 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     stored, pose = newest_pose(view, topic, window, recording) or (None, None)
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
-    in_frame = placed(view, pose, stored.time, stored.bag.recording, frame_id)
+    in_frame = pose_in_map(view, pose, stored.time, stored.bag.recording, frame_id)
     view.notes.add(*axes_of(in_frame.frame_id))
     return with_place(view, in_frame, stored.time, stored.bag.recording)
 
 
-def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None = None) -> Pose:
+def pose_in_map(
+    view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None = None
+) -> Pose:
     """Returns a pose in `frame_id`; without one, in the map if transforms lead there, else as is.
 
     Raises:

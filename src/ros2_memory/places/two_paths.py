@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, jumps
+from ros2_memory.analysis.motion.robot_track import RobotTrack, cut_track, jumps
 from ros2_memory.core.arrays import Flags, Groups, Ints, distinct_rows
 from ros2_memory.core.regions import Region, Steps
 from ros2_memory.core.timebase import Ns, Span, unix_from_ns
@@ -74,7 +74,7 @@ def _steps(track: RobotTrack, window: TimeWindow) -> _TrackSteps:
 
     Jumps are no steps, and a vertex that the robot jumped to and from is left out.
     """
-    part = cut(track, window)
+    part = cut_track(track, window)
     jumped = jumps(part)
     ends = part.ends | jumped
     # The last vertex is an end, and not jumped from: it may stand before the first one.

@@ -10,7 +10,7 @@ from ros2_memory.analysis.intervals import (
     SILENCE_NS,
     IntervalPart,
     VisibleInterval,
-    united,
+    united_tables,
     visible_in,
 )
 from ros2_memory.core.timebase import NS_PER_S
@@ -93,7 +93,7 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
     topics: list[Messages],
 ) -> None:
     each = [watched(messages).visible for messages in topics]
-    together = united(each)
+    together = united_tables(each)
     spans = [one for seen in each for one in seen.intervals()]
     for interval in together.intervals():
         mine = [

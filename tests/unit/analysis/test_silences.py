@@ -11,7 +11,7 @@ from ros2_memory.analysis.silences import (
     Pacing,
     Silence,
     Spacing,
-    joined,
+    joined_pacings,
     silences,
     usual_periods,
 )
@@ -44,7 +44,7 @@ def found(odom: Activity, seen: Activity) -> list[Silence]:
 
 def all_of(parts: Sequence[Activity]) -> Activity:
     runs = united((run for part in parts for run in part.runs), SHORTEST_NS)
-    return Activity(runs, joined([part.pacing for part in parts]))
+    return Activity(runs, joined_pacings([part.pacing for part in parts]))
 
 
 DAY = (0, 9 * HOUR)

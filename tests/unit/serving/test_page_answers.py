@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
-from ros2_memory.analysis.motion.robot_track import cut, track_of
+from ros2_memory.analysis.motion.robot_track import cut_track, track_of
 from ros2_memory.cli.plot import recorded_part
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -222,7 +222,7 @@ def test_a_track_that_is_cut_is_where_the_whole_one_is(
     times, x, y = columns(steps)
     track = track_of(times, x, y, np.zeros(len(times)))
     window = TimeWindow(BEGIN + start * S, BEGIN + (start + length) * S)
-    found = cut(track, window)
+    found = cut_track(track, window)
     assert np.all((found.times >= window.start) & (found.times < window.stop))
     assert np.all(np.diff(found.times) > 0)
     inside = (track.times >= window.start) & (track.times < window.stop)

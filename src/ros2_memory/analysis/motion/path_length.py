@@ -101,7 +101,7 @@ class Creep(NamedTuple):
         """Length from the first place to the last."""
         return 0.0 if self.second is None else math.dist(self.start, self.second) + self.middle_m
 
-    def to(self, place: Vector3) -> Creep:
+    def with_place(self, place: Vector3) -> Creep:
         """Returns the creep with one more place, if that is out of reach of the last one."""
         step = math.dist(self.end, place)
         if step <= self.reach_m:
@@ -113,7 +113,7 @@ class Creep(NamedTuple):
     def joined(self, later: Creep) -> Creep:
         """Returns this creep continued by a later one."""
         reach_m = max(self.reach_m, later.reach_m)
-        whole = self._replace(reach_m=reach_m).to(later.start)
+        whole = self._replace(reach_m=reach_m).with_place(later.start)
         if later.second is None:
             return whole
         step = math.dist(whole.end, later.second)

@@ -154,7 +154,7 @@ def empty_track() -> RobotTrack:
     return track_by(*joined_tracks([]))
 
 
-def thinned(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
+def slot_ends(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
     """Returns the indices of the first and the last pose in each slot; of equal times the first.
 
     Poses are in order of time or, with the numbers of their recordings, of recordings and then of
@@ -186,7 +186,7 @@ def partial_track(
     Poses with NaN or a coordinate beyond `_MAX_M` are no place, and dropped.
     """
     rows = np.flatnonzero((np.abs(x) < _MAX_M) & (np.abs(y) < _MAX_M))
-    rows = rows[thinned(times[rows])]
+    rows = rows[slot_ends(times[rows])]
     times, heading = times[rows], heading[rows]
     x, y = (np.rint(column[rows] * _PER_M) / _PER_M for column in (x, y))
     known = np.isfinite(heading)
@@ -240,7 +240,7 @@ def joined_tracks(
     whole = PartialTrack._make((*columns, 0, ""))
     numbers = np.repeat(np.arange(len(recordings)), sizes)
     order = np.lexsort((whole.times, numbers))
-    order = order[thinned(whole.times[order], numbers[order])]
+    order = order[slot_ends(whole.times[order], numbers[order])]
     whole, numbers = whole.vertices(order), numbers[order]
     # In the middle of a table, headings are continuous already.
     is_continuous = whole.settled & ~_is_new(numbers)
@@ -327,7 +327,7 @@ def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, 
     return float(x), float(y)
 
 
-def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
+def cut_track(track: RobotTrack, window: TimeWindow) -> RobotTrack:
     """Returns a track in a window, with a vertex at each end of the window that it crosses.
 
     A vertex at the start of the window does not begin a piece.

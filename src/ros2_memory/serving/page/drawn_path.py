@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, RobotTrack, cut
+from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, RobotTrack, cut_track
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.model import TimeWindow
@@ -113,7 +113,7 @@ def robot_path(view: View, window: TimeWindow) -> RobotPath | None:
     reader = TrackReader(view, places.map_frame)
     # With what was just before, to know whether the path goes on from there.
     known = reader.track_in(TimeWindow(window.start - SILENCE_NS, window.stop))
-    return RobotPath(places.map_frame, cut(known.track, window), known.since is None, reader)
+    return RobotPath(places.map_frame, cut_track(known.track, window), known.since is None, reader)
 
 
 def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> JsonObject:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.intervals import united
+from ros2_memory.analysis.intervals import united_tables
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -63,7 +63,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
         in_view = [visible.scoring(least) for visible in in_view]
     rows = [
         _label(label, first, last, window)
-        for label, (first, last) in united(in_view).spans().items()
+        for label, (first, last) in united_tables(in_view).spans().items()
         if len(first)
     ]
     rows.sort(key=lambda row: (-float(str(row["seconds"])), str(row["label"])))

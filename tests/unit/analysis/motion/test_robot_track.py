@@ -17,7 +17,7 @@ from ros2_memory.analysis.motion.robot_track import (
     joined_tracks,
     partial_track,
     settled_tracks,
-    thinned,
+    slot_ends,
     track_by,
     track_of,
 )
@@ -88,7 +88,7 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
     def part(begin: int, end: int) -> PartialTrack:
         some = [column[begin:end] for column in columns]
         if thins:
-            index = thinned(some[0])
+            index = slot_ends(some[0])
             some = [column[index] for column in some]
         times, x, y, heading = some
         return partial_track(times, x, y, heading)
