@@ -192,6 +192,7 @@ def _log_entry(value: JsonValue) -> Iterator[Fact]:
 
 
 def _diagnostics(value: JsonValue) -> Iterator[Fact]:
+    """Yields the level of each status in a `DiagnosticArray`, and its message if it is an error."""
     for status in _entries(value, "status"):
         name, level, message = status.get("name"), status.get("level"), status.get("message")
         if not isinstance(level, int):
@@ -211,6 +212,7 @@ def _error(*parts: JsonValue) -> Word:
 
 
 def _goals(value: JsonValue) -> Iterator[Fact]:
+    """Yields the status of each goal in a `GoalStatusArray`, by the goal's id."""
     for goal in _entries(value, "status_list"):
         status, info = goal.get("status"), goal.get("goal_info")
         goal_id = info.get("goal_id") if isinstance(info, dict) else None

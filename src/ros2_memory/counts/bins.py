@@ -457,7 +457,10 @@ class BinnedWindow:
         `days` has the local day of each piece.
         """
         edges = self.bins.edges.tolist()
-        recorded_days, cut_days = set(), set(days[:1] if self._is_first_day_cut() else ())
+        recorded_days: set[int] = set()
+        cut_days: set[int] = set()
+        if self._is_first_day_cut():
+            cut_days.add(days[0])
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
             if length_in(self.gaps, start, stop) < stop - start:
                 recorded_days.add(day)

@@ -196,6 +196,7 @@ def _placed_waypoint(
     recording = recording_at(view, topic, waypoint.time)
     if recording is None:
         return None
+    # A quaternion of the yaw about z; of NaN without one, so that the transform places the rest.
     half = math.nan if waypoint.yaw_rad is None else waypoint.yaw_rad / 2
     pose = Pose(waypoint.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
     for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):

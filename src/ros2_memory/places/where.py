@@ -295,14 +295,7 @@ class Scope:
         self.since: Ns | None = None
         self._inside: Spans | None = None
         if where is not None:
-            place = parse_where(view.limits, where)
-            known_track = known_track_for(view, place, window)
-            self.since = known_track.since
-            inside = known_track.inside(place.region, window)
-            self._inside = united((stay.start, stay.stop + 1) for stay in inside)
-            mixed = note_robots(view, resolve_path_topic(view), window)
-            known = placed_times(known_track.track, mixed)
-            self.unknown = unknown_times(view, window, known, WHEREABOUTS, mixed=mixed)
+            self._limit_to_place(parse_where(view.limits, where))
         self._states = [_ConditionStates(view, condition) for condition in during]
         for state, condition in zip(self._states, during, strict=True):
             state.search.require_met(window.stop)
@@ -312,6 +305,16 @@ class Scope:
             said = f"what {condition.topic} said"
             unknown = unknown_times(view, window, known, said, mixed=mixed)
             self.unknown = united([*self.unknown, *unknown])
+
+    def _limit_to_place(self, place: Where) -> None:
+        view, window = self._view, self.window
+        known_track = known_track_for(view, place, window)
+        self.since = known_track.since
+        inside = known_track.inside(place.region, window)
+        self._inside = united((stay.start, stay.stop + 1) for stay in inside)
+        mixed = note_robots(view, resolve_path_topic(view), window)
+        known = placed_times(known_track.track, mixed)
+        self.unknown = unknown_times(view, window, known, WHEREABOUTS, mixed=mixed)
 
     @property
     def compared_frames(self) -> tuple[str, ...]:
