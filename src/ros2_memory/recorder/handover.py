@@ -27,9 +27,8 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from itertools import groupby, islice
-from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from itertools import islice
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.handover_file import (
     LOG_CLOCK_NOTE,
@@ -55,7 +54,7 @@ from ros2_memory.recorder.policies import ClockReading, set_back
 from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
@@ -84,20 +83,20 @@ MOST_LISTED: Final = 10_000
 _log = get_logger(__name__)
 
 
-def pending(old_name: str) -> Handover:
-    """Returns the new sidecar as soon as its directory exists: until the cut it does not count."""
+def pending_sidecar(old_name: str) -> Handover:
+    """Returns the sidecar of a recording that has begun to take over; it does not count yet."""
     return Handover(state=Counting.PENDING, previous=old_name)
 
 
-def void(old_name: str) -> Handover:
-    """Returns the sidecar of a new recording that did not take over: the old one went on."""
+def void_sidecar(old_name: str) -> Handover:
+    """Returns the sidecar of a recording that did not take over: the old one went on."""
     return Handover(state=Counting.VOID, previous=old_name, compared=False)
 
 
-def intended(old: Handover, new_name: str | None) -> Handover:
-    """Returns the old sidecar before the new recording is started, as a crash may come any time.
+def announcing_sidecar(old: Handover, new_name: str | None) -> Handover:
+    """Returns the old sidecar with the name of the recording that is about to take over.
 
-    None in place of its name withdraws it: the new recording did not take over.
+    None withdraws the name: the new recording did not take over.
     """
     return replace(old, next=new_name, counts_until=None, end=None)
 
@@ -115,27 +114,28 @@ def complete_sidecars(
     simulated: bool,
     clock: CutClock,
 ) -> tuple[Handover, Handover]:
-    """Returns the sidecars of the old and of the new recording after a complete handover.
+    """Returns the sidecars of the old and the new recording after a complete handover.
 
-    The new one must be written first.
+    The cut lies in the middle of `both` and `ended`. Write the new sidecar first.
 
     Args:
         old: the present sidecar of the old recording.
-        old_name: the old recording.
-        new_name: the new recording.
-        began: when the new recorder was started.
-        both: since when both recorders received.
-        ended: until when they did; the cut lies between.
-        old_files: the bag files of the old recording that were open at any time in it.
+        old_name: the name of the old recording.
+        new_name: the name of the new recording.
+        began: when the new recorder was started (wall time).
+        both: since when both recorders received messages.
+        ended: until when both recorders received messages.
+        old_files: the bag files of the old recording that were open during the handover.
         new_files: the bag files of the new recording so far.
-        simulated: whether log times are those of a simulated clock.
+        simulated: whether log times come from a simulated clock.
         clock: whether publish times differ from log times.
     """
-    cut, notes = (both + ended) // 2, (LOG_CLOCK_NOTE,) * (clock is CutClock.LOG)
+    cut = (both + ended) // 2
     begin = Overlap(began, ended, tuple(sorted(new_files)))
     end = Overlap(both, ended + LATE_MESSAGES_NS, tuple(sorted(old_files)))
     if simulated:
         begin, end = Overlap(None, None, begin.files), Overlap(None, None, end.files)
+    notes = _notes_on(clock)
     all_notes = tuple(dict.fromkeys((*old.notes, *notes)))
     return (
         replace(old, clock=clock, next=new_name, counts_until=cut, end=end, notes=all_notes),
@@ -150,6 +150,10 @@ def complete_sidecars(
     )
 
 
+def _notes_on(clock: CutClock) -> tuple[str, ...]:
+    return (LOG_CLOCK_NOTE,) if clock is CutClock.LOG else ()
+
+
 class Step(Enum):
     """What a handover needs next."""
 
@@ -162,11 +166,9 @@ class Step(Enum):
 
 @dataclass(eq=False, repr=False)
 class HandoverTransfer:
-    """A handover from one running session to another.
+    """A handover from a session that records to one that takes over.
 
     Args:
-        old: the session that records.
-        new: the session that takes over.
         began: the time just before the new recorder was started.
     """
 
@@ -176,41 +178,41 @@ class HandoverTransfer:
     orders: Orders
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Notes the splits that were closed before the handover."""
         self.directories = self.old.splits.directory, self.new.splits.directory
         self._last = self.began
-        # Since when both record.
         self._both_since: ClockReading | None = None
         self._marked = False
         self._closed_before = self.old.splits.closed_names
 
     @staticmethod
     def announce(old: RecordingSession, new_name: str) -> None:
-        """Writes the name of the new recording, which is about to be started, into the old sidecar.
+        """Writes the name of the recording that is about to take over into the old sidecar.
 
         Raises:
-            RecorderError: it cannot be written, or the one before that was given up is not settled.
+            RecorderError: the sidecar cannot be written, or an earlier handover of the old
+                recording, which was given up, is not settled yet.
         """
         directory = old.splits.directory
         before = handover_to_change(directory)
         if before.next is not None:
             raise RecorderError(f"{directory}: its handover to {before.next} is not settled yet")
-        write_handover(directory, intended(before, new_name))
+        write_handover(directory, announcing_sidecar(before, new_name))
 
     @property
     def missing(self) -> frozenset[str]:
-        """Topics that the old recorder has subscribed to, and the new one has still to."""
+        """The listed topics that only the old recorder has subscribed to so far."""
         is_listed = self.orders.topics.selection.matches
         return frozenset(filter(is_listed, self.old.subscribed - self.new.subscribed))
 
     def advance(self, now: ClockReading) -> Step:
-        """Returns the step that is due. Must be called several times a second.
+        """Returns the step that is due. Call it several times a second.
 
         Raises:
             RecorderError: a sidecar cannot be written.
         """
         if not self._marked and self.new.splits.exists:
-            write_handover(self.new.splits.directory, pending(self.old.name))
+            write_handover(self.new.splits.directory, pending_sidecar(self.old.name))
             self._marked = True
         before, self._last = self._last, now
         if set_back(before, now):
@@ -229,7 +231,7 @@ class HandoverTransfer:
         return Step.COMPLETE if is_over else Step.WAIT
 
     def complete(self, now: ClockReading) -> bool:
-        """Writes the cut if both recorders receive; returns False while they do not overlap.
+        """Writes the cut if both recorders receive messages; returns False if they do not yet.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -242,7 +244,7 @@ class HandoverTransfer:
         if self.orders.simulated and clock is CutClock.LOG:
             # No time of the wall clock separates them: the old one counts up to its end.
             return True
-        of_old, of_new = complete_sidecars(
+        old_sidecar, new_sidecar = complete_sidecars(
             handover_to_change(old),
             self.old.name,
             self.new.name,
@@ -254,7 +256,7 @@ class HandoverTransfer:
             simulated=self.orders.simulated,
             clock=clock,
         )
-        write_handovers({new: of_new, old: of_old})
+        write_handovers({new: new_sidecar, old: old_sidecar})
         return True
 
     def add_late_splits(self) -> None:
@@ -274,7 +276,7 @@ class HandoverTransfer:
 
 
 def unsettled_handovers(bag_dir: Path) -> list[tuple[Path, Path]]:
-    """Returns the old and the new recording of each handover that an earlier run left unsettled.
+    """Returns each handover that an earlier run left unsettled: the old and the new recording.
 
     Raises:
         OSError: the bag directory cannot be listed.
@@ -286,20 +288,24 @@ def unsettled_handovers(bag_dir: Path) -> list[tuple[Path, Path]]:
             pairs.append((directory, bag_dir / handover.next))
         if handover.previous is not None:
             previous = bag_dir / handover.previous
-            # Retention may have deleted the one before: then there is nothing to compare, and what
-            # waits for it would never count.
-            if handover.compared is False if is_folder(previous) else handover.hides_all:
+            # Where retention deleted the previous one, a recording that waits would never count.
+            waits = handover.compared is False if is_folder(previous) else handover.hides_all
+            if waits:
                 pairs.append((previous, directory))
     return pairs
 
 
 def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection[str] = ()) -> bool:
-    """Completes the handover between two recordings as far as these have ended, and compares them.
+    """Completes the handover between two recordings that have ended, and compares them.
 
-    `running` names the recordings that are being written; the reader must ignore sidecars.
+    Args:
+        old: the recording that handed over.
+        new: the recording that took over.
+        reader: a reader that ignores sidecars.
+        running: the names of the recordings that are being written.
 
     Returns:
-        Whether nothing is left to do: not while a file that may matter is being written.
+        True if nothing is left to do; False while a file that may matter is being written.
 
     Raises:
         RecorderError: the recordings cannot be read, or the sidecars cannot be written.
@@ -322,59 +328,62 @@ def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection
     except OSError as error:
         raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
     except BagUnreachableError as error:
-        # What the disk cannot show at present must not be taken for missing.
+        # The disk cannot show the messages at present: they must not count as missing.
         raise RecorderError(str(error)) from error
 
 
 def give_up(old: Path, new: Path) -> None:
-    """Marks a new recording as not counting: it did not take over, and the old one goes on.
+    """Marks a new recording as void: it did not take over, and the old one goes on.
 
     Raises:
         RecorderError: a sidecar cannot be written.
-        OSError: it is not known whether there is a recording.
+        OSError: the disk does not tell whether a recording exists.
     """
     if is_folder(new):
-        write_handover(new, void(old.name))
+        write_handover(new, void_sidecar(old.name))
     if is_folder(old):
-        write_handover(old, intended(handover_to_change(old), None))
+        write_handover(old, announcing_sidecar(handover_to_change(old), None))
 
 
 def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
     """Writes the cut of a handover that was interrupted, after the old recording has ended.
 
-    The new one may itself have handed over since, if this could not be written at once: what its
-    sidecar records about its own end is kept.
+    The new recording may itself have handed over since: what its sidecar states about its own end
+    stays.
     """
     before = handover_to_change(old)
-    after = handover_to_change(new) if is_folder(new) else void(old.name)
+    after = handover_to_change(new) if is_folder(new) else void_sidecar(old.name)
     if after.state is Counting.COUNTS and after.counts_from is not None:
         # The crash came between the two sidecars of a complete handover.
         start = None if after.begin is None else after.begin.log_from
-        bags = bags_of(old, reader).items()
+        bags = readable_bags(old, reader).items()
         files = tuple(name for name, bag in bags if start is None or bag.end >= start)
         end = Overlap(start, None, files)
         write_handover(old, replace(before, counts_until=after.counts_from, end=end))
         return
-    last = None if after.state is Counting.VOID else _end_of(old, reader)
-    if last is not None:
-        published, logged = last
-        cut = replace(after, previous=old.name, counts_from=published + 1)
-        write_handover(new, _with_begin(cut, new, logged, reader))
-        end = Overlap(None, None, ())
-        write_handover(old, replace(before, counts_until=published + 1, end=end))
-        return
     if after.state is not Counting.VOID:
+        newest = _newest_times(old, reader)
+        if newest is not None:
+            cut = newest.published + 1
+            begun = replace(after, previous=old.name, counts_from=cut)
+            write_handover(new, _with_begin(begun, new, newest.logged, reader))
+            write_handover(old, replace(before, counts_until=cut, end=Overlap(None, None, ())))
+            return
         counts = replace(after, state=Counting.COUNTS, previous=old.name, compared=True)
         write_handover(new, counts)
-    write_handover(old, intended(before, None))
+    write_handover(old, announcing_sidecar(before, None))
 
 
-def _with_begin(cut: Handover, new: Path, logged: Ns, reader: BagReader) -> Handover:
-    """Returns the sidecar of a new recording with the files and times in which its cut applies.
+def _with_begin(begun: Handover, new: Path, logged: Ns, reader: BagReader) -> Handover:
+    """Returns the sidecar of a new recording with the files and log times where its cut applies.
 
-    `logged` is the last log time of the old recording.
+    Args:
+        begun: the sidecar with the cut.
+        new: the new recording.
+        logged: the last log time of the old recording (ns).
+        reader: a reader that ignores sidecars.
     """
-    bags = bags_of(new, reader)
+    bags = readable_bags(new, reader)
     first = min((bag.start for bag in bags.values()), default=logged)
     until = min(logged + JITTER_NS, first + LONGEST_NS)
     later = {name for name, bag in bags.items() if bag.start >= until}
@@ -382,31 +391,38 @@ def _with_begin(cut: Handover, new: Path, logged: Ns, reader: BagReader) -> Hand
     names = tuple(path.name for path in _bag_files(new, reader) if path.name not in later)
     clock = cut_clock(new / next(iter(bags)), reader) if bags else CutClock.PUBLISH
     return replace(
-        cut,
+        begun,
         state=Counting.COUNTS,
         clock=clock,
         begin=Overlap(None, until, names),
-        notes=(LOG_CLOCK_NOTE,) * (clock is CutClock.LOG),
+        notes=_notes_on(clock),
         compared=False,
     )
 
 
-def _end_of(recording: Path, reader: BagReader) -> tuple[Ns, Ns] | None:
-    """Returns the newest publish time and log time in the last bag file that is not empty."""
-    bags = bags_of(recording, reader)
+class _Times(NamedTuple):
+    published: Ns
+    logged: Ns
+
+
+def _newest_times(recording: Path, reader: BagReader) -> _Times | None:
+    """Returns the newest times in the last bag of a recording; None if it has no message."""
+    bags = readable_bags(recording, reader)
     if not bags:
         return None
     last = recording / max(bags, key=lambda name: bags[name].end)
     published = logged = MIN_NS
-    for record in _readable(_unlatched_records(last, reader)):
+    for record in _readable_records(_unlatched_records(last, reader)):
         # A publish time of 0 means that there is none.
         published = max(published, record.publish_time or record.log_time)
         logged = max(logged, record.log_time)
-    return None if logged == MIN_NS else (published, logged)
+    return None if logged == MIN_NS else _Times(published, logged)
 
 
 def cut_clock(bag: Path, reader: BagReader) -> CutClock:
-    """Finds out whether a bag file has publish times of their own; yes if it is empty.
+    """Returns LOG if all publish times in a bag file are 0 or equal to the log times.
+
+    PUBLISH also for an empty or damaged file.
 
     Raises:
         RecorderError: the disk fails.
@@ -417,8 +433,13 @@ def cut_clock(bag: Path, reader: BagReader) -> CutClock:
         raise RecorderError(str(error)) from error
     except BagError:
         return CutClock.PUBLISH
-    equal = bool(records) and all(record.publish_time in {0, record.log_time} for record in records)
-    return CutClock.LOG if equal else CutClock.PUBLISH
+    if records and not any(map(_has_publish_time, records)):
+        return CutClock.LOG
+    return CutClock.PUBLISH
+
+
+def _has_publish_time(record: Record) -> bool:
+    return record.publish_time not in {0, record.log_time}
 
 
 def _unlatched_records(bag: Path, reader: BagReader) -> Iterator[Record]:
@@ -427,17 +448,35 @@ def _unlatched_records(bag: Path, reader: BagReader) -> Iterator[Record]:
     return reader.records(bag, topics, TimeWindow.everything())
 
 
-_Copies: TypeAlias = "Counter[tuple[str, bool]]"
-"""How often a recording holds one message, by file, and by whether the cut counts it there."""
-_Wrong: TypeAlias = "tuple[Path, bool, str, str, str]"
-"""A message for which the cut is wrong: its recording, whether it counts, file, topic, identity."""
+class _Message(NamedTuple):
+    """The identity of a message in both recordings."""
+
+    topic: str
+    message_id: str
+
+
+class _Copy(NamedTuple):
+    """A place of a message in a recording: its file, and whether the cut counts it there."""
+
+    file: str
+    counts: bool
+    has_publish_time: bool
+
+
+class _Correction(NamedTuple):
+    """A message in a file for which the cut is wrong, and whether the message counts there."""
+
+    file: str
+    message: _Message
+    counts: bool
 
 
 class _Side(NamedTuple):
     """One of the two recordings.
 
-    `cut` is as much of its sidecar as is about these two: what that says about the recording before
-    or after them is another comparison's. `bags` are those that are not empty, by file name.
+    Attributes:
+        cut: the part of the sidecar that is about these two recordings.
+        bags: the bags that are not empty, by file name.
     """
 
     recording: Path
@@ -455,136 +494,160 @@ class _Side(NamedTuple):
         return max(bag.end for bag in self.bags.values())
 
     def hidden(self) -> Iterator[Span]:
-        """Yields between which log times the cut may hide messages, both included."""
+        """Yields the spans of log time, both ends included, in which the cut may hide messages."""
         for name, bag in self.bags.items():
             rule = self.cut.rule(name)
-            for _, logged in () if rule is None else rule.exclusions:
-                span = max(bag.start, logged.start), min(bag.end, logged.stop)
-                if span[0] <= span[1]:
-                    yield span
+            for exclusion in () if rule is None else rule.exclusions:
+                first = max(bag.start, exclusion.logged.start)
+                last = min(bag.end, exclusion.logged.stop)
+                if first <= last:
+                    yield first, last
 
-    def records(
+    def copies(
         self, window: TimeWindow, reader: BagReader, *, latched: bool
-    ) -> Iterator[tuple[str, bool, Record]]:
-        """Yields the messages in a window, each with its file and whether the cut counts it."""
-        for name, bag in self.bags.items():
+    ) -> defaultdict[_Message, Counter[_Copy]]:
+        """Returns how often the recording holds each message of a window, by place."""
+        copies: defaultdict[_Message, Counter[_Copy]] = defaultdict(Counter)
+        for file, bag in self.bags.items():
             if not window.overlaps(bag.start, bag.end):
                 continue
-            topics, rule = [topic.topic for topic in bag.topics], self.cut.rule(name)
-            for record in _readable(reader.records(self.recording / name, topics, window)):
-                late = record.log_time - record.publish_time > FRESH_NS
-                if not record.channel.latched or (latched and not late):
-                    yield name, rule is None or rule.counts(record), record
+            topics, rule = [topic.topic for topic in bag.topics], self.cut.rule(file)
+            for record in _readable_records(reader.records(self.recording / file, topics, window)):
+                is_late = record.log_time - record.publish_time > FRESH_NS
+                if record.channel.latched and (is_late or not latched):
+                    continue
+                identity = message_id(record.publish_time, record.payload)
+                counts = rule is None or rule.counts(record)
+                copy = _Copy(file, counts, _has_publish_time(record))
+                copies[_Message(record.channel.topic, identity)][copy] += 1
+        return copies
 
 
 def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) -> bool:
-    """Lists in the sidecars of two recordings what counts against the cut between them."""
+    """Compares two recordings, and lists in their sidecars the messages that the cut gets wrong.
+
+    Returns:
+        False while a file that may matter is being written.
+    """
     before, after = handover_to_change(old), handover_to_change(new)
     if after.compared is not False or after.previous != old.name:
         return True
     withheld, is_void = read_withheld(old.parent), after.state is Counting.VOID
-    written = [
+    written = {
         path for path in (old, new) if path.name in running or withheld.holds_some(path.name)
-    ]
+    }
     if after.state is Counting.PENDING or (new if is_void else old) in written:
         return False
-    old_cut = Handover()
-    if before.next == new.name:
-        old_cut = Handover(counts_until=before.counts_until, end=before.end)
+    is_next = before.next == new.name
+    old_cut = Handover(counts_until=before.counts_until, end=before.end) if is_next else Handover()
     new_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
-    old_side, new_side = (
-        _Side(path, cut, bags_of(path, reader, only_closed=path in written))
-        for path, cut in ((old, old_cut), (new, new_cut))
-    )
+    old_side = _Side(old, old_cut, readable_bags(old, reader, only_closed=old in written))
+    new_side = _Side(new, new_cut, readable_bags(new, reader, only_closed=new in written))
     ended, lasting = (new_side, old_side) if is_void else (old_side, new_side)
     if lasting.recording in written and (
         not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
     ):
         return False
-    wrong = _against_the_cut(old_side, new_side, reader, latched=is_void)
-    changed = {new: _with_listed(after, new, wrong), old: _with_listed(before, old, wrong)}
-    if len(wrong) > MOST_LISTED:
-        # Without a cut all of both count.
-        begin = None if after.begin is None else replace(after.begin, files=())
-        changed = {new: replace(after, state=Counting.COUNTS, begin=begin), old: before}
-        if before.end is not None and before.next == new.name:
-            changed[old] = replace(before, end=replace(before.end, files=()))
-    changed[new] = replace(changed[new], compared=True)
-    if changed[old] == before:
-        del changed[old]
+    in_old, in_new = _corrections(old_side, new_side, reader, latched=is_void)
+    count = len(in_old) + len(in_new)
+    if count > MOST_LISTED:
+        # Without a cut all messages of both recordings count.
+        old_sidecar = replace(before, end=_without_files(before.end)) if is_next else before
+        new_sidecar = replace(after, state=Counting.COUNTS, begin=_without_files(after.begin))
+    else:
+        old_sidecar, new_sidecar = _with_listed(before, in_old), _with_listed(after, in_new)
+    changed = {new: replace(new_sidecar, compared=True)}
+    if old_sidecar != before:
+        changed[old] = old_sidecar
     write_handovers(changed)
-    if wrong:
-        _log.info("handover_compared", recording=old.name, next=new.name, messages=len(wrong))
+    if count:
+        _log.info("handover_compared", recording=old.name, next=new.name, messages=count)
     return True
 
 
-def _against_the_cut(old: _Side, new: _Side, reader: BagReader, *, latched: bool) -> set[_Wrong]:
-    """Returns the messages of two recordings for which the cut is wrong.
+def _without_files(overlap: Overlap | None) -> Overlap | None:
+    return None if overlap is None else replace(overlap, files=())
 
-    `latched`: also of latched messages. The cut does not apply to them, but all of a recording
-    without effect is hidden.
+
+def _corrections(
+    old: _Side, new: _Side, reader: BagReader, *, latched: bool
+) -> tuple[list[_Correction], list[_Correction]]:
+    """Returns the messages of the old and of the new recording that the cut gets wrong.
+
+    `latched` includes latched messages. No cut applies to them, but a void recording hides them.
     """
-    spans = [*old.hidden(), *new.hidden()]
-    if old.bags and new.bags and (start := max(old.start, new.start)) <= min(old.end, new.end):
-        spans.append((start, min(old.end, new.end)))
-    if not spans:
-        return set()
-    first, last = enclosing(spans)
-    window = TimeWindow(first - STALL_NS, last + STALL_NS + 1)
-    by_message: defaultdict[tuple[str, str], tuple[_Copies, _Copies]] = defaultdict(
-        lambda: (Counter(), Counter())
-    )
-    undecided: set[tuple[str, str]] = set()  # without a publish time of their own
-    for nth, side in enumerate((old, new)):
-        for file, counts, record in side.records(window, reader, latched=latched):
-            message = record.channel.topic, message_id(record.publish_time, record.payload)
-            by_message[message][nth][file, counts] += 1
-            if record.publish_time in {0, record.log_time}:
-                undecided.add(message)
-    wrong: set[_Wrong] = set()
-    for message in by_message.keys() - undecided:
-        of_old, of_new = by_message[message]
+    window = _compared_window(old, new)
+    if window is None:
+        return [], []
+    of_old: list[_Correction] = []
+    of_new: list[_Correction] = []
+    copies_in_old = old.copies(window, reader, latched=latched)
+    copies_in_new = new.copies(window, reader, latched=latched)
+    for message in copies_in_old.keys() | copies_in_new.keys():
+        in_old, in_new = copies_in_old[message], copies_in_new[message]
+        if not all(copy.has_publish_time for copy in (*in_old, *in_new)):
+            continue  # the cut alone decides
         # Where both hold it as often, the cut decides.
-        is_old = _weight(of_old) >= _weight(of_new)
-        for side, copies, counts in ((old, of_old, is_old), (new, of_new, not is_old)):
-            wrong.update(
-                (side.recording, counts, file, *message)
-                for file, by_cut in copies
-                if by_cut != counts
-            )
-    return wrong
+        is_old = _weight(in_old) >= _weight(in_new)
+        of_old += [
+            _Correction(copy.file, message, is_old) for copy in in_old if copy.counts != is_old
+        ]
+        of_new += [
+            _Correction(copy.file, message, not is_old) for copy in in_new if copy.counts == is_old
+        ]
+    return of_old, of_new
 
 
-def _weight(copies: _Copies) -> tuple[int, int]:
+def _compared_window(old: _Side, new: _Side) -> TimeWindow | None:
+    """Returns the log times in which messages are compared; None if no message is hidden."""
+    spans = [*old.hidden(), *new.hidden()]
+    if old.bags and new.bags:
+        first, last = max(old.start, new.start), min(old.end, new.end)
+        if first <= last:
+            spans.append((first, last))
+    if not spans:
+        return None
+    first, last = enclosing(spans)
+    return TimeWindow(first - STALL_NS, last + STALL_NS + 1)
+
+
+def _weight(copies: Counter[_Copy]) -> tuple[int, int]:
     """Returns how often a recording holds a message, and how often the cut counts it there."""
-    return copies.total(), sum(times for (_, counts), times in copies.items() if counts)
+    counted = sum(times for copy, times in copies.items() if copy.counts)
+    return copies.total(), counted
 
 
-def _with_listed(handover: Handover, recording: Path, wrong: Collection[_Wrong]) -> Handover:
-    """Returns the sidecar of a recording that lists those messages of it, too."""
-
-    def merged(listed: MessageList, counts: bool) -> MessageList:
-        messages = {
-            (file, topic, message)
-            for file, by_topic in listed.items()
-            for topic, of_topic in by_topic.items()
-            for message in of_topic
-        }
-        messages |= {message[2:] for message in wrong if message[:2] == (recording, counts)}
-        lists: MessageList = {}
-        for (file, topic), of_topic in groupby(sorted(messages), itemgetter(0, 1)):
-            lists.setdefault(file, {})[topic] = tuple(message for _, _, message in of_topic)
-        return lists
-
+def _with_listed(handover: Handover, corrections: Sequence[_Correction]) -> Handover:
+    """Returns a sidecar that lists these messages as well."""
+    counting = [correction for correction in corrections if correction.counts]
+    hidden = [correction for correction in corrections if not correction.counts]
     return replace(
         handover,
-        also_counts=merged(handover.also_counts, counts=True),
-        counts_elsewhere=merged(handover.counts_elsewhere, counts=False),
+        also_counts=_merged(handover.also_counts, counting),
+        counts_elsewhere=_merged(handover.counts_elsewhere, hidden),
     )
 
 
-def _readable(records: Iterator[Record]) -> Iterator[Record]:
-    """Yields the messages that can be read."""
+def _merged(listed: MessageList, corrections: Iterable[_Correction]) -> MessageList:
+    """Returns the list with these messages added, sorted."""
+    messages: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
+    for file, topics in listed.items():
+        for topic, message_ids in topics.items():
+            messages[file, topic].update(message_ids)
+    for file, message, _ in corrections:
+        messages[file, message.topic].add(message.message_id)
+    merged: MessageList = {}
+    for file, topic in sorted(messages):
+        merged.setdefault(file, {})[topic] = tuple(sorted(messages[file, topic]))
+    return merged
+
+
+def _readable_records(records: Iterator[Record]) -> Iterator[Record]:
+    """Yields the messages that can be read.
+
+    Raises:
+        BagUnreachableError: the disk fails.
+    """
     for record in or_errors(records):
         if isinstance(record, BagUnreachableError):
             raise record
@@ -592,12 +655,12 @@ def _readable(records: Iterator[Record]) -> Iterator[Record]:
             yield record
 
 
-def bags_of(
+def readable_bags(
     recording: Path, reader: BagReader, *, only_closed: bool = False
 ) -> dict[str, BagSummary]:
-    """Returns the bag files that can be read and are not empty, by name.
+    """Returns the summaries of the bags that can be read and are not empty, by file name.
 
-    With `only_closed`, of those that are closed and not held back.
+    `only_closed` leaves out bags that are open or held back.
 
     Raises:
         OSError: the recording cannot be listed.

@@ -28,11 +28,11 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder import handover
 from ros2_memory.recorder.handover import (
+    announcing_sidecar,
     complete_sidecars,
-    intended,
-    pending,
+    pending_sidecar,
     settle_handover,
-    void,
+    void_sidecar,
 )
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, tf, transform, write_mcap
@@ -215,8 +215,10 @@ def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
     if kind == "complete":
         hand_over(bag_dir, 5)
     else:
-        write_handover(bag_dir / "a", Handover() if kind == "void" else intended(Handover(), "b"))
-        write_handover(bag_dir / "b", void("a") if kind == "void" else pending("a"))
+        write_handover(
+            bag_dir / "a", Handover() if kind == "void" else announcing_sidecar(Handover(), "b")
+        )
+        write_handover(bag_dir / "b", void_sidecar("a") if kind == "void" else pending_sidecar("a"))
     assert settle_handover(bag_dir / "a", bag_dir / "b", READER)
     assert_union(bag_dir)
 
@@ -324,8 +326,8 @@ def cut_recording(bag_dir: Path, name: str, start: float, stop: float, *, delay:
 
 def interrupted(old: Path, new: Path) -> None:
     """What a crash before the cut leaves."""
-    write_handover(old, intended(Handover(), new.name))
-    write_handover(new, pending(old.name))
+    write_handover(old, announcing_sidecar(Handover(), new.name))
+    write_handover(new, pending_sidecar(old.name))
 
 
 def counted(bag_dir: Path) -> Counter[int]:
@@ -347,7 +349,7 @@ def test_a_crash_between_the_two_sidecars_is_brought_to_its_end(tmp_path: Path) 
     old = cut_recording(tmp_path, "a", 0, 10, delay=5)
     new = cut_recording(tmp_path, "b", 7, 15, delay=9)
     cut = T0 + 9 * S
-    write_handover(old, intended(Handover(), "b"))
+    write_handover(old, announcing_sidecar(Handover(), "b"))
     begin = Overlap(T0 + 6 * S, T0 + 10 * S, ("b_0.mcap",))
     write_handover(new, Handover(previous="a", counts_from=cut, begin=begin))
     assert counted(tmp_path) == once(range(150))
@@ -374,7 +376,7 @@ def test_after_a_clock_that_was_set_back_no_more_than_a_minute_is_in_doubt(tmp_p
 def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path: Path) -> None:
     for name in ("a", "c"):
         old = cut_recording(tmp_path, name, 0, 1, delay=0)
-        write_handover(old, intended(Handover(), name + "2"))
+        write_handover(old, announcing_sidecar(Handover(), name + "2"))
     (tmp_path / "a" / ".handover.json.tmp").mkdir()
     with capture_logs() as logs:
         World(tmp_path).started(100)
@@ -386,9 +388,9 @@ def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: 
     first = cut_recording(tmp_path, "a", 0, 10, delay=5)
     second = cut_recording(tmp_path, "b", 8, 20, delay=9)
     third = cut_recording(tmp_path, "c", 18, 25, delay=2)
-    write_handover(first, intended(Handover(), "b"))
+    write_handover(first, announcing_sidecar(Handover(), "b"))
     end = Overlap(T0 + 18 * S, None, ("b_0.mcap",))
-    handed_over = replace(pending("a"), next="c", counts_until=T0 + 19 * S, end=end)
+    handed_over = replace(pending_sidecar("a"), next="c", counts_until=T0 + 19 * S, end=end)
     write_handover(second, handed_over)
     begin = Overlap(T0 + 17 * S, T0 + 21 * S, ("c_0.mcap",))
     write_handover(third, Handover(previous="b", counts_from=T0 + 19 * S, begin=begin))
@@ -404,5 +406,5 @@ def test_one_whose_predecessor_is_gone_counts_and_stays_as_it_is(tmp_path: Path)
         recover_handovers(tmp_path, READER)
     assert not logs
     assert read_handover(new).handover == after
-    write_handover(new, pending("a"))
+    write_handover(new, pending_sidecar("a"))
     assert counted(tmp_path) == once(range(70, 150))
