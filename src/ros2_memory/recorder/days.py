@@ -1,8 +1,8 @@
-"""The folder `memory/`: what stays of bags that are deleted, a file for each day (UTC).
+"""The folder `memory/`: the messages that stay of deleted bags, in one file for each day (UTC).
 
-Before bags go, the messages of them that stay (see `thinning`) are on the disk in the file of their
-day, `memory/20261120.mcap`. It is a bag like any other: the index finds it, every tool answers from
-it, `forget` rewrites it. It is never changed in place: a new file takes its name.
+Before a bag is deleted, the messages of it that stay (see `thinning`) are written to the file of
+its day, `memory/20261120.thinned.mcap`. That file is a bag: the index finds it, every tool answers
+from it, `forget` rewrites it. It is never changed in place: a new file takes its name.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import time
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, is_dataclass, replace
-from itertools import chain, repeat, starmap
+from itertools import chain, count
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -55,20 +55,20 @@ from ros2_memory.messages.detections import detections_of
 from ros2_memory.recorder.thinning import (
     MINUTE_NS,
     TopicThinning,
-    beside_pauses,
     fields_in,
     has_numbers,
     is_said,
     is_sampled,
     rounded,
-    shown_by,
+    times_near,
+    with_shown_by,
 )
 from ros2_memory.retention.delete import beside
 from ros2_memory.retention.disk import FailingFiles
 from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -111,28 +111,32 @@ _NAMES: Final = _OF_DETECTIONS.union(
 )
 """Fields that may name people."""
 _FIRST_DAY: Final = "2014"
-"""Days before it have a wrong date: there was no ROS 2."""
+"""Earlier days have a wrong date: there was no ROS 2."""
 _QOS: Final = "offered_qos_profiles"
 MONTH_NS: Final[Ns] = 31 * 86_400 * NS_PER_S
 """The numbers of older days have one message a minute."""
 _BY_MINUTE: Final = ("ros2_memory_numbers_s", "60")
-"""In the metadata of each channel of such a day: it is not read again to thin it."""
+"""In the metadata of each channel of a day that was thinned to minutes: it is not thinned again."""
 GRACE_S: Final = 86_400.0
-"""So long the recorder runs before days are deleted that nobody wants: `memory.keep` may have been
-lost by accident."""
+"""How long the recorder runs with `memory.keep=false` before it deletes the days: the setting may be
+an accident."""
 COUNTED_S: Final = 600.0
+"""How often the rest of that time is written."""
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 _EVERYTHING: Final = TimeWindow.everything()
+_TopicType: TypeAlias = tuple[str, str]
+"""A topic and its type."""
 
 _log = get_logger(__name__)
 
 
 class MemoryLimits(NamedTuple):
-    """What may stay of deleted bags, and how much.
+    """Which messages of deleted bags may stay, and how many bytes of them for how long.
 
     Attributes:
-        texts: names or globs of the topics of which texts may stay: speech, descriptions, logs.
-        people: words for people besides those that are known: names, roles.
+        texts: names or globs of topics whose texts may stay: speech, descriptions, logs.
+        labels: labels of people that may stay.
+        people: more words for people: names, roles.
     """
 
     texts: tuple[str, ...] = ()
@@ -144,13 +148,13 @@ class MemoryLimits(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class MemoryDays:
-    """Writes and deletes the days of one bag directory, whose lock its caller holds.
+    """Writes and deletes the days of one bag directory. The caller holds the directory's lock.
 
     Args:
-        reader: reads bags, without what counts in another recording.
+        reader: leaves out messages that count in another recording.
         own: lists the days as the recorder's own.
-        extractor: has the schema map, by which detections are found.
-        limits: which messages stay; None: none, and the days that exist are deleted.
+        extractor: finds detections by the schema map.
+        limits: which messages stay; None keeps none, and `clear` deletes the days.
     """
 
     bag_dir: Path
@@ -164,72 +168,75 @@ class MemoryDays:
     monotonic: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Prepares the words for people."""
         self._folder = self.bag_dir / MEMORY_FOLDER
         self.keeps = self.limits is not None
         self._limits = self.limits or MemoryLimits()
-        named = map(_words_in, self._limits.people)
-        self._people = [words for words in named if words.strip()]
+        words = [_words_in(name) for name in self._limits.people]
+        self._people = [name for name in words if name.strip()]
         self._static_topics = frozenset(self.static_topics)
-        self._minutes: set[Path] = set()
+        self._checked_for_minutes: set[Path] = set()
         self._failing = FailingFiles(self.monotonic)
-        self._leaving_since: float | None = None
+        self._counted_at_s: float | None = None
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
-        """Makes durable what stays of some bags, which may be deleted then.
+        """Writes the messages that stay of the bags at `paths`, which may then be deleted.
 
-        What stays already is not written twice. What is damaged in a bag does not stay.
+        Messages that a day has already are not written twice. Damaged messages do not stay.
 
         Raises:
             BagError: a day cannot be written, or the disk fails while a bag is read.
-            OSError: likewise, or the list of the recorder's own bags cannot be read.
+            OSError: a day cannot be written, or the list of own recordings cannot be read.
         """
-        if (self._folder.parent / ERASING_FILE).exists():
+        if (self.bag_dir / ERASING_FILE).exists():
             raise BagError(str(self._folder), "messages are being forgotten: they must not stay")
         begun = time.perf_counter_ns()
         bags = [bag for bag in snapshot.bags if bag.file in paths]
         if not bags:
             return
-        thinned = self._read_thinned()
-        shown = shown_by(thinned, snapshot, bags)
-        chosen = self._choose(snapshot, bags, shown)
-        if shown != thinned:
-            THINNED.write(self._folder.parent, shown)
-        # Whole bags, also across midnight: a bag is in one day, or in none.
+        known = self._read_thinned()
+        thinned = with_shown_by(known, snapshot, bags)
+        selection = self._select(snapshot, bags, thinned)
+        if thinned != known:
+            THINNED.write(self.bag_dir, thinned)
+        # A bag that crosses midnight goes to the day of its start as a whole.
         days: dict[str, list[BagFile]] = defaultdict(list)
         for bag in bags:
             days[utc_day(bag.start)].append(bag)
         messages = 0
-        for day, of_day in days.items():
-            records = sorted(self._staying_records(of_day, chosen), key=attrgetter("log_time"))
+        for day, day_bags in days.items():
+            records = sorted(self._staying_records(day_bags, selection), key=attrgetter("log_time"))
             messages += len(records)
             if records:
-                self._write_day(day, records, of_day)
+                self._write_day(day, records, day_bags)
         _log.info(
             "memory_kept",
             days=[*days],
             bags=len(bags),
             messages=messages,
-            left_out=chosen.left_out,
+            left_out=selection.left_out,
             duration_ms=ms_since(begun),
         )
 
     def limit(self, now: Ns | None) -> None:
-        """Deletes the days that are too old, then the oldest above the size; thins one further.
+        """Deletes days by age and then by size, and thins one old day to a message a minute.
 
-        Age counts from `now`; without it nothing ages. Days before there was ROS 2 have a wrong
-        date, and do not age either.
+        Args:
+            now: the wall time that ages count from; None if the clock may be wrong: no day ages.
 
         Raises:
-            BagError: a day cannot be read or written anew.
-            OSError: the folder cannot be read, or a day not be deleted.
+            BagError: a day cannot be read or written.
+            OSError: the folder cannot be read, or a day cannot be deleted.
         """
-        oldest = "" if now is None else memory_file(utc_day(now - self._limits.max_age_ns))
-        today = "" if now is None else memory_file(utc_day(now))
-        for path in self._days():
-            if _FIRST_DAY <= path.name < oldest:
-                self._delete_day(path)
-        # Those of a clock that was ahead first: they would push out all others, and never age.
+        today = ""
+        if now is not None:
+            today = memory_file(utc_day(now))
+            oldest = memory_file(utc_day(now - self._limits.max_age_ns))
+            for path in self._days():
+                if _FIRST_DAY <= path.name < oldest:
+                    self._delete_day(path)
+        # Days after today come from a clock that was ahead. They go first: they would push out all
+        # others, and never age.
         days = sorted(self._days(), key=lambda path: "" < today < path.name, reverse=True)
         size = sum(path.stat().st_size for path in days)
         for path in days:
@@ -241,124 +248,136 @@ class MemoryDays:
         if now is not None:
             self._thin_one_before(memory_file(utc_day(now - MONTH_NS)))
 
-    def _thin_one_before(self, month_ago: str) -> None:
-        """Thins the oldest day before one, given by the names of files, that has still to be."""
+    def _thin_one_before(self, newest: str) -> None:
+        """Thins the oldest day that is not thinned to minutes yet; its file sorts before a name."""
         for path in self._days():
-            if path.name < month_ago and path not in self._minutes:
-                self._minutes.add(path)
+            if path.name < newest and path not in self._checked_for_minutes:
+                self._checked_for_minutes.add(path)
                 channels = self.reader.channels(path)
                 is_thinned = all(_BY_MINUTE in channel.metadata for channel in channels)
-                # A damaged day written anew would not tell that something is missing.
+                # A damaged day that is rewritten would not show any more that messages are missing.
                 if not is_thinned and self._is_whole(path):
                     self._thin_to_minutes(path)
                     break
 
     def _forget_deleted(self) -> None:
-        """Takes out of `thinned.json` what is older than all days; it goes with the last."""
+        """Drops from `thinned.json` what is older than all days; deletes it with the last day."""
         thinned, days = self._read_thinned(), self._days()
         if thinned.since is None:
             return
         if not days:
-            THINNED.remove(self._folder.parent)
+            THINNED.remove(self.bag_dir)
             return
         left = thinned.from_day(days[0].name[: len(utc_day(0))])
         if left != thinned:
-            THINNED.write(self._folder.parent, left)
+            THINNED.write(self.bag_dir, left)
 
     def _delete_day(self, path: Path) -> None:
         path.unlink()
         _log.warning("memory_day_deleted", path=str(path))
 
     def _thin_to_minutes(self, path: Path) -> None:
-        """Writes a day anew in which numbers have one message a minute, and their extremes."""
+        """Rewrites a day with one message a minute of each topic of numbers, and their extremes."""
         detections = DetectionColumns(self.extractor)
-        numbers: dict[tuple[str, str], TopicThinning] = {}
+        thinnings: dict[_TopicType, TopicThinning] = {}
         for table in self._tables(path):
             if has_numbers(table) and not table.channel.latched:
                 key = (table.channel.topic, table.channel.type)
-                numbers.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
-        stays = {key: {*thinning.times().tolist()} for key, thinning in numbers.items()}
+                thinnings.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
+        times = {key: {*thinning.times().tolist()} for key, thinning in thinnings.items()}
+        self._replace_day(path, self._minute_records(path, times), ())
 
-        def thinned() -> Iterator[Record]:
-            for record in self._merged_by_hour(path, ()):
-                channel = record.channel
-                if record.log_time in stays.get((channel.topic, channel.type), [record.log_time]):
-                    metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
-                    yield record._replace(channel=replace(channel, metadata=(*metadata,)))
-
-        self._replace_day(path, thinned(), ())
+    def _minute_records(
+        self, path: Path, times: Mapping[_TopicType, Collection[Ns]]
+    ) -> Iterator[Record]:
+        """Yields the messages of a day: of the topics in `times` those of these log times (ns)."""
+        for record in self._merged_by_hour(path, ()):
+            channel = record.channel
+            key = channel.topic, channel.type
+            if key not in times or record.log_time in times[key]:
+                metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
+                yield record._replace(channel=replace(channel, metadata=tuple(metadata)))
 
     def clear(self) -> None:
-        """Deletes all days where nothing is to stay (`memory.keep`), a day after saying so.
+        """Deletes all days if `memory.keep` is false, `GRACE_S` after a warning.
 
-        A day in which the recorder runs, since the wall clock may be wrong.
+        The recorder's own running time counts, since the wall clock may be wrong.
 
         Raises:
-            OSError: one cannot be deleted, or how long it is until then not be written.
+            OSError: a day cannot be deleted, or the rest of the time cannot be written.
         """
-        bag_dir, days = self._folder.parent, self._days()
+        days = self._days()
         if self.keeps or not days:
-            if (bag_dir / LEAVING_FILE).exists():
-                LEAVING.remove(bag_dir)
+            if (self.bag_dir / LEAVING_FILE).exists():
+                LEAVING.remove(self.bag_dir)
             return
-        now, since = self.monotonic(), self._leaving_since
-        left_s = GRACE_S
-        with suppress(ValueError):
-            left_s = (LEAVING.read(bag_dir) or Leaving(GRACE_S)).left_s
-        left_s = max(left_s - (0.0 if since is None else now - since), 0.0)
-        if since is None or now - since >= COUNTED_S or not left_s:
-            self._leaving_since = now
-            LEAVING.write(bag_dir, Leaving(left_s))
-        if since is None:
-            _log.warning("memory_leaves", days=len(days), left_s=left_s)
-        if left_s:
+        if self._count_down(len(days)):
             return
-        for path in [*self._folder.glob(".*.thinned.mcap.*"), *days, bag_dir / THINNED_FILE]:
+        unfinished = self._folder.glob(".*.thinned.mcap.*")
+        for path in [*unfinished, *days, self.bag_dir / THINNED_FILE]:
             path.unlink(missing_ok=True)
         _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
         with suppress(OSError):
             self._folder.rmdir()
-        LEAVING.remove(bag_dir)
+        LEAVING.remove(self.bag_dir)
+
+    def _count_down(self, days: int) -> float:
+        """Writes for how long the recorder must still run until it deletes the days; returns it."""
+        now_s, counted_at_s = self.monotonic(), self._counted_at_s
+        left_s = GRACE_S
+        with suppress(ValueError):
+            left_s = (LEAVING.read(self.bag_dir) or Leaving(GRACE_S)).left_s
+        if counted_at_s is not None:
+            left_s = max(left_s - (now_s - counted_at_s), 0.0)
+        if counted_at_s is None or now_s - counted_at_s >= COUNTED_S or not left_s:
+            self._counted_at_s = now_s
+            LEAVING.write(self.bag_dir, Leaving(left_s))
+        if counted_at_s is None:
+            _log.warning("memory_leaves", days=days, left_s=left_s)
+        return left_s
 
     def _days(self) -> list[Path]:
-        """Returns the files that the recorder wrote, the oldest first; no link is followed."""
+        """Returns the files of days that the recorder wrote, oldest first. Follows no link."""
         if self._folder.is_symlink() or not self._folder.is_dir():
             return []
         paths = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
         return sorted(path for path in paths if self.own.owns_bag(path))
 
     def _read_thinned(self) -> Thinned:
-        """Returns what is known of deleted bags; nothing, which is logged, of a damaged file."""
+        """Returns the content of `thinned.json`; an empty one if the file is missing or damaged."""
         try:
-            return THINNED.read(self._folder.parent) or Thinned()
+            return THINNED.read(self.bag_dir) or Thinned()
         except ValueError as error:
             _log.warning("memory_not_read", path=THINNED_FILE, reason=str(error))
             return Thinned()
 
-    def _choose(self, snapshot: Snapshot, bags: Sequence[BagFile], shown: Thinned) -> _Staying:
-        """Returns which messages of some bags stay, also beside the pauses that these show."""
-        chosen = _Staying()
-        thinned: dict[tuple[str, str], TopicThinning] = {}
+    def _select(
+        self, snapshot: Snapshot, bags: Sequence[BagFile], thinned: Thinned
+    ) -> _StayingMessages:
+        """Returns which messages of bags stay. Those beside the pauses in `thinned` stay, too."""
+        selection = _StayingMessages()
+        thinnings: dict[_TopicType, TopicThinning] = {}
         detections = DetectionColumns(self.extractor)
-        times = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
-        near = times.widened(STAMPS_BESIDE_NS)
-        pauses = [pause for pause in shown.pauses if near.overlaps(*pause)]  # not those of a year
+        window = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
+        near = window.widened(STAMPS_BESIDE_NS)
+        # `thinned` has the pauses of a year.
+        pauses = [pause for pause in thinned.pauses if near.overlaps(*pause)]
         for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
-            topic, kind = table.channel.topic, table.channel.type
+            key = topic, _ = table.channel.topic, table.channel.type
             if why := self._why_left_out(table):
-                chosen.left_out[topic] = why
+                selection.left_out[topic] = why
             elif self._is_latched(snapshot, topic):
-                chosen.latched.add(topic)
-                chosen.times[topic, kind].update(table.log_times.tolist())
+                selection.latched.add(topic)
+                selection.times[key].update(table.log_times.tolist())
             else:
-                thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
-                chosen.times[topic, kind].update(beside_pauses(pauses, table.log_times).tolist())
-        for key, thinning in thinned.items():
-            chosen.times[key].update(thinning.times().tolist())
-        return chosen
+                thinnings.setdefault(key, TopicThinning(detections)).add(table)
+                selection.times[key].update(times_near(pauses, table.log_times).tolist())
+        for key, thinning in thinnings.items():
+            selection.times[key].update(thinning.times().tolist())
+        return selection
 
     def _why_left_out(self, table: Table) -> str | None:
-        """Returns why nothing of a topic stays; None where something does."""
+        """Returns why no message of a topic stays; None if some stay."""
         topic = table.channel.topic
         if "" in table.left_out:
             return table.left_out[""]
@@ -371,37 +390,48 @@ class MemoryDays:
         return None
 
     def _is_latched(self, snapshot: Snapshot, topic: str) -> bool:
-        """Whether all messages of a topic stay: each holds until the next, however long that is."""
+        """Whether all messages of a topic stay, since each is valid until the next one."""
         timeline = snapshot.timeline
         return topic in self._static_topics or (
             timeline.is_transient_state(topic)
             and all(timeline.pace(topic, path).is_rare for path in timeline.recordings(topic))
         )
 
-    def _staying_records(self, bags: Sequence[BagFile], chosen: _Staying) -> Iterator[Record]:
-        """Yields the messages that stay, without people whose label may not."""
-        topics = [*{topic for (topic, _), times in chosen.times.items() if times}]
+    def _staying_records(
+        self, bags: Sequence[BagFile], selection: _StayingMessages
+    ) -> Iterator[Record]:
+        """Yields the messages that stay, without people whose label may not stay."""
+        topics = [topic for (topic, _), times in selection.times.items() if times]
         for bag in bags:
-            for record in or_errors(self.reader.records(bag.path, topics, _EVERYTHING)):
-                if isinstance(record, BagError):
-                    if self._failing.may_recover(bag.path, record):
-                        raise record
-                    continue
+            for record in self._readable_records(bag.path, topics):
                 channel = record.channel
-                if record.log_time not in chosen.times.get((channel.topic, channel.type), ()):
+                if record.log_time not in selection.times.get((channel.topic, channel.type), ()):
                     continue
-                if channel.latched and channel.topic not in chosen.latched:
-                    # Thinned, it would look like one whose messages hold until the next.
-                    metadata = tuple((key, value) for key, value in channel.metadata if key != _QOS)
-                    channel = replace(channel, latched=False, metadata=metadata)
-                stays = self._without_people(
-                    record._replace(channel=channel), rounds=channel.topic not in chosen.latched
-                )
-                if stays is not None:
-                    yield stays
+                is_latched = channel.topic in selection.latched
+                if channel.latched and not is_latched:
+                    # A thinned message must not look as if it were valid until the next.
+                    metadata = tuple(item for item in channel.metadata if item[0] != _QOS)
+                    record = record._replace(  # noqa: PLW2901 - as it stays
+                        channel=replace(channel, latched=False, metadata=metadata)
+                    )
+                staying = self._without_people(record, rounds=not is_latched)
+                if staying is not None:
+                    yield staying
+
+    def _readable_records(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
+        """Yields the messages of a bag; damaged ones are left out.
+
+        Raises:
+            BagError: the disk fails to read the bag, and may recover.
+        """
+        for record in or_errors(self.reader.records(path, topics, _EVERYTHING)):
+            if not isinstance(record, BagError):
+                yield record
+            elif self._failing.may_recover(path, record):
+                raise record
 
     def _tables(self, path: Path) -> Iterator[Table]:
-        """Yields the messages of a bag as tables; what is damaged of it is left out.
+        """Yields the messages of a bag as tables; damaged ones are left out.
 
         Raises:
             BagUnreachableError: the disk fails to read the bag, and may recover.
@@ -415,12 +445,17 @@ class MemoryDays:
                 _log.warning("memory_not_read", path=str(path), reason=group.reason)
 
     def _without_people(self, record: Record, *, rounds: bool) -> Record | None:
-        """Returns a message without people whose label may not stay, maybe with rounded numbers.
+        """Returns a message without people whose label may not stay.
 
-        None where it cannot be parted from them, or where no transform of it is left.
+        None if the people cannot be removed from it, or if it has no transform left.
+
+        Args:
+            record: the message.
+            rounds: whether its numbers are rounded, too.
         """
+        channel = record.channel
         try:
-            whole, channel = self.reader.decode(record), record.channel
+            whole = self.reader.decode(record)
             message = _without_hidden(whole, self._is_hidden)
             if message is not whole and getattr(message, "transforms", None) == []:
                 return None
@@ -435,19 +470,21 @@ class MemoryDays:
             return None
 
     def _names_people(self, message: object, type_name: str) -> bool:
-        extracted = self.extractor.exact(message, type_name)
-        texts = [value for _, value in fields_in(message) if isinstance(value, str)]
-        labels = [
-            detection.label for value in (extracted, *texts) for detection in detections_of(value)
-        ]
-        said = chain(zip(repeat(LABELS[0]), labels), _labels(message), *map(_labels_in_json, texts))
-        return any(starmap(self._is_hidden, said))
+        """Whether a detection, a name or a JSON text in a message has a label that may not stay."""
+        detections = [*detections_of(self.extractor.exact(message, type_name))]
+        labels = [*_labels(message)]
+        for _, value in fields_in(message):
+            if isinstance(value, str):
+                detections += detections_of(value)
+                labels += _labels_in_json(value)
+        labels += [(LABELS[0], detection.label) for detection in detections]
+        return any(self._is_hidden(field, text) for field, text in labels)
 
     def _is_hidden(self, field: str, text: str) -> bool:
-        """Returns whether a text in such a field is of people.
+        """Whether the text of a field is a label of people that may not stay.
 
-        As the label of a detection a number may be: 0 is a person in COCO. Joints and frames have
-        numbers, too, and those are none.
+        A number may be a label of a detection: 0 is a person in COCO. Numbers of joints and frames
+        are no labels.
         """
         if text in self._limits.labels:
             return False
@@ -455,17 +492,22 @@ class MemoryDays:
         return is_number or self._is_of_people(text)
 
     def _is_of_people(self, name: str) -> bool:
-        """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
-        # Whole, too: in `MÄDCHEN` and `McDonald` no word begins at a capital.
-        words = f"{_words_in(' '.join(_WORD.findall(name)))}{_words_in(name)}"
+        """Whether a label, a frame or a topic has a word for people in it: `person_1`."""
+        # The whole name as well: no word begins at a capital in `MÄDCHEN` and `McDonald`.
+        words = _words_in(" ".join(_WORD.findall(name))) + _words_in(name)
         return not _PEOPLE.isdisjoint(words.split()) or any(one in words for one in self._people)
 
     def _write_day(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
-        """Writes a day anew, with more messages, which are those of some bags that stay.
+        """Adds messages to a day.
+
+        Args:
+            day: the day (UTC), as `20261120`.
+            records: the messages that stay.
+            bags: the bags that these messages come from.
 
         Raises:
-            BagError: it cannot be written.
-            OSError: likewise.
+            BagError: the day cannot be written.
+            OSError: the day cannot be written.
         """
         if self._folder.is_symlink():
             raise BagError(str(self._folder), "a symbolic link, which is not followed: remove it")
@@ -475,62 +517,60 @@ class MemoryDays:
         self._replace_day(path, self._merged_by_hour(path, records), bags)
 
     def _replace_day(self, path: Path, records: Iterator[Record], bags: Sequence[BagFile]) -> None:
-        """Writes a new file that takes the name of a day, and lists the bags that it has now, too.
+        """Replaces the file of a day, and lists the bags that the day now stands for.
 
-        From that moment on those bags, and those listed for it before, count no longer.
+        From then on these bags, and those listed for the day before, no longer count.
         """
-        bag_dir, name = self._folder.parent, f"{MEMORY_FOLDER}/{path.name}"
+        name = f"{MEMORY_FOLDER}/{path.name}"
         with beside(path) as new:
             self.writer.write(new, records, dense=True)
-            status, before = new.stat(), Superseded()
+            status, known = new.stat(), Superseded()
             with suppress(ValueError):  # a damaged list is replaced
-                before = SUPERSEDED.read(bag_dir) or before
-            # Those that could not be deleted yet.
-            left = {bag: day for bag, day in before.bags.items() if (bag_dir / bag).exists()}
-            listed = left | {str(bag.path.relative_to(bag_dir)): name for bag in bags}
-            days = {other: before.days[other] for other in {*left.values()} - {name}}
+                known = SUPERSEDED.read(self.bag_dir) or known
+            # A bag that could not be deleted yet stays listed.
+            listed = {bag: day for bag, day in known.bags.items() if (self.bag_dir / bag).exists()}
+            days = {day: known.days[day] for day in {*listed.values()} - {name}}
             days[name] = status.st_size, status.st_mtime_ns
-            SUPERSEDED.write(bag_dir, Superseded(days, listed))
+            listed |= {str(bag.path.relative_to(self.bag_dir)): name for bag in bags}
+            SUPERSEDED.write(self.bag_dir, Superseded(days, listed))
             new.replace(path)
         flush(self._folder)
-        flush(bag_dir)
+        flush(self.bag_dir)
 
     def _writable_file(self, day: str) -> Path:
-        """Returns the file of a day that can be written anew: no damaged one, nor one of others."""
-        number = 0
-        while True:
+        """Returns a new file for a day, or its own whole one; never a damaged or a foreign one."""
+        for number in count():
             path = self._folder / memory_file(day, number)
-            if not path.exists():
-                return path
             with suppress(BagError):
-                if self._is_whole(path) and self.own.owns_bag(path):
-                    return path
-            number += 1
+                if not path.exists() or (self._is_whole(path) and self.own.owns_bag(path)):
+                    break
+        return path
 
     def _is_whole(self, path: Path) -> bool:
         summary = self.reader.summarize(path)
         return summary.complete and not summary.notes
 
     def _merged_by_hour(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
-        """Yields the messages of a day and others, hour by hour and topic by topic, copies once.
+        """Yields the messages of a day and `added` ones, hour by hour and topic by topic, each once.
 
-        So what is alike lies together, and compresses.
+        Similar messages lie together, and compress.
         """
         topics = [channel.topic for channel in self.reader.channels(path)] if path.exists() else []
         hours: defaultdict[int, list[Record]] = defaultdict(list)
         for record in added:
             hours[record.log_time // HOUR_NS].append(record)
         if topics:
-            # Not all from the first to the last: where the clock was set, years lie between.
-            batches = self.reader.batches(path, topics, _EVERYTHING, bare=topics)
-            for hour in {at // HOUR_NS for batch in batches for at in batch.log_times.tolist()}:
-                hours.setdefault(hour, [])
+            # Only hours with messages: if the clock was set, years may lie between two.
+            for batch in self.reader.batches(path, topics, _EVERYTHING, bare=topics):
+                for hour in np.unique(batch.log_times // HOUR_NS).tolist():
+                    hours.setdefault(hour, [])
         for hour in sorted(hours):
             window = TimeWindow(hour * HOUR_NS, (hour + 1) * HOUR_NS)
-            before = [*self.reader.records(path, topics, window)] if topics else []
+            records = hours[hour]
+            if topics:
+                records = [*self.reader.records(path, topics, window), *records]
             identities: set[tuple[str, Ns, Ns, bytes]] = set()
-            by_topic = attrgetter("channel.topic", "log_time")
-            for record in sorted([*before, *hours[hour]], key=by_topic):
+            for record in sorted(records, key=attrgetter("channel.topic", "log_time")):
                 channel, logged, published, payload = record
                 identity = (channel.topic, logged, published, payload)
                 if identity not in identities:
@@ -539,16 +579,16 @@ class MemoryDays:
 
 
 @dataclass(slots=True)
-class _Staying:
-    """Which messages of some bags stay.
+class _StayingMessages:
+    """Which messages of bags stay.
 
     Attributes:
-        times: their log times (ns), by topic and type.
-        latched: the topics of which all do.
-        left_out: of which topics none does, and why.
+        times: log times (ns) of the messages that stay, by topic and type.
+        latched: topics whose messages all stay.
+        left_out: topics whose messages all go, each with the reason.
     """
 
-    times: dict[tuple[str, str], set[Ns]] = field(default_factory=lambda: defaultdict(set))
+    times: dict[_TopicType, set[Ns]] = field(default_factory=lambda: defaultdict(set))
     latched: set[str] = field(default_factory=set)
     left_out: dict[str, str] = field(default_factory=dict)
 
@@ -559,9 +599,9 @@ def _words_in(name: str) -> str:
 
 
 def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:
-    """Yields the names in an entry of a list, each with its field.
+    """Yields each name in an entry of a list, with the field that has it.
 
-    Such as its `name`, or the `class_id` of its `results[0].hypothesis`.
+    A `name`, for example, or the `class_id` of `results[0].hypothesis`.
     """
     if isinstance(node, str):
         yield field, node
@@ -572,7 +612,7 @@ def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _labels_in_json(text: str) -> Iterator[tuple[str, str]]:
-    """Yields what a text that is JSON has for labels, also of states, each with its field."""
+    """Yields each label in a JSON text, with the key that has it."""
     fields: list[tuple[str, object]] = []
     if looks_like_json(text):
         with suppress(ValueError, RecursionError):
@@ -584,32 +624,35 @@ def _labels_in_json(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> object:
-    """Returns a decoded message without those entries of its lists that have a hidden label.
+    """Returns a decoded message without the entries of its lists that have a hidden label.
 
-    What lies at the same place of a list of texts belongs to it: `name`, `position`.
+    A list of texts names the entries of lists of the same length: `name` and `position`.
     """
     if not is_dataclass(message) or isinstance(message, type):
         return message
     lists = {
         name: value for name, value in fields_in(message) if isinstance(value, list | np.ndarray)
     }
-    hidden = {
-        name: {
-            row for row, item in enumerate(items) if any(starmap(is_hidden, _labels(item, name)))
-        }
-        for name, items in lists.items()
-    }
+    hidden = {name: _hidden_rows(name, items, is_hidden) for name, items in lists.items()}
     changed: dict[str, object] = {}
     for name, items in lists.items():
-        parallel = (
-            hidden[other]
-            for other, texts in lists.items()
-            if len(texts) == len(items) and all(isinstance(text, str) for text in texts)
-        )
-        gone = hidden[name].union(*parallel)
-        if gone:
-            left = [row for row in range(len(items)) if row not in gone]
-            changed[name] = (
-                items[left] if isinstance(items, np.ndarray) else [items[row] for row in left]
-            )
+        rows = set(hidden[name])
+        for other, texts in lists.items():
+            if len(texts) == len(items) and all(isinstance(text, str) for text in texts):
+                rows |= hidden[other]
+        if rows and isinstance(items, np.ndarray):
+            changed[name] = np.delete(items, [*rows])
+        elif rows:
+            changed[name] = [item for row, item in enumerate(items) if row not in rows]
     return replace(message, **changed) if changed else message
+
+
+def _hidden_rows(
+    name: str, items: Iterable[object], is_hidden: Callable[[str, str], bool]
+) -> set[int]:
+    """Returns the rows of the list `name` that have a hidden label."""
+    rows: set[int] = set()
+    for row, item in enumerate(items):
+        if any(is_hidden(field, text) for field, text in _labels(item, name)):
+            rows.add(row)
+    return rows

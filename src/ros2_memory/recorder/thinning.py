@@ -450,7 +450,7 @@ _MOST_PAUSES: Final = 32
 """Of a day; the messages beside each stay."""
 
 
-def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thinned:
+def with_shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thinned:
     """Returns what is known, and what some bags of a snapshot show; at least one bag."""
 
     def is_in(at: Ns) -> bool:
@@ -493,7 +493,7 @@ def _few_a_day(pauses: Iterable[Span]) -> Iterator[Span]:
             yield start, end
 
 
-def beside_pauses(pauses: Iterable[Span], times: IntArray) -> IntArray:
+def times_near(pauses: Iterable[Span], times: IntArray) -> IntArray:
     """Returns those of some log times (ns) that lie so near a pause that they show a step."""
     near = np.zeros(times.size, bool)
     for start, end in pauses:

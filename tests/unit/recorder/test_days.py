@@ -38,7 +38,7 @@ from ros2_memory.recorder import days as recorder_days
 from ros2_memory.recorder.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.recorder.thinning import beside_pauses
+from ros2_memory.recorder.thinning import times_near
 from ros2_memory.retention import collect
 from ros2_memory.retention.delete import remove_bag
 from ros2_memory.storage.base import BagWriter, Record
@@ -563,8 +563,8 @@ def test_pauses_of_other_days_are_not_compared_with_messages(
     split(bag_dir, 0)
     (bag_dir / "memory").mkdir()
     THINNED.write(bag_dir, Thinned(far[0][0], pauses=(*far, *near)))
-    compared = Mock(wraps=beside_pauses)
-    monkeypatch.setattr(recorder_days, "beside_pauses", compared)
+    compared = Mock(wraps=times_near)
+    monkeypatch.setattr(recorder_days, "times_near", compared)
     keep_all(bag_dir)
     assert [call.args[0] for call in compared.call_args_list] == [near] * compared.call_count
 
