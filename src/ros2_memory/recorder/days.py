@@ -57,8 +57,8 @@ from ros2_memory.recorder.thinning import (
     TopicThinning,
     fields_in,
     has_numbers,
-    is_said,
-    is_sampled,
+    has_samples,
+    has_speech,
     rounded,
     times_near,
     with_shown_by,
@@ -118,8 +118,8 @@ MONTH_NS: Final[Ns] = 31 * 86_400 * NS_PER_S
 _BY_MINUTE: Final = ("ros2_memory_numbers_s", "60")
 """In the metadata of each channel of a day that was thinned to minutes: it is not thinned again."""
 GRACE_S: Final = 86_400.0
-"""How long the recorder runs with `memory.keep=false` before it deletes the days: the setting may be
-an accident."""
+"""How long the recorder runs with `memory.keep=false` before it deletes the days: the setting may
+be an accident."""
 COUNTED_S: Final = 600.0
 """How often the rest of that time is written."""
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
@@ -381,11 +381,13 @@ class MemoryDays:
         topic = table.channel.topic
         if "" in table.left_out:
             return table.left_out[""]
-        if is_sampled(table):
+        if has_samples(table):
             return "it has long arrays of numbers"
         if self._is_of_people(f"{topic}/{table.channel.type}") and not self._limits.labels:
             return "it is of people, and memory.labels names none"
-        if is_said(table) and not any(match_topics((topic,), glob) for glob in self._limits.texts):
+        if has_speech(table) and not any(
+            match_topics((topic,), glob) for glob in self._limits.texts
+        ):
             return "it has texts, and memory.texts does not name it"
         return None
 
@@ -551,9 +553,9 @@ class MemoryDays:
         return summary.complete and not summary.notes
 
     def _merged_by_hour(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
-        """Yields the messages of a day and `added` ones, hour by hour and topic by topic, each once.
+        """Yields the messages of a day and `added` ones by hour and topic, each once.
 
-        Similar messages lie together, and compress.
+        Similar messages lie together, and compress well.
         """
         topics = [channel.topic for channel in self.reader.channels(path)] if path.exists() else []
         hours: defaultdict[int, list[Record]] = defaultdict(list)

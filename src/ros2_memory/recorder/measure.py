@@ -1,12 +1,15 @@
-"""Measures how topics arrive: of one closed split, and since the start."""
+"""Measures how topics arrive: their losses, QoS, bursts, rates and silences.
+
+Closed splits are measured one by one; `LossCounter` and `Arrivals` follow the topics across splits.
+"""
 
 from __future__ import annotations
 
 import re
 import struct
 from bisect import bisect_right
-from collections import Counter, deque
-from dataclasses import dataclass
+from collections import Counter, defaultdict, deque
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from statistics import fmean, median_low
@@ -20,21 +23,23 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.base import BagReader, Schema
+    from ros2_memory.storage.base import BagReader, Channel, Record, Schema
 
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 RECENT: Final = 6
-"""After so many splits nothing is waited for any more."""
+"""A message, or a recording, that is missing for so many splits does not come any more."""
 FEWEST: Final = 10
-"""Messages that show a cadence."""
+"""Fewer messages show no cadence."""
 REGULAR: Final = 0.9
-"""The part of all steps that must be of one length, or nothing is expected."""
+"""The share of all steps that must be of one length, or there is no cadence."""
 LONGEST_NS: Final[Ns] = 5 * NS_PER_S
-"""A longer hole is a publisher that was silent, and reported as that."""
+"""After a longer hole the publisher was silent, which is reported elsewhere."""
 MOST_MISSING: Final = 10_000
+"""More missing messages are a jump of the counter or the stamp."""
 _TOLERANCE: Final = 0.25
+"""So far, in periods, a regular step may be from the median."""
 _FIELD: Final = re.compile(r"^[ \t]*(\w\S*)[ \t]+(\w+)\b(?![ \t]*=)", re.MULTILINE)
-"""Type and name of each field; a constant has a value behind a `=`."""
+"""The type and the name of a field; a constant has a `=` as well."""
 _HEADERS: Final = frozenset({"std_msgs/Header", "std_msgs/msg/Header", "Header"})
 _TIMES: Final = frozenset(
     f"builtin_interfaces/{middle}{name}" for middle in ("", "msg/") for name in ("Time", "Duration")
@@ -76,23 +81,23 @@ Kind = Literal["counter", "stamps"]
 
 
 class Position(NamedTuple):
-    """Where one message lies: its counter or stamp (ns), and its log time."""
+    """The counter or stamp (ns) of one message, and its log time."""
 
     value: int
     log_time: Ns
 
 
 class Progress(NamedTuple):
-    """The messages of a topic in one split, at least one, by log time, and what shows holes."""
+    """The positions of a topic's messages in one split, at least one, by log time."""
 
     kind: Kind
     positions: Sequence[Position]
 
 
 class Hole(NamedTuple):
-    """Messages that are missing between two that are not.
+    """Messages that are missing between two others.
 
-    An open one may still turn out to be a late message: too few follow to tell.
+    `is_open`: too few messages follow to tell whether they only come late.
     """
 
     before: Position
@@ -103,56 +108,63 @@ class Hole(NamedTuple):
 
 @dataclass(slots=True)
 class _Series:
-    """What the recordings have of a topic, by value; the first message is settled."""
+    """The messages of a topic since the newest settled one, by value.
+
+    `heard` is how many splits had been measured when the topic last came.
+    """
 
     kind: Kind
     positions: list[Position]
-    heard: int = 0
-    """How many splits had been measured when it last came."""
+    heard: int
+
+
+class _Reached(NamedTuple):
+    """How many splits had been measured when a recording last came, and its newest log time."""
+
+    measured: int
+    log_time: Ns
 
 
 class LossCounter:
-    """What is missing in the splits of one bag directory, measured one after the other."""
+    """Counts the messages that are missing in the splits of one bag directory."""
 
     def __init__(self) -> None:
         self._measured = 0
-        # Of each recording, how many splits had been measured when it was last heard of, and up to
-        # which log time it has been.
-        self._recordings: dict[str, tuple[int, Ns]] = {}
+        self._recordings: dict[str, _Reached] = {}
         self._series: dict[str, _Series] = {}
         self._lately: deque[Loss] = deque(maxlen=10_000)
         self._counted: set[str] = set()
 
     def begin(self, recording: str) -> None:
-        """Notes that a recording begins, which may have what another one misses."""
-        self._recordings[recording] = self._measured, 0
+        """Notes that a recording begins, which may have messages that another one misses."""
+        self._recordings[recording] = _Reached(self._measured, 0)
 
-    def unclear(self, topics: Collection[str] | None = None) -> None:
-        """Notes that a split does not show what it has of these topics; None: of any."""
+    def forget(self, topics: Collection[str] | None = None) -> None:
+        """Forgets what is known of topics, all if None: a split does not show their messages."""
         for topic in [*self._series] if topics is None else topics:
             self._series.pop(topic, None)
 
-    def measured(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
-        """Takes the next split of a recording; returns the losses that are certain by now."""
+    def add_split(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
+        """Adds the next split of a recording; returns the losses that are certain by now."""
         self._measured += 1
         _, reached = self._recordings.get(recording, (0, 0))
-        ends = (progress.positions[-1].log_time for progress in split.values())
-        self._recordings[recording] = self._measured, max(reached, *ends, 0)
+        ends = [progress.positions[-1].log_time for progress in split.values()]
+        self._recordings[recording] = _Reached(self._measured, max(reached, *ends, 0))
         for topic, progress in split.items():
             self._add(topic, progress)
         self._recordings = {
-            name: (heard, reached)
-            for name, (heard, reached) in self._recordings.items()
-            if self._measured - heard < RECENT
+            name: reached
+            for name, reached in self._recordings.items()
+            if self._measured - reached.measured < RECENT
         }
-        return self._settle(min(reached for _, reached in self._recordings.values()))
+        return self._settle(min(reached.log_time for reached in self._recordings.values()))
 
     def flush(self) -> list[Loss]:
-        """Returns what no further split will fill."""
+        """Returns the losses that only a further split could disprove; none comes."""
         return self._settle(MAX_NS)
 
-    def reported(self, topic: str, start: Ns, stop: Ns, lost: int) -> list[Loss]:
-        """Takes rosbag2's own count of a topic; returns it where nothing else counts the topic."""
+    def add_reported(self, topic: str, start: Ns, stop: Ns, lost: int) -> list[Loss]:
+        """Adds rosbag2's own count of a topic; returns it unless the topic is counted already."""
         if topic in self._counted:
             return []
         loss = Loss(topic, start, stop, lost, "rosbag2")
@@ -160,7 +172,7 @@ class LossCounter:
         return [loss]
 
     def in_last_hour(self, now: Ns) -> dict[str, int]:
-        """Returns how many messages of each topic are missing of the last hour."""
+        """Returns how many messages of each topic are missing in the last hour."""
         lost = Counter[str]()
         for loss in self._lately:
             if loss.stop > now - HOUR_NS:
@@ -168,158 +180,162 @@ class LossCounter:
         return dict(lost)
 
     def _add(self, topic: str, progress: Progress) -> None:
-        """Puts what a split has of a topic together with what is known of it."""
+        """Merges the messages that a split has of a topic with those of other splits."""
         positions, series = progress.positions, self._series.get(topic)
         steps = enumerate(pairwise(positions), 1)
         back = [index for index, (before, after) in steps if before.value >= after.value]
         if len(back) > 1:  # several publishers
-            self.unclear([topic])
+            self.forget([topic])
             return
         last = positions[-1]
         if back and last.value < positions[back[0] - 1].value:
-            # Its publisher began anew. Else what it had sent before came again, as latched.
+            # The publisher began anew. Otherwise an earlier message came again, as latched.
             series, positions = None, positions[back[0] :]
         elif series is not None and last.value < series.positions[0].value:
-            series = None  # likewise, or the clock was set back
+            series = None  # it began anew between two splits, or the clock was set back
         known = [] if series is None else series.positions
-        by_value = dict(sorted((*known, *positions), reverse=True))
-        merged = [
-            Position(value, log_time)
-            for value, log_time in sorted(by_value.items())
-            if not known or value >= known[0].value
-        ]
+        earliest: dict[int, Ns] = {}
+        for value, log_time in (*known, *positions):
+            earliest[value] = min(log_time, earliest.get(value, log_time))
+        first = known[0].value if known else min(earliest)
+        merged = [Position(value, earliest[value]) for value in sorted(earliest) if value >= first]
         self._series[topic] = _Series(progress.kind, merged, self._measured)
 
     def _settle(self, until: Ns) -> list[Loss]:
-        """Returns the losses up to a log time that all recordings have reached."""
+        """Returns the losses up to a log time that all recordings have reached, each once."""
         losses: list[Loss] = []
         for topic, series in self._series.items():
-            positions, is_over = series.positions, until == MAX_NS
-            is_over |= self._measured - series.heard >= RECENT
-            settled = max(
-                (index for index, position in enumerate(positions) if position.log_time <= until),
-                default=0,
-            )
-            series_holes = holes(positions, series.kind)
-            if series_holes is not None:
+            is_over = until == MAX_NS or self._measured - series.heard >= RECENT
+            topic_holes = holes(series.positions, series.kind)
+            if topic_holes is not None:
                 self._counted.add(topic)
-            for hole in series_holes or ():
-                if hole.after.value > positions[settled].value:
+            settled = 0
+            for index, position in enumerate(series.positions):
+                if position.log_time <= until:
+                    settled = index
+            for hole in topic_holes or ():
+                if hole.after.value > series.positions[settled].value:
                     break
                 if hole.is_open and not is_over:
-                    settled = positions.index(hole.before)
+                    settled = series.positions.index(hole.before)
                     break
-                losses.append(
-                    Loss(
-                        topic, hole.before.log_time, hole.after.log_time, hole.missing, series.kind
-                    )
-                )
-            series.positions = positions[settled:]
+                start, stop = hole.before.log_time, hole.after.log_time
+                losses.append(Loss(topic, start, stop, hole.missing, series.kind))
+            series.positions = series.positions[settled:]
         self._lately += losses
         return losses
 
 
 class ValueReader(NamedTuple):
-    """What shows holes in messages of a type: a counter, or stamps (ns).
+    """Reads the counter, or the stamp (ns), of messages of a type.
 
-    `value_of` takes a payload, and raises `struct.error` for one that does not fit.
+    `value_of` takes a payload, and raises `struct.error` if it is too short.
     """
 
     kind: Kind
     value_of: Callable[[bytes], int]
 
 
-def reader_of(schema: Schema) -> ValueReader | None:
-    """Returns what shows holes in messages of this type; None where nothing does."""
+def value_reader(schema: Schema) -> ValueReader | None:
+    """Returns what reads the counter or stamp of a type; None if it has neither."""
     if schema.encoding != "ros2msg":
         return None
     fields = _FIELD.findall(schema.text.decode(errors="replace").partition("\n===")[0])
     before: list[str] = []
     for kind, name in fields:
-        if name in _COUNTERS and (form := _FORMS.get(kind)) in _COUNTED:
-            value_of = partial(_counter, before=tuple(before), form=form)
-            return ValueReader("counter", value_of)
+        form = _FORMS.get(kind)
+        if name in _COUNTERS and form in _COUNTED:
+            return ValueReader("counter", partial(_counter, before=tuple(before), form=form))
         if kind not in {"string", *_FORMS, *_HEADERS, *_TIMES}:
             break
         before.append(kind)
-    first_type, _ = fields[0] if fields else ("", "")
-    return ValueReader("stamps", _stamp) if first_type in _HEADERS else None
+    if fields and fields[0][0] in _HEADERS:
+        return ValueReader("stamps", _stamp)
+    return None
 
 
 def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
-    """Returns the holes between messages, in the order of their positions.
-
-    None where no cadence is to be seen, so that nothing can be expected: few messages, irregular
-    ones, or several publishers.
+    """Returns the holes between messages; None if the messages have no cadence.
 
     A message that was stamped late leaves a wide step, too, but then the next ones follow in a
-    burst. So what counts is how far behind the cadence the messages after the step remain.
+    burst. So a hole counts by how far the messages after it stay behind the cadence.
     """
-    steps = [(before, after, after.value - before.value) for before, after in pairwise(positions)]
-    lengths = [length for _, _, length in steps if length > 0]
-    if len(positions) < FEWEST or len(steps) - len(lengths) > 1:
+    period = _cadence(positions, kind)
+    if period is None:
         return None
-    usual = 1 if kind == "counter" else median_low(lengths)
-    allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
-    regular = [length for length in lengths if abs(length - usual) <= allowed]
-    if len(regular) < REGULAR * len(steps):
-        return None
-    period = fmean(regular)  # Jitter cancels out in it, and does not in a median.
-    holes_found: list[Hole] = []
-    for index, (before, after, length) in enumerate(steps):
+    holes: list[Hole] = []
+    for index, (before, after) in enumerate(pairwise(positions), 1):
+        length = after.value - before.value
         missing = round(length / period) - 1
-        wide = length > (2 - _TOLERANCE) * period
-        short = after.log_time - before.log_time <= LONGEST_NS and missing <= MOST_MISSING
-        if not (wide and short):
+        is_silence = after.log_time - before.log_time > LONGEST_NS or missing > MOST_MISSING
+        if is_silence or length <= (2 - _TOLERANCE) * period:
             continue
         enough = 1 if kind == "counter" else missing + FEWEST
-        later = positions[index + 1 : index + 1 + enough]
-        behind = (
-            min(position.value - nth * period for nth, position in enumerate(later, 1))
-            - before.value
-        )
-        if (missing := round(behind / period)) > 0:
-            holes_found.append(Hole(before, after, missing, len(later) < enough))
-    return holes_found
+        later = positions[index : index + enough]
+        due = [position.value - nth * period for nth, position in enumerate(later, 1)]
+        missing = round((min(due) - before.value) / period)
+        if missing > 0:
+            holes.append(Hole(before, after, missing, len(later) < enough))
+    return holes
+
+
+def _cadence(positions: Sequence[Position], kind: Kind) -> float | None:
+    """Returns the usual step from message to message; None of few, irregular or mixed messages."""
+    steps = [after.value - before.value for before, after in pairwise(positions)]
+    forward = [step for step in steps if step > 0]
+    # A second step back comes from a second publisher.
+    if len(positions) < FEWEST or len(steps) - len(forward) > 1:
+        return None
+    usual = 1 if kind == "counter" else median_low(forward)
+    allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
+    regular = [step for step in forward if abs(step - usual) <= allowed]
+    if len(regular) < REGULAR * len(steps):
+        return None
+    return fmean(regular)  # jitter cancels out in a mean, and not in a median
 
 
 def _stamp(payload: bytes) -> int:
+    """Returns the stamp (ns) of a CDR message that begins with a header."""
     seconds, nanoseconds = struct.unpack_from("<iI", payload, 4)
     return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
 def _counter(payload: bytes, before: Sequence[str], form: str) -> int:
-    at = 0
+    """Returns the counter behind fields of the types `before`; CDR has 4 bytes in front."""
+    offset = 0
     for kind in before:
         if kind in _FORMS:
             size = struct.calcsize(_FORMS[kind])
-            at = _aligned(at, size) + size
+            offset = _aligned(offset, size) + size
             continue
-        at = _aligned(at, 4)
+        offset = _aligned(offset, 4)
         if kind != "string":
-            at += 8
+            offset += 8  # a time
         if kind == "string" or kind in _HEADERS:
-            at += 4 + int(struct.unpack_from("<I", payload, 4 + at)[0])
-    return int(struct.unpack_from(form, payload, 4 + _aligned(at, struct.calcsize(form)))[0])
+            offset += 4 + int(struct.unpack_from("<I", payload, 4 + offset)[0])
+    offset = _aligned(offset, struct.calcsize(form))
+    return int(struct.unpack_from(form, payload, 4 + offset)[0])
 
 
-def _aligned(at: int, size: int) -> int:
-    return -(-at // size) * size
+def _aligned(offset: int, size: int) -> int:
+    return -(-offset // size) * size
 
 
 HOLD_S: Final = 2.0
-"""A queue holds what arrives within so many seconds."""
+"""A queue holds the messages of so many seconds."""
 MESSAGE_BYTES: Final = 256
-"""What a queued message takes besides its payload, in bytes: sample, change and allocation."""
+"""A queued message takes so much besides its payload: sample, change and allocation."""
 
 # Enumerations are numbers up to Iron (rmw/types.h), names since.
 _RELIABLE: Final = frozenset({"reliable", "1"})
 _LATCHED: Final = frozenset({"transient_local", "1"})
-_POLICY: Final = re.compile(r"\b(reliability|durability): *(\w+)")
+# Patterns: parsing YAML would take longer than all else that is measured.
+_RELIABILITY: Final = re.compile(r"\breliability: *(\w+)")
+_DURABILITY: Final = re.compile(r"\bdurability: *(\w+)")
 
 
 class OfferedQos(NamedTuple):
-    """What all publishers of a topic offer: `reliable`, and `latched` (transient local)."""
+    """The QoS that all publishers of a topic offer; `latched` is transient local."""
 
     reliable: bool
     latched: bool
@@ -340,11 +356,11 @@ class TopicFlow(NamedTuple):
 
     @property
     def message_bytes(self) -> int:
-        """What one of its messages may take in a queue, in bytes."""
+        """The bytes that one of its messages may take in a queue."""
         return self.largest + MESSAGE_BYTES
 
     def joined(self, newer: TopicFlow) -> TopicFlow:
-        """Returns the newer flow, with peaks of this one that fade by a tenth with each split."""
+        """Returns the newer flow; the peaks of this one fade by a tenth with each split."""
         return newer._replace(
             burst=max(newer.burst, self.burst * 9 // 10),
             largest=max(newer.largest, self.largest * 9 // 10),
@@ -352,17 +368,15 @@ class TopicFlow(NamedTuple):
 
 
 def offered_by_all(texts: Collection[str]) -> OfferedQos | None:
-    """Returns what all publishers offer, by rosbag2's `offered_qos_profiles` in one bag.
+    """Returns the QoS that all publishers offer; None if no publisher is listed.
 
-    Best effort if any publisher is, volatile if any is; None where the texts list no publisher, as
-    those of other programs.
+    It is best effort if any publisher is, and volatile if any is.
+
+    Args:
+        texts: rosbag2's `offered_qos_profiles` of the topic's channels in one bag.
     """
-    # Parsing YAML takes longer than all else that is measured.
-    policies = [policy for text in texts for policy in _POLICY.findall(text)]
-    reliability, durability = (
-        [value for name, value in policies if name == wanted]
-        for wanted in ("reliability", "durability")
-    )
+    reliability = [value for text in texts for value in _RELIABILITY.findall(text)]
+    durability = [value for text in texts for value in _DURABILITY.findall(text)]
     if not reliability:
         return None
     return OfferedQos(
@@ -373,19 +387,20 @@ def offered_by_all(texts: Collection[str]) -> OfferedQos | None:
 
 
 SPLIT_BYTES: Final = 64 * 2**20
-"""Of a larger split only the last seconds are measured, and no holes, to spare the processor."""
+"""Only the end of a larger split is measured, and no holes, to spare the processor."""
 TAIL_NS: Final[Ns] = 4 * NS_PER_S
+"""The length of that end."""
 _HOLD_NS: Final[Ns] = ns_from_unix(HOLD_S)
 _FEWEST: Final = 5
-"""Messages that show a rate, where a topic did not last for `HOLD_S`."""
+"""So many messages show a rate, even if they did not last for `HOLD_S`."""
 
 MEASURED_NS: Final[Ns] = 30 * NS_PER_S
-"""Rates are those of the newest data of this length; a topic is regular after as long."""
+"""Rates are measured over the newest data of this length; a topic is regular after as long."""
 SILENT_PERIODS: Final = 10
 LEAST_SILENCE_NS: Final[Ns] = 10 * NS_PER_S
-"""Shorter pauses are no silence, however often a topic comes: splits show no more."""
+"""A shorter pause is no silence, however often a topic comes: splits do not show it."""
 IRREGULAR_NS: Final[Ns] = 3600 * NS_PER_S
-"""After a silence a topic does not count as regular for so long."""
+"""A topic does not count as regular for so long after a silence."""
 _REGULAR: Final = 20
 """Messages that make a topic regular."""
 _SET_BACK_NS: Final[Ns] = 60 * NS_PER_S
@@ -419,9 +434,9 @@ class SplitMeasure(NamedTuple):
     """How the topics of one split arrived.
 
     Attributes:
-        flows: of those whose offered QoS the split states.
-        progress: of those with one publisher, whose messages show what is missing.
-        arrivals: of all topics that have a message.
+        flows: topics whose offered QoS the split states.
+        progress: topics with one publisher, whose messages have a counter or a stamp.
+        arrivals: all topics that have a message.
     """
 
     flows: Mapping[str, TopicFlow]
@@ -439,74 +454,91 @@ class SplitMeasure(NamedTuple):
         return max(arrival.last for arrival in self.arrivals.values())
 
 
+@dataclass(slots=True)
+class _Messages:
+    """The messages of one topic in a split."""
+
+    offered_texts: list[str] = field(default_factory=list)
+    value_reader: ValueReader | None = None
+    published: list[Ns] = field(default_factory=list)
+    largest: int = 0
+    arrival: Arrival | None = None
+    positions: list[Position] = field(default_factory=list)
+
+    def add_channel(self, channel: Channel) -> None:
+        metadata = channel.metadata
+        self.offered_texts += [text for name, text in metadata if name == "offered_qos_profiles"]
+        self.value_reader = value_reader(channel.schema) or self.value_reader
+
+    def add(self, record: Record) -> None:
+        logged = record.log_time
+        self.published.append(record.publish_time or logged)
+        self.largest = max(self.largest, len(record.payload))
+        arrival = Arrival(logged, logged)
+        self.arrival = arrival if self.arrival is None else self.arrival.joined(arrival)
+        if self.value_reader is not None:
+            try:
+                value = self.value_reader.value_of(record.payload)
+            except struct.error:
+                self.value_reader = None
+            else:
+                self.positions.append(Position(value, logged))
+
+
 def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> SplitMeasure:
     """Returns how each topic of a closed split arrived.
 
-    `end_only`: of a small split, too, only the last seconds are measured, and no holes.
+    `end_only` measures only the last seconds of a small split, too, and no holes.
 
     Raises:
         BagError: the split cannot be read.
-        OSError: it is not there.
+        OSError: the split does not exist.
     """
-    offers: dict[str, list[str]] = {}
-    readers: dict[str, ValueReader] = {}
+    topics: defaultdict[str, _Messages] = defaultdict(_Messages)
     for channel in reader.channels(path):
-        texts = offers.setdefault(channel.topic, [])
-        texts += [text for name, text in channel.metadata if name == "offered_qos_profiles"]
-        if value_reader := reader_of(channel.schema):
-            readers[channel.topic] = value_reader
+        topics[channel.topic].add_channel(channel)
     window = TimeWindow.everything()
     is_whole = not end_only and path.stat().st_size <= SPLIT_BYTES
     if not is_whole and not (summary := reader.summarize(path)).empty:
         window = TimeWindow.before(summary.end, TAIL_NS)
-    times: dict[str, list[Ns]] = {}
-    largest: dict[str, int] = {}
+    for record in reader.records(path, [*topics], window):
+        topics[record.channel.topic].add(record)
+    flows: dict[str, TopicFlow] = {}
+    progress: dict[str, Progress] = {}
     arrivals: dict[str, Arrival] = {}
-    positions: dict[str, list[Position]] = {}
-    for record in reader.records(path, offers, window):
-        topic, logged = record.channel.topic, record.log_time
-        times.setdefault(topic, []).append(record.publish_time or logged)
-        largest[topic] = max(largest.get(topic, 0), len(record.payload))
-        arrival = Arrival(logged, logged)
-        arrivals[topic] = arrivals[topic].joined(arrival) if topic in arrivals else arrival
-        if topic in readers:
-            try:
-                position = Position(readers[topic].value_of(record.payload), logged)
-            except struct.error:
-                del readers[topic]
-            else:
-                positions.setdefault(topic, []).append(position)
-    flows = {
-        topic: TopicFlow(offered, burst_of(published), largest[topic])
-        for topic, published in times.items()
-        if (offered := offered_by_all(offers[topic])) is not None
-    }
-    progress = {
-        topic: Progress(readers[topic].kind, of_topic)
-        for topic, of_topic in positions.items()
-        if is_whole and topic in readers and topic in flows and flows[topic].offered.publishers == 1
-    }
+    for topic, messages in topics.items():
+        if messages.arrival is None:
+            continue
+        arrivals[topic] = messages.arrival
+        offered = offered_by_all(messages.offered_texts)
+        if offered is None:
+            continue
+        flows[topic] = TopicFlow(offered, largest_burst(messages.published), messages.largest)
+        if is_whole and messages.value_reader is not None and offered.publishers == 1:
+            progress[topic] = Progress(messages.value_reader.kind, messages.positions)
     return SplitMeasure(flows, progress, arrivals)
 
 
-def burst_of(published: Sequence[Ns]) -> int:
-    """Returns the most messages within `HOLD_S`, of times of one or more.
+def largest_burst(published: Sequence[Ns]) -> int:
+    """Returns the most messages within `HOLD_S`, by their publish times; there must be one.
 
-    A shorter topic is assumed to continue at its rate: it may have just started.
+    A topic that did not last for `HOLD_S` may have just started: its rate is extrapolated.
     """
     ordered = sorted(published)
-    counts = (nth - bisect_right(ordered, at - _HOLD_NS) for nth, at in enumerate(ordered, 1))
-    most, lasted = max(counts), ordered[-1] - ordered[0]
+    counts = [nth - bisect_right(ordered, time - _HOLD_NS) for nth, time in enumerate(ordered, 1)]
+    lasted = ordered[-1] - ordered[0]
     if len(ordered) >= _FEWEST and 0 < lasted < _HOLD_NS:
-        return max(most, -(-(len(ordered) - 1) * _HOLD_NS // lasted))
-    return most
+        extrapolated = -(-(len(ordered) - 1) * _HOLD_NS // lasted)
+        return max(*counts, extrapolated)
+    return max(counts)
 
 
 @dataclass(slots=True)
 class _Topic:
+    """A topic since its last silence, which ended at the log time `resumed`."""
+
     arrival: Arrival
-    paused: Ns | None = None
-    """When its last silence ended."""
+    resumed: Ns | None = None
 
     @property
     def patience(self) -> Ns:
@@ -516,7 +548,7 @@ class _Topic:
         arrival = self.arrival
         if arrival.messages < _REGULAR or arrival.last - arrival.first < MEASURED_NS:
             return False
-        return self.paused is None or now - self.paused > IRREGULAR_NS
+        return self.resumed is None or now - self.resumed > IRREGULAR_NS
 
 
 class Arrivals:
@@ -528,8 +560,8 @@ class Arrivals:
         self._newest: Ns = 0
         self._silent = set[str]()
 
-    def measured(self, split: SplitMeasure) -> None:
-        """Takes the next closed split."""
+    def add_split(self, split: SplitMeasure) -> None:
+        """Adds the next closed split."""
         if not split.arrivals:
             return
         end = split.end
@@ -539,36 +571,39 @@ class Arrivals:
             for measured in (*self._splits, split)
             if self._newest - MEASURED_NS < measured.end <= self._newest
         ]
-        for topic, arrival in split.arrivals.items():
-            topic_state = self._topics.get(topic)
-            if topic_state is None or arrival.last < topic_state.arrival.last - _SET_BACK_NS:
-                self._topics[topic] = _Topic(arrival)
-                self._silent.discard(topic)
+        for name, arrival in split.arrivals.items():
+            topic = self._topics.get(name)
+            if topic is None or arrival.last < topic.arrival.last - _SET_BACK_NS:
+                self._topics[name] = _Topic(arrival)
+                self._silent.discard(name)
                 continue
-            joined = topic_state.arrival.joined(arrival)
-            if joined.last > topic_state.arrival.last:
-                self._silent.discard(topic)
-            if max(arrival.pause, arrival.first - topic_state.arrival.last) > topic_state.patience:
-                topic_state.arrival, topic_state.paused = arrival, arrival.first
-            else:
-                topic_state.arrival = joined
+            last, patience = topic.arrival.last, topic.patience
+            topic.arrival = topic.arrival.joined(arrival)
+            if topic.arrival.last > last:
+                self._silent.discard(name)
+            if max(arrival.pause, arrival.first - last) > patience:
+                topic.arrival, topic.resumed = arrival, arrival.first
 
-    def silent(self, idle: Ns) -> frozenset[str]:
-        """Returns the topics that came regularly, and have stopped: for ten periods, 10 s at least.
+    def silent_topics(self, idle: Ns) -> frozenset[str]:
+        """Returns the regular topics that have not come for ten periods, and for 10 s at least.
 
-        One that was found silent stays so until it comes again, also if `idle` is shorter then.
-        `idle`: for how long (ns) nothing has come at all.
+        A silent topic stays silent until it comes again.
+
+        Args:
+            idle: how long nothing at all has come (ns).
         """
         now = self._newest + idle
-        self._silent |= {
-            name
-            for name, topic in self._topics.items()
-            if topic.is_regular(now) and now - topic.arrival.last > topic.patience
-        }
+        for name, topic in self._topics.items():
+            if topic.is_regular(now) and now - topic.arrival.last > topic.patience:
+                self._silent.add(name)
         return frozenset(self._silent)
 
     def rates_hz(self, idle: Ns) -> Mapping[str, float]:
-        """Returns the messages a second of each topic in the newest data; see `silent`."""
+        """Returns the messages a second of each topic in the newest data.
+
+        Args:
+            idle: how long nothing at all has come (ns).
+        """
         if not self._splits:
             return {}
         start = min(split.start for split in self._splits)

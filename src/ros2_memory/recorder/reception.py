@@ -252,7 +252,7 @@ class Reception:
         def reported() -> list[Loss]:
             state = self._recordings.get(recording)
             start, stop = (0, 0) if state is None else state.span
-            return self._losses.reported(topic, start, stop, count)
+            return self._losses.add_reported(topic, start, stop, count)
 
         self.background.add(_TASK, lambda: self._report_losses(reported))
 
@@ -264,7 +264,7 @@ class Reception:
     def arrivals(self, idle: Ns) -> tuple[frozenset[str], Mapping[str, float]]:
         """Returns the topics that have stopped, and the rates of all, see `Arrivals`."""
         with self._lock:
-            return self._arrivals.silent(idle), self._arrivals.rates_hz(idle)
+            return self._arrivals.silent_topics(idle), self._arrivals.rates_hz(idle)
 
     def _report_losses(self, take: Callable[[], list[Loss]]) -> None:
         with self._lock:
@@ -364,7 +364,7 @@ class Reception:
             # The file is reported where it matters; its successor shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
             with self._lock:
-                self._losses.unclear()
+                self._losses.forget()
             return
         with self._lock:
             before = self._plan_queues().cut_short
@@ -376,9 +376,9 @@ class Reception:
                     if not flow.offered.reliable:
                         self._asked_anew[topic] = _Anew(best_effort=True)
             short = self._plan_queues().cut_short - before
-            self._losses.unclear(split.arrivals.keys() - split.progress.keys())
+            self._losses.forget(split.arrivals.keys() - split.progress.keys())
             if recording:
-                self._arrivals.measured(split)
+                self._arrivals.add_split(split)
             if state is not None and split.arrivals:
                 # Of a large split only the end is measured.
                 start, (first, last) = summary.start, state.span
@@ -389,7 +389,7 @@ class Reception:
                 )
                 state.span = first or start, split.end
         if recording:
-            self._report_losses(lambda: self._losses.measured(recording, split.progress))
+            self._report_losses(lambda: self._losses.add_split(recording, split.progress))
         for topic in sorted(short):
             _log.warning(
                 "queue_cut_short",

@@ -1,19 +1,19 @@
-"""Which messages of a topic stay when its bags are deleted, by their columns, and what else. Pure.
+"""Chooses the messages of a topic that stay when its bags are deleted. Pure.
 
-A message that stays is as it was recorded. Those go that say again what others say:
+A message that stays is as it was recorded. A message goes if another one says the same:
 
-- What moves has a pose a second (`STEP_NS`), and one in two while it stands: standstills are found,
-  and where poses are farther apart none was recorded.
-- Of a boolean, a status or a name every message stays that changes it, and the last one before. An
-  integer is a status in five minutes in which it has few values, or does not change often.
-- Of the detections of a second, and of the transforms of a slot, as few messages stay as show all
-  labels and frames, each label with its highest score (`_STEPS`), and the most of one at once.
-- Of numbers one of each slot stays, and their least and greatest of five minutes.
+- Poses: one a second stays while the frame or robot moves (`STEP_NS`), one in two seconds while it
+  stands. So standstills are found, and poses that are farther apart mean that none was recorded.
+- Booleans, statuses and names: every message that changes the value stays, and the one before it.
+  An integer is a status in five minutes in which it has few values, or does not change often.
+- Detections of a second, and transforms of a slot: as few messages stay as show all labels and
+  frames, each label with its highest score (`_STEPS`), and the most of a label at once.
+- Other numbers: one message a slot stays, and the least and the greatest value of five minutes.
 
-No topic is silent for longer than a slot and its own period: what counts as a silence, was one.
+No topic is silent for longer than a slot and its own period: a longer silence was a silence.
 
-Bags also show silences, pauses, steps of the clock and crashes. Those messages are too few to show
-them: `memory/thinned.json` states them.
+Bags also show silences, pauses, steps of the clock and crashes. The messages that stay are too few
+to show them, so `memory/thinned.json` states them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from math import ceil, isnan, log2, nan
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, TypeGuard
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -52,9 +52,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import IntArray
 
-    Name = tuple[str, int]
+    Name = tuple[str, int]  # a label or frame, and its number in the message
     Scored = tuple[float, float]  # the step of a score, and the score
-    _Value = tuple[float, Ns]  # and its log time
     Points = NDArray[np.float64]
 
 _RELATIVE_BITS: Final = 20
@@ -62,12 +61,12 @@ _RELATIVE_BITS: Final = 20
 
 
 def rounded(message: object, definition: Definition | None, path: str = "") -> object:
-    """Returns a decoded message with rounded numbers; integers, texts and times are as they were.
+    """Returns a decoded message with rounded numbers; integers, texts and times stay exact.
 
     Args:
-        message: the message, or what is at `path` in one.
-        definition: of the whole message.
-        path: as `pose.pose.position`.
+        message: the message, or the value at `path` in one.
+        definition: the definition of the whole message.
+        path: the path of the value, such as `pose.pose.position`.
     """
     if isinstance(message, float):
         return float(_rounded(np.array(message), step_of(path, definition)))
@@ -85,7 +84,7 @@ def rounded(message: object, definition: Definition | None, path: str = "") -> o
 
 
 def fields_in(node: object) -> Iterator[tuple[str, object]]:
-    """Yields the fields of a decoded message, by name; none of an object that is no message."""
+    """Yields the name and value of each field of a decoded message; none of any other object."""
     if is_dataclass(node) and not isinstance(node, type):
         for member in fields(node):
             yield member.name, getattr(node, member.name)
@@ -104,9 +103,11 @@ def _rounded(numbers: Points, step: Step) -> Points:
 
 
 STEP_NS: Final[Ns] = NS_PER_S
+"""One pose stays in so long."""
 STANDING_NS: Final[Ns] = 2 * NS_PER_S
+"""One pose stays in so long while it does not change."""
 PAUSE_NS: Final[Ns] = 3 * NS_PER_S
-"""With a slot of 7 s no more than the 10 s of a silence lie between two messages that stay."""
+"""With a slot of 7 s, at most the 10 s of a silence lie between two messages that stay."""
 MINUTE_NS: Final[Ns] = 60 * NS_PER_S
 EXTREMES_NS: Final[Ns] = 300 * NS_PER_S
 _MOVED: Final = 0.05
@@ -115,30 +116,30 @@ _FEW: Final = 8
 _OFTEN: Final = 7
 """Integers of more than `_FEW` values that change more often in a slot are measurements."""
 _STEPS: Final = 20
-"""Of a unit of scores: one of 0.52 may stay for one of 0.54. Above 0.5 both are found."""
+"""Steps of a unit of scores: a score of 0.52 may stand for one of 0.54."""
 _HIGHEST: Final = 1e6
 _SINGLE: Final = 1e-6
-"""What a number of 32 bits may be less than what was meant."""
+"""By so much a number of 32 bits may be too small."""
 _UNSCORED: Final = (0.0, 0.0)
 _LONG: Final = 64
 """Messages with longer arrays are samples: scans, maps, sound, features of faces."""
 _DEGREE_M: Final = 111_320.0
-"""Metres of a degree of latitude."""
+"""Metres in a degree of latitude."""
 _FRAME: Final = "child_frame_id"
 _TURNS: Final = {"position": "orientation", "translation": "rotation"}
 _MORE_NAMES: Final = frozenset({"location", "serial_number"})
 
 
-def is_said(table: Table) -> bool:
-    """Returns whether messages say something in words: they have a text that names nothing."""
+def has_speech(table: Table) -> bool:
+    """Whether messages have a text that is not a name: speech, descriptions, logs."""
     return any(
         isinstance(column, Texts) and name not in NAMES_IN_MESSAGES | _MORE_NAMES
-        for name, column in _columns(table.columns, table.elements)
+        for name, column in _named_columns(table.columns, table.elements)
     )
 
 
 def has_numbers(table: Table) -> bool:
-    """Returns whether messages are measurements: numbers with a fraction that are no pose."""
+    """Whether messages are measurements: floating-point numbers that are not a pose."""
     measured = any(_is_measured(column) for column in table.columns.values())
     lists = any(inner.columns.keys() != {""} for inner in table.elements.values())
     return measured and not lists and not _poses(table.columns)
@@ -148,122 +149,151 @@ def _is_measured(column: Column) -> TypeGuard[Numbers]:
     return not isinstance(column, Texts) and column.dtype.kind == "f"
 
 
-def _columns(
+def _named_columns(
     columns: Mapping[str, Column], elements: Mapping[str, Elements]
 ) -> Iterator[tuple[str, Column]]:
-    """Yields each column with the name of its field; an element without fields has its list's."""
+    """Yields each column with its field's name, or its list's if elements have no fields."""
     for path, column in columns.items():
         yield path.rpartition(".")[2], column
     for path, inner in elements.items():
-        for name, column in _columns(inner.columns, inner.elements):
+        for name, column in _named_columns(inner.columns, inner.elements):
             yield name or path.rpartition(".")[2], column
 
 
 @dataclass(slots=True)
 class _Mover:
-    """A frame or a robot, by the last pose of it that stays, and the last that was looked at.
+    """A frame or a robot.
 
-    `kept` is the log time of the newest message that stays for it.
+    Attributes:
+        slot: the second of the newest pose, in units of `STEP_NS`.
+        pose: the newest pose that stays for its place.
+        seen: the log time of the newest pose that was compared; 0 before the first.
+        stayed: the log time of the newest pose that stays.
     """
 
     slot: int = -1
-    stays: Points = field(default_factory=lambda: np.full(0, np.nan))
-    before: Ns = 0
-    kept: Ns = 0
+    pose: Points = field(default_factory=lambda: np.full(0, np.nan))
+    seen: Ns = 0
+    stayed: Ns = 0
 
-    def moved(self, times: IntArray, poses: Points) -> Iterator[Ns]:
-        """Yields the log times of the poses that stay, since it moved; also of those before it did.
+    def staying_times(self, times: IntArray, poses: Points) -> Iterator[Ns]:
+        """Yields the log times of the poses that stay: when it moved, and the pose before.
 
         Args:
             times: log times, ascending.
-            poses: a row for each, of metres and components of a unit quaternion.
+            poses: a row for each time, of metres and components of a unit quaternion.
         """
-        steps = times // STEP_NS
-        for nth in np.flatnonzero(np.diff(steps, prepend=self.slot)).tolist():
-            pose, time = poses[nth], int(times[nth])
-            if self.stays.size != pose.size or not (abs(pose - self.stays) < _MOVED).all():
-                if self.before:
-                    yield self.before
+        slots = times // STEP_NS
+        for row in np.flatnonzero(np.diff(slots, prepend=self.slot)).tolist():
+            pose, time = poses[row], int(times[row])
+            if self.pose.size != pose.size or not (abs(pose - self.pose) < _MOVED).all():
+                if self.seen:
+                    yield self.seen
                 yield time
-                self.stays, self.kept = pose, time
-            elif time - self.kept >= STANDING_NS:
+                self.pose, self.stayed = pose, time
+            elif time - self.stayed >= STANDING_NS:
                 yield time
-                self.kept = time
-            self.before = time
-        self.slot = int(steps[-1])
+                self.stayed = time
+            self.seen = time
+        self.slot = int(slots[-1])
+
+
+class _Extremes(NamedTuple):
+    """The least and the greatest value of a column in a slot, each with its log time."""
+
+    least: tuple[float, Ns]
+    greatest: tuple[float, Ns]
+
+
+class _Changes(NamedTuple):
+    """The changes of an integer in a slot: the log times before and after each.
+
+    `values` are the integer's values, at most one more than `_FEW`.
+    """
+
+    values: Numbers
+    before: IntArray
+    after: IntArray
 
 
 @dataclass(slots=True)
 class TopicThinning:
-    """Chooses the messages of a topic that stay; its tables are added in order of time.
+    """Chooses the messages of a topic that stay. Add its tables in order of time.
 
-    `detections` finds what was seen in a table. Of measurements one message stays in
-    `numbers_ns`.
+    Args:
+        detections: finds the detections in a table.
+        numbers_ns: the slot in which one message of measurements stays.
     """
 
     detections: DetectionColumns
     numbers_ns: Ns = THINNED_NS
     _last: Ns | None = None
-    _stays: list[IntArray] = field(default_factory=list)
+    _staying: list[IntArray] = field(default_factory=list)
     _slot: int = -1
-    _named: dict[Name, Scored] = field(default_factory=dict)
+    _seen: dict[Name, Scored] = field(default_factory=dict)
     _values: dict[str, tuple[object, Ns]] = field(default_factory=dict)
     _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
-    _extremes: dict[tuple[str, int], tuple[_Value, _Value]] = field(default_factory=dict)
-    """The least and the greatest value of a column in some minutes."""
-    _changes: defaultdict[tuple[str, int], list[tuple[Numbers, IntArray, IntArray]]] = field(
+    _extremes: dict[tuple[str, int], _Extremes] = field(default_factory=dict)
+    _changes: defaultdict[tuple[str, int], list[_Changes]] = field(
         default_factory=lambda: defaultdict(list)
     )
-    """Of integers, likewise: their values, up to one more than are few, and the log times before
-    each change, and of each."""
 
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
-        times, named = table.log_times, self._labels(table)
-        has_labels = any(named)
+        times, labels = table.log_times, self._labels(table)
+        has_labels = any(labels)
         for path, column in table.columns.items():
             if isinstance(column, Texts):
-                # A text with detections differs in each message, and is none that holds.
+                # A text with detections differs in each message: it is no status.
                 if not has_labels:
-                    self._stays += self._changed(path, column.codes, column.values(), times)
-            elif _is_measured(column) or not _is_time(table, path):
-                if not _is_measured(column):
-                    self._add_integers(path, column, times)
+                    self._staying += self._changed(path, column.codes, column.values(), times)
+            elif _is_measured(column):
                 self._add_extremes(path, column, times)
-        self._add_moves("", times, _poses(table.columns))
+            elif not _is_time(table, path):
+                self._add_integers(path, column, times)
+                self._add_extremes(path, column, times)
+        self._add_poses("", times, _poses(table.columns))
         for path, inner in table.elements.items():
-            self._add_frames(inner, times, named)
+            self._add_frames(inner, times, labels)
             self._add_states(path, inner, times)
         slot_ns = self.numbers_ns if has_numbers(table) else THINNED_NS
         if slot_ns == THINNED_NS:
             self._add_pauses(times)
-        slot_ns = STEP_NS if has_labels else slot_ns
+        self._add_slots(times, labels, STEP_NS if has_labels else slot_ns)
+
+    def _add_slots(
+        self, times: IntArray, names: Sequence[Mapping[Name, Scored]], slot_ns: Ns
+    ) -> None:
+        """Adds at least one message of each slot, and as many as show all labels and frames."""
         slots = times // slot_ns
         starts = np.flatnonzero(np.diff(slots, prepend=-1)).tolist()
         for start, stop in zip(starts, [*starts[1:], times.size], strict=True):
-            self._add_slot(int(slots[start]), times[start:stop], named[start:stop])
-
-    def _add_slot(self, slot: int, times: IntArray, named: Sequence[Mapping[Name, Scored]]) -> None:
-        """Adds few messages of a slot that show all labels and frames in it; at least one."""
-        is_new = slot != self._slot
-        if is_new:
-            self._slot = slot
-            self._named.clear()
-        rows = _covering(named, self._named) or ([0] if is_new else [])
-        self._stays.append(times[np.array(rows, np.int64)])
+            is_new = slots[start] != self._slot
+            if is_new:
+                self._slot = int(slots[start])
+                self._seen.clear()
+            missing = _missing(names[start:stop], self._seen)
+            self._seen |= missing
+            rows = _covering_rows(names[start:stop], missing) if missing else []
+            if is_new and not rows:
+                rows = [0]
+            self._staying.append(times[start:stop][np.array(rows, np.int64)])
 
     def _add_pauses(self, times: IntArray) -> None:
         """Adds the messages before and after each time without one."""
         before = times[:1] if self._last is None else [self._last]
         around = np.concatenate([before, times]).astype(np.int64)
         after = np.flatnonzero(np.diff(around) > PAUSE_NS)
-        self._stays += [around[after], around[after + 1]]
+        self._staying += [around[after], around[after + 1]]
         self._last = int(times[-1])
 
     def _labels(self, table: Table) -> list[dict[Name, Scored]]:
-        """Returns the labels of the detections in each message, also in JSON, with their number."""
-        in_table = self.detections.of(table)
+        """Returns the scores of the labels in each message; JSON texts have labels, too.
+
+        The key is a label and a number: a message with two cups has `cup` 0 and 1.
+        """
         labels: list[tuple[int, str, float]] = []
+        in_table = self.detections.of(table)
         if in_table is not None:
             detections = in_table.detections
             rows, scores = detections.rows.tolist(), detections.scores.tolist()
@@ -271,34 +301,38 @@ class TopicThinning:
         for column in table.columns.values():
             if isinstance(column, Texts) and looks_like_json(column.words[0]):
                 for row, text in enumerate(column.values()):
-                    labels += [
-                        (row, detection.label, nan if detection.score is None else detection.score)
-                        for detection in detections_of(text)
-                    ]
-        named: list[dict[Name, Scored]] = [{} for _ in range(len(table))]
+                    for detection in detections_of(text):
+                        score = nan if detection.score is None else detection.score
+                        labels.append((row, detection.label, score))
+        names: list[dict[Name, Scored]] = [{} for _ in range(len(table))]
         counts = Counter[tuple[int, str]]()
         for row, label, score in labels:
             scored = _stepped(score)
-            named[row][label, 0] = max(scored, named[row].get((label, 0), scored))
-            if repeat := counts[row, label]:
-                named[row][label, repeat] = _UNSCORED
+            names[row][label, 0] = max(scored, names[row].get((label, 0), scored))
+            number = counts[row, label]
+            if number:
+                names[row][label, number] = _UNSCORED
             counts[row, label] += 1
-        return named
+        return names
 
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
-        extremes = [extreme[1] for both in self._extremes.values() for extreme in both]
-        stays, most = [*self._stays, np.array(extremes, np.int64)], EXTREMES_NS // self.numbers_ns
-        for parts in self._changes.values():
-            values, before, after = map(np.concatenate, zip(*parts, strict=True))
-            if np.unique(values).size <= _FEW or after.size <= most * _OFTEN:
-                stays += [before, after]
-        return np.unique(np.concatenate(stays))
+        extremes = [time for slot in self._extremes.values() for _, time in slot]
+        staying, most = (
+            [*self._staying, np.array(extremes, np.int64)],
+            EXTREMES_NS // self.numbers_ns,
+        )
+        for changes in self._changes.values():
+            values, before, after = map(np.concatenate, zip(*changes, strict=True))
+            is_status = np.unique(values).size <= _FEW or after.size <= most * _OFTEN
+            if is_status:
+                staying += [before, after]
+        return np.unique(np.concatenate(staying))
 
     def _changed(
         self, path: str, codes: Numbers, values: Sequence[object], times: IntArray
     ) -> tuple[IntArray, IntArray]:
-        """Returns the log times before each change of a value, and of each change.
+        """Returns the log times before and after each change of a value.
 
         `codes` differ where `values` do.
         """
@@ -316,7 +350,7 @@ class TopicThinning:
         for slot in np.unique(slots).tolist():
             inside = slots_after == slot
             values = np.unique(column[slots == slot])[: _FEW + 1]
-            self._changes[path, slot].append((values, before[inside], after[inside]))
+            self._changes[path, slot].append(_Changes(values, before[inside], after[inside]))
 
     def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
         slots, is_finite = times // EXTREMES_NS, np.isfinite(numbers)
@@ -327,17 +361,17 @@ class TopicThinning:
                 *zip(numbers[rows].tolist(), times[rows].tolist(), strict=True),
             ]
             if samples:
-                # Of equal ones the earliest.
+                # The earliest of equal values.
                 greatest = max(samples, key=itemgetter(0))
-                self._extremes[path, slot] = min(samples), greatest
+                self._extremes[path, slot] = _Extremes(min(samples), greatest)
 
-    def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
-        for path, rows in poses.items():
+    def _add_poses(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
+        for path, points in poses.items():
             mover = self._movers.setdefault((path, name), _Mover())
-            self._stays.append(np.array([*mover.moved(times, rows)], np.int64))
+            self._staying.append(np.array([*mover.staying_times(times, points)], np.int64))
 
     def _add_states(self, path: str, inner: Elements, times: IntArray) -> None:
-        """Adds the messages in which the states of a list change, as those of goals."""
+        """Adds the messages in which the states of a list change, such as the states of goals."""
         states = [
             column.tolist()
             for column in inner.columns.values()
@@ -346,30 +380,30 @@ class TopicThinning:
         ]
         if not states:
             return
-        rows: list[tuple[object, ...]] = [()] * times.size
+        by_message: list[tuple[object, ...]] = [()] * times.size
         for owner, *values in zip(inner.owners.tolist(), *states, strict=True):
-            rows[owner] = (*rows[owner], *values)
-        _, codes = numbered(rows)
-        self._stays += self._changed(path, codes, rows, times)
+            by_message[owner] = (*by_message[owner], *values)
+        _, codes = numbered(by_message)
+        self._staying += self._changed(path, codes, by_message, times)
 
     def _add_frames(
-        self, inner: Elements, times: IntArray, named: Sequence[dict[Name, Scored]]
+        self, inner: Elements, times: IntArray, names: Sequence[dict[Name, Scored]]
     ) -> None:
-        """Adds the moves of the frames of transforms, and to `named` the frames in each message."""
+        """Adds the poses of the frames of transforms, and to `names` the frames in each message."""
         column = inner.columns.get(_FRAME)
         if not isinstance(column, Texts):
             return
         for row, frame in zip(inner.owners.tolist(), column.values(), strict=True):
-            named[row][frame, 0] = _UNSCORED
+            names[row][frame, 0] = _UNSCORED
         poses = _poses(inner.columns)
         for code, frame in enumerate(column.words):
             rows = np.flatnonzero(column.codes == code)
-            own = {path: points[rows] for path, points in poses.items()}
-            self._add_moves(frame, times[inner.owners[rows]], own)
+            of_frame = {path: points[rows] for path, points in poses.items()}
+            self._add_poses(frame, times[inner.owners[rows]], of_frame)
 
 
-def is_sampled(table: Table) -> bool:
-    """Returns whether messages have a long array of numbers, other than a covariance."""
+def has_samples(table: Table) -> bool:
+    """Whether messages have a long array of numbers, other than a covariance."""
     return any(
         not isinstance(column, Texts) and column.size and column.max() > _LONG
         for path, column in table.columns.items()
@@ -378,38 +412,44 @@ def is_sampled(table: Table) -> bool:
 
 
 def _stepped(score: float) -> tuple[float, float]:
-    """Returns a score with its step; one that a detector does not give is the lowest."""
+    """Returns the step of a score, and the score; a missing score (NaN) is the lowest."""
     score = -_HIGHEST if isnan(score) else max(-_HIGHEST, min(score, _HIGHEST))
     return (score + _SINGLE) * _STEPS // 1, score
 
 
-def _covering(named: Sequence[Mapping[Name, Scored]], seen: dict[Name, Scored]) -> list[int]:
-    """Returns few rows with all names that were not `seen`, or not so high, and adds these to them.
-
-    Each name is in one of them with its highest score, to a step.
-    """
+def _missing(
+    messages: Sequence[Mapping[Name, Scored]], seen: Mapping[Name, Scored]
+) -> dict[Name, Scored]:
+    """Returns the names that messages add to `seen`, or have with a higher step of the score."""
     missing: dict[Name, Scored] = {}
-    for names in named:
+    for names in messages:
         for name, score in names.items():
             if name not in seen or seen[name][0] < score[0]:
                 missing[name] = max(score, missing.get(name, score))
-    seen |= missing
-    shown = [
-        {
-            name: score
-            for name, (step, score) in names.items()
-            if name in missing and missing[name][0] == step
-        }
-        for names in named
-    ]
+    return missing
+
+
+def _covering_rows(
+    messages: Sequence[Mapping[Name, Scored]], missing: Mapping[Name, Scored]
+) -> list[int]:
+    """Returns few rows of messages that have all missing names, each with its highest step.
+
+    Greedy: the message with the most names comes first, of equal ones that with higher scores.
+    """
+    uncovered: list[dict[Name, float]] = []
+    for names in messages:
+        uncovered.append({})
+        for name, (step, score) in names.items():
+            if name in missing and missing[name][0] == step:
+                uncovered[-1][name] = score
     rows: list[int] = []
-    while missing:
-        best = max(range(len(shown)), key=lambda row: (len(shown[row]), sum(shown[row].values())))
-        rows.append(best)
-        for name in [*shown[best]]:
-            del missing[name]
-            for left in shown:
-                left.pop(name, None)
+    while any(uncovered):
+        sizes = [(len(scores), sum(scores.values())) for scores in uncovered]
+        row = sizes.index(max(sizes))
+        rows.append(row)
+        for name in [*uncovered[row]]:
+            for scores in uncovered:
+                scores.pop(name, None)
     return rows
 
 
@@ -421,15 +461,15 @@ def _is_time(table: Table, path: str) -> bool:
 
 
 def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
-    """Returns the poses in columns by the path of their point: its numbers, and the turn's."""
+    """Returns the poses in columns, by the path of their point: metres, then the quaternion."""
     poses: dict[str, Points] = {}
     for path in columns:
         point = path.removesuffix(".x")
-        around, _, name = point.rpartition(".")
+        parent, _, name = point.rpartition(".")
         if point != path and name in _TURNS:
-            names = [f"{point}.{axis}" for axis in "xyz"]
-            names += [f"{around}.{_TURNS[name]}.{axis}".lstrip(".") for axis in "xyzw"]
-            poses |= _stacked(point, [columns[one] for one in names if one in columns])
+            turn = f"{parent}.{_TURNS[name]}".lstrip(".")
+            names = [f"{point}.{axis}" for axis in "xyz"] + [f"{turn}.{axis}" for axis in "xyzw"]
+            poses |= _stacked(point, [columns[name] for name in names if name in columns])
     if {"x", "y", "theta"} <= columns.keys():  # geometry_msgs/msg/Pose2D, turtlesim/msg/Pose
         poses |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
     if {"latitude", "longitude"} <= columns.keys():
@@ -439,7 +479,7 @@ def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
 
 
 def _stacked(path: str, columns: Sequence[Column]) -> dict[str, Points]:
-    """Returns columns of numbers as rows, by a path; nothing where one is of texts."""
+    """Returns columns of numbers as the rows at a path; nothing if a column is of texts."""
     numbers = [column for column in columns if not isinstance(column, Texts)]
     if len(numbers) < len(columns):
         return {}
@@ -447,44 +487,46 @@ def _stacked(path: str, columns: Sequence[Column]) -> dict[str, Points]:
 
 
 _MOST_PAUSES: Final = 32
-"""Of a day; the messages beside each stay."""
+"""So many pauses of a day are remembered; the messages beside each stay."""
 
 
 def with_shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thinned:
-    """Returns what is known, and what some bags of a snapshot show; at least one bag."""
+    """Returns `known` with the silences, pauses, clock steps and crashes that bags show.
 
-    def is_in(at: Ns) -> bool:
+    Args:
+        known: the content of `thinned.json`.
+        snapshot: the index of all bags.
+        bags: the bags of the snapshot that are about to be deleted, at least one.
+    """
+
+    def is_inside(at: Ns) -> bool:
         return any(bag.start <= at <= bag.end for bag in bags)
 
-    silences = {
-        (silence.topic, silence.start): (*silence,)
-        for silence in (
-            *map(snapshot.prolonged, map(Silence._make, known.silences)),
-            *(silence for silence in snapshot.silences if is_in(silence.start)),
-        )
-    }
+    silences = [snapshot.prolonged(Silence._make(silence)) for silence in known.silences]
+    silences += [silence for silence in snapshot.silences if is_inside(silence.start)]
+    by_start = {(silence.topic, silence.start): (*silence,) for silence in silences}
     steps = [
         (fault.at, fault.by)
         for fault in snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK
-        if fault.by >= SHORTEST_STEP_NS and is_in(fault.at)
+        if fault.by >= SHORTEST_STEP_NS and is_inside(fault.at)
     ]
-    pauses = [pause.span for pause in snapshot.suspects if is_in(pause.start)]
+    pauses = [pause.span for pause in snapshot.suspects if is_inside(pause.start)]
     left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]
     since = bags[0].start if known.since is None else known.since
     if since > snapshot.scanned_at:  # by a clock that was ahead
         since = min(since, bags[0].start)
     return Thinned(
         since,
-        tuple(sorted(silences.values(), key=itemgetter(1))),
-        (*_few_a_day([*known.pauses, *pauses]),),
+        tuple(sorted(by_start.values(), key=itemgetter(1))),
+        tuple(_first_of_each_day([*known.pauses, *pauses])),
         tuple(sorted({*known.set_back, *steps})),
         tuple(sorted({*known.left_open, *left_open})),
     )
 
 
-def _few_a_day(pauses: Iterable[Span]) -> Iterator[Span]:
-    """Yields pauses in order of time, each once: the first `_MOST_PAUSES` of a day."""
+def _first_of_each_day(pauses: Iterable[Span]) -> Iterator[Span]:
+    """Yields the first `_MOST_PAUSES` pauses of each day, in order of time and each once."""
     counts = Counter[str]()
     for start, end in sorted({*pauses}):
         day = utc_day(start)
@@ -494,7 +536,7 @@ def _few_a_day(pauses: Iterable[Span]) -> Iterator[Span]:
 
 
 def times_near(pauses: Iterable[Span], times: IntArray) -> IntArray:
-    """Returns those of some log times (ns) that lie so near a pause that they show a step."""
+    """Returns the log times (ns) that lie so near a pause that they may show a step of a clock."""
     near = np.zeros(times.size, bool)
     for start, end in pauses:
         near |= (times >= start - STAMPS_BESIDE_NS) & (times <= end + STAMPS_BESIDE_NS)

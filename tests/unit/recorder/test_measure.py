@@ -16,7 +16,7 @@ from ros2_memory.recorder.measure import (
     Progress,
     SplitMeasure,
     holes,
-    reader_of,
+    value_reader,
 )
 from ros2_memory.storage.base import Schema
 
@@ -69,7 +69,7 @@ def test_a_late_message_at_the_end_of_a_split_is_told_by_the_next_split(
     losses = [
         loss
         for part in (positions[:cut], positions[cut:250], positions[250:])
-        for loss in counter.measured("a", {"/odom": Progress("stamps", part)})
+        for loss in counter.add_split("a", {"/odom": Progress("stamps", part)})
     ]
     counted = sum(loss.lost for loss in [*losses, *counter.flush()])
     # Where the late ones come while others are lost, the steps before and after may hide one.
@@ -86,9 +86,9 @@ def test_nothing_is_expected_of_what_has_no_cadence() -> None:
 
 def test_a_hole_between_two_splits_counts_and_only_once() -> None:
     counter = LossCounter()
-    assert counter.measured("a", progress([*range(100)])) == []
-    [loss] = counter.measured("a", progress([*range(103, 200)]))
-    assert counter.measured("a", progress([*range(200, 300)])) == []
+    assert counter.add_split("a", progress([*range(100)])) == []
+    [loss] = counter.add_split("a", progress([*range(103, 200)]))
+    assert counter.add_split("a", progress([*range(200, 300)])) == []
     found = (loss.topic, loss.start, loss.lost, loss.by)
     assert found == ("/odom", T0 + 99 * PERIOD + 1000, 3, "stamps")
     assert counter.in_last_hour(loss.stop) == {"/odom": 3}
@@ -110,7 +110,7 @@ def test_a_hole_waits_for_the_other_recording_of_a_long_handover(
     losses = [
         loss
         for name in order
-        for loss in counter.measured(name, progress(sorted(splits[name].pop(0))))
+        for loss in counter.add_split(name, progress(sorted(splits[name].pop(0))))
     ]
     assert sum(each.lost for each in [*losses, *counter.flush()]) == taken
 
@@ -122,7 +122,7 @@ def test_a_recording_that_brings_nothing_is_not_waited_for_for_ever() -> None:
     losses = [
         loss
         for first in range(0, 799, 100)
-        for loss in counter.measured("live", progress(kept[first : first + 100]))
+        for loss in counter.add_split("live", progress(kept[first : first + 100]))
     ]
     assert [each.lost for each in losses] == [1]
 
@@ -130,9 +130,9 @@ def test_a_recording_that_brings_nothing_is_not_waited_for_for_ever() -> None:
 def test_nothing_is_missing_between_splits_around_one_that_was_not_measured() -> None:
     counter = LossCounter()
     for first, unclear in ((0, {"/odom", "/tf"}), (200, None), (400, {"/tf"})):
-        assert counter.measured("a", progress([*range(first, first + 100)])) == []
-        counter.unclear(unclear)
-    assert [each.lost for each in counter.measured("a", progress([*range(510, 600)]))] == [10]
+        assert counter.add_split("a", progress([*range(first, first + 100)])) == []
+        counter.forget(unclear)
+    assert [each.lost for each in counter.add_split("a", progress([*range(510, 600)]))] == [10]
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_nothing_is_missing_between_splits_around_one_that_was_not_measured() ->
 def test_counters_and_stamps_are_found_by_the_definition(
     text: str, payload: bytes, kind: str, value: int
 ) -> None:
-    found = reader_of(Schema("a/msg/B", "ros2msg", text.encode()))
+    found = value_reader(Schema("a/msg/B", "ros2msg", text.encode()))
     assert found is not None
     assert (found[0], found[1](payload)) == (kind, value)
 
@@ -172,8 +172,8 @@ def test_counters_and_stamps_are_found_by_the_definition(
     "text", ["string data\n", "float64[] seq\n", "geometry_msgs/Pose p\nuint32 seq\n", ""]
 )
 def test_other_types_show_nothing(text: str) -> None:
-    assert reader_of(Schema("a/msg/B", "ros2msg", text.encode())) is None
-    assert reader_of(Schema("a/msg/B", "ros2idl", b"uint32 seq\n")) is None
+    assert value_reader(Schema("a/msg/B", "ros2msg", text.encode())) is None
+    assert value_reader(Schema("a/msg/B", "ros2idl", b"uint32 seq\n")) is None
 
 
 def test_a_counter_that_begins_anew_loses_nothing_and_is_followed_from_there() -> None:
@@ -183,23 +183,23 @@ def test_a_counter_that_begins_anew_loses_nothing_and_is_followed_from_there() -
         at = [Position(value, T0 + (first + nth) * PERIOD) for nth, value in enumerate(values)]
         return {"/odom": Progress("counter", at)}
 
-    assert counter.measured("a", counts(range(500, 600), 0)) == []
-    assert counter.measured("a", counts([*range(600, 640), *range(40)], 100)) == []
-    assert [each.lost for each in counter.measured("a", counts(range(45, 100), 190))] == [5]
-    assert counter.measured("a", counts(range(50), 300)) == []
+    assert counter.add_split("a", counts(range(500, 600), 0)) == []
+    assert counter.add_split("a", counts([*range(600, 640), *range(40)], 100)) == []
+    assert [each.lost for each in counter.add_split("a", counts(range(45, 100), 190))] == [5]
+    assert counter.add_split("a", counts(range(50), 300)) == []
     assert counter.flush() == []
 
 
 def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
     counter = LossCounter()
     counter.begin("old")
-    assert counter.measured("old", progress([*range(100)])) == []
+    assert counter.add_split("old", progress([*range(100)])) == []
     counter.begin("new")
     again = [Position(value, T0 + 205 * PERIOD) for value, _ in at([*range(90, 130)])]
     new = [*at([*range(205, 210)]), *again, *at([*range(210, 300)])]
     old = progress([tick for tick in range(100, 215) if not 180 <= tick < 190])
-    losses = counter.measured("new", {"/odom": Progress("stamps", new)})
-    losses += counter.measured("old", old)
+    losses = counter.add_split("new", {"/odom": Progress("stamps", new)})
+    losses += counter.add_split("old", old)
     assert [loss.lost for loss in [*losses, *counter.flush()]] == [10]
 
 
@@ -215,17 +215,17 @@ def arriving(start: int, stop: int, **hz: int) -> SplitMeasure:
 def test_who_was_silent_once_is_not_regular_for_an_hour() -> None:
     arrivals = Arrivals()
     for start in (*range(0, 60, 10), *range(100, 160, 10)):
-        arrivals.measured(arriving(start, start + 10, teleop=10, odom=50))
-    arrivals.measured(arriving(160, 190, odom=50))
-    assert arrivals.silent(0) == frozenset()
+        arrivals.add_split(arriving(start, start + 10, teleop=10, odom=50))
+    arrivals.add_split(arriving(160, 190, odom=50))
+    assert arrivals.silent_topics(0) == frozenset()
     for start in range(190, 4000, 10):
-        arrivals.measured(arriving(start, start + 10, teleop=10, odom=50))
-    assert arrivals.silent(20 * NS) == {"odom", "teleop"}
+        arrivals.add_split(arriving(start, start + 10, teleop=10, odom=50))
+    assert arrivals.silent_topics(20 * NS) == {"odom", "teleop"}
 
 
 def test_a_clock_that_was_set_back_begins_anew() -> None:
     arrivals = Arrivals()
     for start in (*range(7000, 7060, 10), *range(0, 60, 10)):
-        arrivals.measured(arriving(start, start + 10, odom=50))
-    assert (arrivals.silent(0), arrivals.rates_hz(0)) == (frozenset(), {"odom": 50.0})
-    assert arrivals.silent(11 * NS) == {"odom"}
+        arrivals.add_split(arriving(start, start + 10, odom=50))
+    assert (arrivals.silent_topics(0), arrivals.rates_hz(0)) == (frozenset(), {"odom": 50.0})
+    assert arrivals.silent_topics(11 * NS) == {"odom"}
