@@ -1,7 +1,7 @@
 """Measures how topics arrive, plans their QoS, and decides when that needs a new recording.
 
 `ros2 bag record` never changes a subscription. So a deeper queue, or a weaker QoS for a publisher
-that came later, takes a rotation. What the splits show is measured beside the recorder's loop.
+that came later, takes a rotation. Splits are measured in the background.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.recorder.measure import (
     Arrivals,
     LossCounter,
+    SplitMeasure,
     TopicFlow,
     measure_split,
 )
 from ros2_memory.retention.delete import size_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.recorder.background import Background
@@ -39,36 +40,40 @@ if TYPE_CHECKING:
 DEFAULT_DEPTH: Final = 10
 """The depth with which rosbag2 subscribes by itself."""
 HEADROOM: Final = 2
-"""Queues are made so many times as deep as measured, where memory allows."""
+"""Queues are made so many times as deep as measured, if memory allows."""
 
 
 class QueuePlan(NamedTuple):
-    """The depth of each queue. `cut_short` hold less than `HOLD_S`, for want of memory."""
+    """The depth of each topic's queue.
+
+    `cut_short` names the topics whose queue holds less than `HOLD_S`, for want of memory.
+    """
 
     depths: Mapping[str, int]
     cut_short: frozenset[str] = frozenset()
 
     def depth(self, topic: str) -> int:
-        """Returns the depth of a topic's queue; without a plan it is rosbag2's own."""
+        """Returns the depth of a topic's queue; rosbag2's own if it is not planned."""
         return self.depths.get(topic, DEFAULT_DEPTH)
 
 
 def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
     """Returns depths that hold `HOLD_S` of each topic and together take at most `queue_bytes`.
 
-    Where that is not enough, no topic takes more than an equal share of what the smaller ones
-    leave. At least one message of each is held, however large.
+    If that is not enough, each topic gets an equal share of what smaller ones leave, and at least
+    one message, however large.
     """
     sizes = {topic: flow.message_bytes for topic, flow in flows.items()}
     for factor in (HEADROOM, 1):
         depths = {topic: max(DEFAULT_DEPTH, factor * flow.burst) for topic, flow in flows.items()}
         if sum(depth * sizes[topic] for topic, depth in depths.items()) <= queue_bytes:
             return QueuePlan(depths)
-    # One message of each, and shares of what is then left.
     wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
     left, depths = max(0, queue_bytes - sum(sizes.values())), {}
-    for nth, topic in enumerate(sorted(wanted, key=lambda name: wanted[name] * sizes[name])):
-        more = min(wanted[topic] - 1, left // (len(wanted) - nth) // sizes[topic])
+    by_size = sorted(wanted, key=lambda topic: wanted[topic] * sizes[topic])
+    for nth, topic in enumerate(by_size):
+        share = left // (len(by_size) - nth)
+        more = min(wanted[topic] - 1, share // sizes[topic])
         depths[topic] = 1 + more
         left -= more * sizes[topic]
     short = frozenset(topic for topic, depth in depths.items() if depth < flows[topic].burst)
@@ -79,28 +84,30 @@ _Profile: TypeAlias = dict[str, str | int]
 
 
 def _profile(depth: int | None, *, reliable: bool = False, latched: bool = False) -> _Profile:
-    """Returns a QoS profile; with None in place of a depth all messages are kept."""
-    return {
-        **({"history": "keep_all"} if depth is None else {"history": "keep_last", "depth": depth}),
-        "reliability": "reliable" if reliable else "best_effort",
-        "durability": "transient_local" if latched else "volatile",
-    }
+    """Returns a QoS profile for rosbag2; the depth None keeps all messages."""
+    profile: _Profile = {"history": "keep_all"}
+    if depth is not None:
+        profile = {"history": "keep_last", "depth": depth}
+    profile["reliability"] = "reliable" if reliable else "best_effort"
+    profile["durability"] = "transient_local" if latched else "volatile"
+    return profile
 
 
 ALL_MESSAGES: Final = _profile(None, reliable=True, latched=True)
-"""Asks for all messages, also for earlier ones."""
+"""The QoS that receives all messages, earlier ones as well."""
 DEEPEN_EVERY_S: Final = 60.0
-"""At most so often a recording is rotated for deeper queues: a robot's nodes start one by one."""
+"""The least time between two rotations for deeper queues: a robot's nodes start one by one."""
 ASK_AGAIN_S: Final = 300.0
-"""So long no recording is rotated for a topic of which one refused the weakest QoS, too."""
+"""The least time between two rotations for a topic: publishers may refuse the weakest QoS, too."""
 ASKED_FOR: Final = 8
-"""So many recordings ask for what fits the publisher that was last refused, or best effort. What
-splits name are the publishers that were discovered in time, often not all: they do not show that it
-has gone."""
+"""So many recordings ask a topic for what fits the publisher that was refused last. A split does
+not show that this publisher has gone: it names only publishers that were discovered in time."""
 _UNNOTICED_NS: Final[Ns] = 5 * NS_PER_S
-"""So long a publisher may have sent before rosbag2 says that it was refused."""
-_PLANS_KEPT: Final = 8
-_LOOKED_AT: Final = 3
+"""So long a publisher may have sent before rosbag2 reports that it was refused."""
+_RECORDINGS_KEPT: Final = 8
+_NEWEST_SPLITS: Final = 3
+"""So many splits are measured at the start: the last one may have been recorded when the robot's
+nodes had ended."""
 _MOST_UNWRITTEN: Final = 1000
 _TASK: Final = "reception"
 
@@ -108,7 +115,7 @@ _log = get_logger(__name__)
 
 
 class Rotation(NamedTuple):
-    """Why a new recording is needed: a log event, a sentence, and the topics it is for."""
+    """Why a new recording is needed: a log event, a sentence, and its topics."""
 
     event: str
     sentence: str
@@ -118,19 +125,24 @@ class Rotation(NamedTuple):
 
 @dataclass(slots=True)
 class _Recording:
+    """A recording that was started.
+
+    Attributes:
+        refused: topics with a publisher that the subscription does not fit.
+        asked_anew: topics whose subscription fits every publisher.
+        span: the first and the last log time (ns); 0 before the first split.
+    """
+
     plan: QueuePlan
+    asked_anew: frozenset[str]
     refused: set[str] = field(default_factory=set)
-    """Topics with a publisher that this recording's subscription does not fit."""
-    asked_anew: frozenset[str] = frozenset()
-    """Topics that it asked for with what fits every publisher."""
     span: Span = (0, 0)
-    """First and last log time of what it has."""
 
 
 class _Anew(NamedTuple):
-    """How a topic with a publisher that offers less is asked for, and by how many recordings.
+    """How a topic with a weak publisher is asked for, and by how many more recordings.
 
-    Without `best_effort` only its durability did not fit.
+    Without `best_effort` only the durability did not fit.
     """
 
     best_effort: bool
@@ -142,12 +154,13 @@ class Reception:
     """How the topics of one bag directory arrive, across its recordings.
 
     Args:
-        queue_bytes: what the queues of all topics together may take.
-        bag_dir: where losses are written.
-        volatile: topics that are not asked for their earlier messages once a split has shown them.
+        queue_bytes: the bytes that the queues of all topics may take together.
+        bag_dir: the directory whose `lost.jsonl` gets the losses.
+        latched: topics whose messages are all recorded, earlier ones as well.
+        volatile: topics that, once measured, are not asked for earlier messages.
 
     Attributes:
-        may_write: whether losses are written; those that are not wait.
+        may_write: whether losses are written now; if not, they wait.
     """
 
     reader: BagReader
@@ -159,7 +172,7 @@ class Reception:
     background: Background
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Begins without any measurement."""
         self._losses = LossCounter()
         self._unwritten: deque[Loss] = deque(maxlen=_MOST_UNWRITTEN)
         self._arrivals = Arrivals()
@@ -182,93 +195,103 @@ class Reception:
         """Returns the QoS overrides (YAML) for a recording that is about to start."""
         with self._lock:
             plan, anew = self._plan_queues(), self._asked_anew
-            topics = {*self._flows, *anew, *self.latched}
-            profiles = {topic: self._profile_of(topic, plan) for topic in topics}
-            self._recordings[recording] = _Recording(plan, asked_anew=frozenset(anew))
+            chosen: dict[str, _Profile] = {}
+            for topic in {*self._flows, *anew, *self.latched}:
+                profile = self._profile_of(topic, plan)
+                if profile is not None:
+                    chosen[topic] = profile
+            self._recordings[recording] = _Recording(plan, frozenset(anew))
             self._losses.begin(recording)
-            for name in [*self._recordings][:-_PLANS_KEPT]:
+            for name in [*self._recordings][:-_RECORDINGS_KEPT]:
                 del self._recordings[name]
             self._asked_anew = {
                 topic: asked._replace(recordings=asked.recordings - 1)
                 for topic, asked in anew.items()
                 if asked.recordings > 1
             }
-        chosen = {topic: profile for topic, profile in profiles.items() if profile is not None}
         return yaml.safe_dump(chosen, sort_keys=True)
 
     def _profile_of(self, topic: str, plan: QueuePlan) -> _Profile | None:
-        """Returns the QoS with which a topic is asked for; None where rosbag2 chooses it.
+        """Returns the QoS of the subscription to a topic; None lets rosbag2 choose.
 
-        One with a publisher that was refused, or is best effort, is asked for with what fits every
-        publisher: rosbag2 itself asks for more where it has not discovered all of them, and a split
-        names only those that it had. Who subscribes with best effort is sent no earlier messages,
-        so it is volatile as well. Of a topic that counts as latched, and may have many publishers,
-        all messages are asked for, unless its publishers are known to be volatile.
+        A topic with a best-effort or a refused publisher gets a QoS that fits every publisher:
+        rosbag2 asks for more if it has not discovered all of them, and a split names only those
+        that were discovered. A best-effort subscriber is sent no earlier messages, so it is
+        volatile as well. All messages of a topic in `latched`, which may have many publishers, are
+        asked for, unless its publishers are known to be volatile.
         """
         flow, asked = self._flows.get(topic), self._asked_anew.get(topic)
         counts_as_latched, depth = topic in self.latched, plan.depth(topic)
         if asked is not None and counts_as_latched and not asked.best_effort:
-            # As volatile it would lose what was published before: rosbag2 decides by the publishers
-            # that it finds.
+            # A volatile subscriber would lose earlier messages: rosbag2 decides by the publishers.
             return None
         if flow is None:
             return {**ALL_MESSAGES} if asked is None else _profile(depth)
         reliable, latched, publishers = flow.offered
+        if asked is not None:
+            return _profile(depth, reliable=reliable and not asked.best_effort)
+        # One of several publishers may have a message that is not excluded: all are asked.
         is_skipped = topic in self._skipped and publishers == 1
-        latched &= asked is None and topic not in self.volatile and not is_skipped
-        return _profile(
-            None if latched and counts_as_latched else depth,
-            reliable=reliable and not (asked is not None and asked.best_effort),
-            latched=latched,
-        )
+        latched = latched and topic not in self.volatile and not is_skipped
+        keeps_all = latched and counts_as_latched
+        return _profile(None if keeps_all else depth, reliable=reliable, latched=latched)
 
     def skip_latched(self, topics: Collection[str]) -> None:
-        """Sets the topics whose latched message the next recordings are not to ask for.
-
-        Of several publishers only one may have such a message: all are asked for theirs.
-        """
+        """Sets the topics whose latched message the next recordings do not ask for."""
         with self._lock:
             self._skipped = frozenset(topics)
 
     def recall(self, paths: Sequence[Path]) -> None:
-        """Measures the ends of closed splits of an earlier run at once, in order. Raises nothing.
+        """Measures the ends of closed splits of an earlier run, now and in order. Raises nothing.
 
-        No holes: what an earlier run recorded was counted by that.
+        Their holes do not count again.
         """
         for path in paths:
             self._measure("", path)
 
     def learn(self, recording: str, path: Path) -> None:
-        """Measures a closed split of a recording, later."""
+        """Measures a closed split of a recording in the background."""
         self.background.add(_TASK, lambda: self._measure(recording, path))
 
     def flush(self) -> None:
-        """Counts what no further split can fill; called when nothing is recorded any more."""
-        self.background.add(_TASK, lambda: self._report_losses(self._losses.flush))
+        """Counts the losses that only a further split could disprove: recording has ended."""
+        self.background.add(_TASK, self._flush)
 
     def lost(self, recording: str, topic: str, count: int) -> None:
-        """Notes that rosbag2 itself lost messages of a topic, up to a recording's last split."""
+        """Notes that rosbag2 reports lost messages of a topic, up to a recording's last split."""
+        self.background.add(_TASK, lambda: self._add_reported(recording, topic, count))
 
-        def reported() -> list[Loss]:
+    def _flush(self) -> None:
+        with self._lock:
+            losses = self._losses.flush()
+        self._report_losses(losses)
+
+    def _add_reported(self, recording: str, topic: str, count: int) -> None:
+        with self._lock:
             state = self._recordings.get(recording)
             start, stop = (0, 0) if state is None else state.span
-            return self._losses.add_reported(topic, start, stop, count)
-
-        self.background.add(_TASK, lambda: self._report_losses(reported))
+            losses = self._losses.add_reported(topic, start, stop, count)
+        self._report_losses(losses)
 
     def lost_in_last_hour(self, now: Ns) -> dict[str, int]:
-        """Returns how many messages of each topic are known to be missing of the last hour."""
+        """Returns how many messages of each topic are known to be missing in the last hour."""
         with self._lock:
             return self._losses.in_last_hour(now)
 
     def arrivals(self, idle: Ns) -> tuple[frozenset[str], Mapping[str, float]]:
-        """Returns the topics that have stopped, and the rates of all, see `Arrivals`."""
+        """Returns the silent topics, and the rate of each topic (Hz), see `Arrivals`.
+
+        `idle`: how long nothing at all has come (ns).
+        """
         with self._lock:
             return self._arrivals.silent_topics(idle), self._arrivals.rates_hz(idle)
 
-    def _report_losses(self, take: Callable[[], list[Loss]]) -> None:
-        with self._lock:
-            losses = take()
+    def _report_losses(self, losses: Sequence[Loss]) -> None:
+        """Logs losses, and writes them with those that are not written yet.
+
+        Raises:
+            RecorderError: they cannot be written; the next call tries again.
+        """
         by_topic = Counter[str]()
         for loss in losses:
             by_topic[loss.topic] += loss.lost
@@ -289,64 +312,66 @@ class Reception:
                 raise RecorderError(f"losses cannot be written: {reason}") from error
             self._unwritten.clear()
 
-    def refused(self, recording: str, topic: str, *, best_effort: bool | None = True) -> None:
-        """Notes that a publisher does not fit how a recording subscribed to the topic.
+    def refused(self, recording: str, topic: str, *, best_effort: bool = True) -> None:
+        """Notes that a publisher's QoS does not fit how a recording subscribed to the topic.
 
-        The next recordings ask for what fits every publisher; without `best_effort` for what fits a
-        volatile one, or, of a topic that counts as latched, adapt to the publishers they find. With
-        None it is of another type, which no QoS fits. What that publisher sent is missing from each
-        split of this recording, until it ends.
+        The next recordings ask for what fits every publisher. Without `best_effort` they ask for
+        what fits a volatile publisher; a topic in `latched` adapts to the publishers that it finds.
         """
+        with self._lock:
+            before = self._asked_anew.get(topic)
+            was_best_effort = before is not None and before.best_effort
+            self._asked_anew[topic] = _Anew(best_effort or was_best_effort)
+        self.never_received(recording, topic)
+
+    def never_received(self, recording: str, topic: str) -> None:
+        """Notes that a recording receives no message of some publisher of a topic."""
         with self._lock:
             state = self._recordings.get(recording)
             if state is not None:
                 state.refused.add(topic)
-            if best_effort is not None:
-                before = self._asked_anew.get(topic)
-                best_effort |= before is not None and before.best_effort
-                self._asked_anew[topic] = _Anew(best_effort)
 
     def rotation_due(self, recording: str, now_s: float) -> Rotation | None:
-        """Returns why a recording should be rotated now; None where it need not be."""
+        """Returns why a recording should be rotated now; None if there is no reason."""
         with self._lock:
             state = self._recordings.get(recording)
             if state is None:
                 return None
-            refused = frozenset(
+            refused = [
                 topic
-                for topic in state.refused & self._asked_anew.keys()
+                for topic in sorted(state.refused & self._asked_anew.keys())
                 if topic not in state.asked_anew
                 or now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
-            )
+            ]
             if refused:
                 sentence = (
-                    f"a publisher offers weaker QoS than requested on {listed(sorted(refused))}: a "
+                    f"a publisher offers weaker QoS than requested on {listed(refused)}: a "
                     "new recording subscribes again; messages sent by it meanwhile are not recorded"
                 )
-                return Rotation("asking_again", sentence, refused, is_fault=True)
+                return Rotation("asking_again", sentence, frozenset(refused), is_fault=True)
             if self._deepened_s is not None and now_s - self._deepened_s < DEEPEN_EVERY_S:
                 return None
-            active, planned = state.plan, self._plan_queues()
-            shallow = frozenset(
+            planned = self._plan_queues()
+            shallow = [
                 topic
-                for topic, flow in self._planned_for().items()
-                if active.depth(topic) < min(flow.burst, planned.depth(topic))
-            )
+                for topic, flow in sorted(self._flows_with_depth().items())
+                if state.plan.depth(topic) < min(flow.burst, planned.depth(topic))
+            ]
             if not shallow:
                 return None
             sentence = "a new recording starts, to subscribe with deeper queues: "
-            return Rotation("queues_deepened", sentence + listed(sorted(shallow)), shallow)
+            return Rotation("queues_deepened", sentence + listed(shallow), frozenset(shallow))
 
     def rotation_begun(self, rotation: Rotation, now_s: float) -> None:
-        """Records why a rotation was started."""
+        """Notes that a rotation began: the same reason waits before the next one."""
         with self._lock:
             if rotation.is_fault:
                 self._asked_s |= dict.fromkeys(rotation.topics, now_s)
             else:
                 self._deepened_s = now_s
 
-    def _planned_for(self) -> Mapping[str, TopicFlow]:
-        """Returns the topics with a queue of a planned depth."""
+    def _flows_with_depth(self) -> dict[str, TopicFlow]:
+        """Returns the topics whose queue has a depth: all but those that keep all messages."""
         return {
             topic: flow
             for topic, flow in self._flows.items()
@@ -354,42 +379,33 @@ class Reception:
         }
 
     def _plan_queues(self) -> QueuePlan:
-        return plan_queues(self._planned_for(), self.queue_bytes)
+        return plan_queues(self._flows_with_depth(), self.queue_bytes)
 
     def _measure(self, recording: str, path: Path) -> None:
+        """Measures a split; without a recording it is of an earlier run."""
         try:
             split = measure_split(self.reader, path, end_only=not recording)
             summary = self.reader.summarize(path)
         except (EpisodicError, OSError) as error:
-            # The file is reported where it matters; its successor shows the same topics.
+            # The file is reported where it matters; the next split shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
             with self._lock:
                 self._losses.forget()
             return
+        losses: list[Loss] = []
         with self._lock:
             before = self._plan_queues().cut_short
             state = self._recordings.get(recording)
-            for topic, flow in split.flows.items():
-                # A recording that refused a publisher does not state what that one offers.
-                if state is None or topic not in state.refused:
-                    self._flows[topic] = self._flows.get(topic, flow).joined(flow)
-                    if not flow.offered.reliable:
-                        self._asked_anew[topic] = _Anew(best_effort=True)
+            self._add_flows(split, frozenset() if state is None else state.refused)
             short = self._plan_queues().cut_short - before
             self._losses.forget(split.arrivals.keys() - split.progress.keys())
+            if state is not None and split.arrivals:
+                self._add_refused(state, summary.start, split.end)
             if recording:
                 self._arrivals.add_split(split)
-            if state is not None and split.arrivals:
-                # Of a large split only the end is measured.
-                start, (first, last) = summary.start, state.span
-                since = max(first or start, min(last or start, start) - _UNNOTICED_NS)
-                self._unwritten += (
-                    Loss(topic, since, split.end + 1, 0, "refused")
-                    for topic in sorted(state.refused)
-                )
-                state.span = first or start, split.end
+                losses = self._losses.add_split(recording, split.progress)
         if recording:
-            self._report_losses(lambda: self._losses.add_split(recording, split.progress))
+            self._report_losses(losses)
         for topic in sorted(short):
             _log.warning(
                 "queue_cut_short",
@@ -398,16 +414,29 @@ class Reception:
                 "recording.queue_mb, or record less",
             )
 
+    def _add_flows(self, split: SplitMeasure, refused: Collection[str]) -> None:
+        for topic, flow in split.flows.items():
+            # A recording that refused a publisher does not state that publisher's QoS.
+            if topic not in refused:
+                self._flows[topic] = self._flows.get(topic, flow).joined(flow)
+                if not flow.offered.reliable:
+                    self._asked_anew[topic] = _Anew(best_effort=True)
+
+    def _add_refused(self, recording: _Recording, start: Ns, end: Ns) -> None:
+        """Adds the time of a split as a loss of each topic with a refused publisher."""
+        first, last = recording.span
+        since = max(first or start, min(last or start, start) - _UNNOTICED_NS)
+        for topic in sorted(recording.refused):
+            self._unwritten.append(Loss(topic, since, end + 1, 0, "refused"))
+        recording.span = first or start, end
+
 
 def newest_splits(bag_dir: Path) -> list[Path]:
-    """Returns the newest splits in a bag directory, by the names of its recordings, in order.
-
-    More than one: the last of a run may have been recorded when the robot's nodes had ended.
-    """
+    """Returns the newest splits in a bag directory, in the order of its recordings' names."""
     newest: list[Path] = []
     with suppress(OSError):
         folders = sorted(folder for folder in bag_dir.iterdir() if has_own_name(folder.name))
-        for folder in [*filter(is_folder, folders)][-_LOOKED_AT:]:
+        for folder in [*filter(is_folder, folders)][-_NEWEST_SPLITS:]:
             splits = sorted(folder.glob("*.mcap"), key=lambda split: split.lstat().st_mtime_ns)
             newest += filter(size_of, splits)
-    return newest[-_LOOKED_AT:]
+    return newest[-_NEWEST_SPLITS:]

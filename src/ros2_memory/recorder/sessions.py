@@ -577,7 +577,7 @@ class RecordingSessions:
                 best_effort = "DURABILITY" not in line.text
                 reception.refused(session.name, line.topic, best_effort=best_effort)
             elif line.kind is LineKind.SEVERAL_TYPES and line.topic in session.subscribed:
-                reception.refused(session.name, line.topic, best_effort=None)
+                reception.never_received(session.name, line.topic)
 
     def _flush_later(
         self, session: RecordingSession, directory: Path, names: tuple[str, ...]
