@@ -93,7 +93,6 @@ class JsonLog(Generic[_T]):
     is_brief: bool = False
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
         self.current = until_changed(self.name)(self.rows)
 
     @cached_property
@@ -206,7 +205,6 @@ class JsonDocument(Generic[_T]):
     most_bytes: int = MAX_SMALL_FILE
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
         self.current = until_changed(self.name)(self.read)
 
     @cached_property

@@ -168,7 +168,6 @@ class MemoryDays:
     monotonic: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
-        """Prepares the words for people."""
         self._folder = self.bag_dir / MEMORY_FOLDER
         self.keeps = self.limits is not None
         self._limits = self.limits or MemoryLimits()

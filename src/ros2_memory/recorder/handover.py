@@ -178,7 +178,6 @@ class HandoverTransfer:
     orders: Orders
 
     def __post_init__(self) -> None:
-        """Notes the splits that were closed before the handover."""
         self.directories = self.old.splits.directory, self.new.splits.directory
         self._last = self.began
         self._both_since: ClockReading | None = None

@@ -172,7 +172,6 @@ class Reception:
     background: Background
 
     def __post_init__(self) -> None:
-        """Begins without any measurement."""
         self._losses = LossCounter()
         self._unwritten: deque[Loss] = deque(maxlen=_MOST_UNWRITTEN)
         self._arrivals = Arrivals()

@@ -1,4 +1,4 @@
-"""Runs the recordings: mostly one, two during a handover, and those that are ending.
+"""Runs the recordings: one at most times, two during a handover, and those that are ending.
 
 This module does each step; `supervisor` decides when. Nothing here waits, except `stop`. Only the
 end of a bag file shows whether it is closed: distributions number splits differently, and a new
@@ -37,11 +37,12 @@ from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
@@ -49,18 +50,21 @@ if TYPE_CHECKING:
 
 
 MAX_DISTINCT: Final = 200
-"""How many warnings of a kind that differ in more than their numbers one recording reports."""
+"""So many different warnings of a kind are reported of one recording."""
 EMPTY_GRACE_S: Final = 5.0
 """A file that is still 0 bytes so long after a newer one appeared was lost to a full disk."""
 _LAST_LINES: Final = 6
+"""So many lines of a child are quoted when it dies."""
 
 
 class SplitChanges(NamedTuple):
-    """What changed since the last observation.
+    """The changes in a recording since the last observation.
 
-    `closed` names splits in the order in which they were recorded, and `empty` those that are found
-    to stay empty though a newer one was seen. `gone`: the directory existed and does not any more.
-    `faults` are sentences about what could not be read.
+    Attributes:
+        closed: names of the splits that were closed, in the order in which they were recorded.
+        empty: names of the splits that will stay empty, since a newer one was started.
+        gone: whether the directory, which existed, is missing.
+        faults: sentences on what cannot be read.
     """
 
     closed: tuple[str, ...] = ()
@@ -83,8 +87,8 @@ class Splits:
     """The splits of one recording, as of the last observation.
 
     Attributes:
-        received: the topics of which a closed split has a message.
-        messages: how many messages all closed splits have.
+        received: the topics that have a message in a closed split.
+        messages: the number of messages in all closed splits.
     """
 
     directory: Path
@@ -107,25 +111,13 @@ class Splits:
         for name, size in sizes.items():
             split = self._files.setdefault(name, _Split(now_s))
             split.size = max(split.size, size)
-        faults: list[str] = []
-        closed = [name for name in sizes if self._note_closed(name, faults)]
-        closed.sort(key=lambda name: (self._files[name].start, name))
-        newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
-        overdue = now_s - newest_s >= EMPTY_GRACE_S
-        empty = [
-            name
-            for name, size in sizes.items()
-            if overdue
-            and not (size or self._files[name].stays_empty)
-            and newest_s > self._files[name].first_seen_s
-        ]
-        for name in empty:
-            self._files[name].stays_empty = True
+        closed, faults = self._find_closed(sizes)
+        empty = self._find_empty(sizes, now_s)
         return SplitChanges(tuple(closed), tuple(empty), faults=tuple(faults))
 
     @property
     def bytes_written(self) -> int:
-        """The size of all splits in bytes, deleted ones included; it never shrinks."""
+        """The size of all splits in bytes, with deleted ones; it never shrinks."""
         return sum(split.size for split in self._files.values())
 
     @property
@@ -135,11 +127,11 @@ class Splits:
 
     @property
     def seen(self) -> Collection[str]:
-        """The names of all splits that were ever observed."""
+        """The names of all splits that any observation found."""
         return self._files.keys()
 
     def names(self) -> frozenset[str]:
-        """Returns the names of all splits, seen before or present now."""
+        """Returns the names of all splits, those observed and those present now."""
         with suppress(OSError):
             return frozenset(self._files) | frozenset(self._sizes())
         return frozenset(self._files)
@@ -152,33 +144,49 @@ class Splits:
                     sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
         return sizes
 
-    def _note_closed(self, name: str, faults: list[str]) -> bool:
-        """Takes what a split has that was closed since the last observation; returns if it was."""
-        split = self._files[name]
-        if split.closed or split.size == 0:
-            return False
-        path = self.directory / name
-        try:
-            if self.reader.closing(path) is not Closing.CLOSED:
-                return False
-            split.closed = True
-            summary = self.reader.summarize(path)
-        except BagError as error:
-            if split.closed:
-                faults.append(str(error))
-            return split.closed
-        except OSError as error:
-            faults.append(f"{path}: {error.strerror or error}")
-            return split.closed
+    def _find_closed(self, names: Iterable[str]) -> tuple[list[str], list[str]]:
+        """Returns the newly closed splits, in the order of their start, and sentences on faults."""
+        closed: list[str] = []
+        faults: list[str] = []
+        for name in names:
+            split, path = self._files[name], self.directory / name
+            if split.closed or not split.size:
+                continue
+            try:
+                if self.reader.closing(path) is Closing.CLOSED:
+                    split.closed = True
+                    closed.append(name)
+                    self._add_content(split, self.reader.summarize(path))
+            except BagError as error:
+                if split.closed:  # an open file need not be readable yet
+                    faults.append(str(error))
+            except OSError as error:
+                faults.append(f"{path}: {error.strerror or error}")
+        closed.sort(key=lambda name: (self._files[name].start, name))
+        return closed, faults
+
+    def _add_content(self, split: _Split, summary: BagSummary) -> None:
         if not summary.empty:
             split.start = summary.start
         self.received.update(topic.topic for topic in summary.topics)
         self.messages += summary.count
-        return True
+
+    def _find_empty(self, sizes: Mapping[str, int], now_s: float) -> list[str]:
+        """Returns the splits that are newly known to stay empty."""
+        newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
+        if now_s - newest_s < EMPTY_GRACE_S:
+            return []
+        empty: list[str] = []
+        for name, size in sizes.items():
+            split = self._files[name]
+            if not size and not split.stays_empty and split.first_seen_s < newest_s:
+                split.stays_empty = True
+                empty.append(name)
+        return empty
 
 
 class SessionState(Enum):
-    """How far a session has come."""
+    """The state of a session."""
 
     STARTING = auto()
     RECORDING = auto()
@@ -191,11 +199,11 @@ class RecordingSession:
     """One recording: its name, its child process and its splits.
 
     Attributes:
-        is_listed: whether it is in the list of the recorder's own recordings, as a directory.
-        has_recorded: whether its child ever reported that it records.
-        subscribed: the topics that its child reported as subscribed, which does not mean that it
-            receives any of them.
-        of_unknown_type: the topics that its child reported as of an unknown type: one of each type.
+        is_listed: whether the list of own recordings has its directory.
+        has_recorded: whether the child has ever reported that it records.
+        grew_at: when the splits last grew (wall time).
+        subscribed: topics that the child has subscribed to, whether it receives them or not.
+        of_unknown_type: topics of an unknown type, as the child reports them: one of each type.
     """
 
     name: str
@@ -204,7 +212,6 @@ class RecordingSession:
     began: ClockReading
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
         self.state = SessionState.STARTING
         self.is_listed = False
         self.has_recorded = False
@@ -217,32 +224,28 @@ class RecordingSession:
 
     @property
     def is_recording(self) -> bool:
-        """Whether its child records, and has not been asked to end."""
+        """Whether the child records, and was not asked to end."""
         return self.state is SessionState.RECORDING
 
     @property
     def last_output(self) -> str:
-        """The last warnings and errors of the child, at most 600 characters.
-
-        Not its INFO lines, nor what it said of a single topic, which is no reason to end.
-        """
+        """The last warnings and errors of the child that name no topic, at most 600 characters."""
         return " | ".join(self._last_lines)[-600:]
 
     def age_s(self, now: ClockReading) -> float:
-        """Returns for how long it has lived, in seconds."""
+        """Returns how long ago the recording began, in seconds."""
         return now.monotonic_s - self.began.monotonic_s
 
     def end(self) -> None:
-        """Asks its child to end. Does nothing the second time."""
+        """Asks the child to end. A second call does nothing."""
         if self.state in {SessionState.STARTING, SessionState.RECORDING}:
             self.state = SessionState.ENDING
             self.child.end()
 
     def new_lines(self) -> Sequence[Line]:
-        """Returns what the child printed since the last call and is worth reporting.
+        """Returns the lines since the last call that are worth reporting, each warning once.
 
-        Each warning comes once: some recorders repeat one ten times a second for as long as its
-        cause lasts.
+        Some recorders repeat a warning ten times a second.
         """
         lines: list[Line] = []
         for raw in self.child.take_lines():
@@ -250,16 +253,16 @@ class RecordingSession:
             if line.text and line.topic is None and "[INFO]" not in raw:
                 self._last_lines.append(line.text)
             if line.kind is LineKind.TOPIC_LOST and line.topic is not None:
-                # It counts from the beginning of the recording.
+                # The child counts from the beginning of the recording.
                 self._lost[line.topic] = line.count or 0
             if line.kind is LineKind.READY:
                 if not self.has_recorded:
                     lines.append(line)
                 self._note_recording()
             elif line.kind is LineKind.SUBSCRIBED and line.topic is not None:
-                # A child that subscribes records, in whatever words it reports its beginning.
+                # Distributions report in different words that they record; all report this.
                 self._note_recording()
-                # Its own topic says nothing of whether it hears the robot.
+                # A recorder's own topic does not show that it hears the robot.
                 if line.topic != MESSAGES_LOST:
                     self.subscribed.add(line.topic)
                     lines.append(line)
@@ -270,12 +273,12 @@ class RecordingSession:
         return lines
 
     def take_lost(self) -> Mapping[str, int]:
-        """Returns how many more messages of topics the child has lost than at the last call."""
+        """Returns how many messages of each topic the child has lost since the last call."""
         more, self._lost_before = self._lost - self._lost_before, self._lost.copy()
         return more
 
     def silent_topics(self) -> frozenset[str]:
-        """Returns topics subscribed to that no closed split contains; none before the first."""
+        """Returns subscribed topics that no closed split has; none before a split is closed."""
         if not self.splits.closed_names:
             return frozenset()
         return frozenset(self.subscribed - self.splits.received)
@@ -304,14 +307,14 @@ class Required(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orders:
-    """What to record, and with what. Durations are in seconds.
+    """What to record, and the parts that recording uses. Durations are in seconds.
 
     Attributes:
-        session_duration_s: how long a recording lasts before the next takes over.
-        min_free_bytes: what must be free on the disk for recording to continue.
+        session_duration_s: how long a recording lasts before the next one takes over.
+        min_free_bytes: recording pauses while less is free on the disk.
         start_child: starts the `ros2 bag record` of a recording, given its name and directory.
         simulated: log times come from a simulated clock.
-        advice: says what to do where publishers are subscribed to and not heard.
+        advice: returns advice on publishers that are subscribed to and not received.
     """
 
     bag_dir: Path
@@ -331,9 +334,9 @@ class Orders:
 
 
 SETTLE_S: Final = 5.0
-"""A recording this young writes its headers and latched messages, which do not end a silence."""
+"""At first a recording writes its headers and latched messages, which do not end a silence."""
 WHOLE_RECORDING_S: Final = 15.0
-"""A recording that lived for less is too short to report topics without messages."""
+"""Of a shorter recording, topics without messages are not reported."""
 
 
 @dataclass(eq=False, repr=False)
@@ -341,18 +344,18 @@ class RecordingSessions:
     """The sessions of one bag directory.
 
     Args:
-        announce: receives the name of a recording before anything of it exists.
-        interrupted: receives when a recording last grew that ended unexpectedly (wall time), and
-            how it ended.
+        announce: is called with the name of a recording before anything of it exists.
+        interrupted: is called when a recording ended unexpectedly, with the wall time at which it
+            last grew, and with how it ended.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
         current: the session that records; None while none does.
-        handover: the handover from the current session to the next; None mostly.
+        handover: the handover from the current session to the next; None at most times.
         restarts: how often a recording had to be started again.
-        heard: the topics of which a closed split had a message.
+        heard: the topics that had a message in a closed split.
         closed_s: when a split was last closed, by the monotonic clock.
-        grew_s: when a recording last grew by more than its beginning, by that clock.
+        grew_s: when a recording last grew by more than its beginning, by the monotonic clock.
     """
 
     orders: Orders
@@ -361,14 +364,13 @@ class RecordingSessions:
     events: EventLog
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
         self._bag_dir = self.orders.bag_dir
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
         self.running: tuple[RecordingSession, ...] = ()
         # By the old recording's name, until that has ended.
         self._completed: dict[str, HandoverTransfer] = {}
-        # Old and new recordings whose sidecars may have to change.
+        # Pairs of an old and a new recording whose sidecars may have to change.
         self._unsettled: list[tuple[Path, Path]] = []
         self._is_recovered = False
         self._ended_bytes = 0
@@ -386,7 +388,7 @@ class RecordingSessions:
         """Starts a recording; none may be current.
 
         Raises:
-            RecorderError: it cannot be started.
+            RecorderError: the recording cannot be started.
         """
         self.current = self._launch(self._name(now), now)
         self.grew_s = max(self.grew_s, now.monotonic_s)
@@ -398,7 +400,7 @@ class RecordingSessions:
         """Starts a recording that is to take over from the current one.
 
         Raises:
-            RecorderError: it cannot be started; the current one continues.
+            RecorderError: the recording cannot be started; the current one continues.
         """
         old = self.current
         if old is None or self.handover is not None:
@@ -415,12 +417,13 @@ class RecordingSessions:
         self.events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:
-        """Reads what the children printed and wrote; returns whether a split was closed."""
+        """Reads the output and the splits of all children; returns whether a split was closed."""
         has_closed = False
         for session in self.running:
             changes = self._observe_session(session, now)
             self._update_list(session)
-            has_closed |= bool(changes.closed)
+            if changes.closed:
+                has_closed = True
             if changes.gone and session.state is not SessionState.ENDING:
                 name = session.name
                 sentence = f"the directory of recording {name} is missing; a new recording starts"
@@ -432,7 +435,7 @@ class RecordingSessions:
         return has_closed
 
     def advance_handover(self, now: ClockReading) -> Step:
-        """Takes a handover further; returns COMPLETE or ABANDON when it is over."""
+        """Does the step of the handover that is due; returns COMPLETE or ABANDON at its end."""
         handover = self.handover
         if handover is None:
             return Step.WAIT
@@ -447,7 +450,7 @@ class RecordingSessions:
         return step
 
     def end_unready(self, now: ClockReading) -> bool:
-        """Ends the current session if it does not begin to record; returns whether it did."""
+        """Ends the current session if it never began to record; returns whether it did so."""
         current = self.current
         if current is None or current.is_recording or current.age_s(now) < READY_TIMEOUT_S:
             return False
@@ -460,13 +463,13 @@ class RecordingSessions:
         return True
 
     def collect_ended(self, now: ClockReading) -> int:
-        """Finalizes sessions that have ended; returns how many did so by themselves.
+        """Finalizes sessions that have ended; returns how many died.
 
-        Those that are ending are signalled again. If the current one died during a handover, the
+        Sessions that are ending are signalled again. If the current one died during a handover, the
         new one becomes the current one.
         """
         running, deaths = self.running, 0
-        # The newest first: none that died as well takes over.
+        # The newest first, so that no dead one takes over.
         for session in reversed(running):
             is_ending = session.state is SessionState.ENDING
             status = session.child.end() if is_ending else session.child.exit_status()
@@ -475,30 +478,40 @@ class RecordingSessions:
             if not is_ending:
                 deaths += 1
                 self._report_output(session)
-                sentence, lived_s = describe_death(status, session.last_output), session.age_s(now)
-                self.events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
-                self.restarts += 1
-                self.interrupted(session.grew_at, "died")
+                sentence = describe_death(status, session.last_output)
+                self._report_interruption(
+                    session, "died", "recorder_died", sentence, lived_s=session.age_s(now)
+                )
                 self._go_on_without(session)
             elif session.has_recorded and status == -signal.SIGKILL:
                 sentence = (
                     f"the ros2 bag record of {session.name} hung: it did not end when it was asked "
                     "to, and was killed (SIGKILL); what it had not written yet is lost"
                 )
-                self.events.fail("recorder_hung", sentence, recording=session.name)
-                self.restarts += 1
-                self.interrupted(session.grew_at, "hung")
+                self._report_interruption(session, "hung", "recorder_hung", sentence)
             self._finalize(session, now)
         if self.running != running:
             self.settle_handovers()
         return deaths
+
+    def _report_interruption(
+        self,
+        session: RecordingSession,
+        how: Interruption,
+        event: str,
+        sentence: str,
+        **values: object,
+    ) -> None:
+        self.events.fail(event, sentence, recording=session.name, **values)
+        self.restarts += 1
+        self.interrupted(session.grew_at, how)
 
     def end_all(self, now: ClockReading) -> None:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
         handover = self.handover
         if handover is not None:
             with self._reporting_failures(handover.old):
-                # Else the old one counts up to its end, and the new one from there.
+                # An incomplete one is settled later: the old recording counts up to its end.
                 if handover.complete(now):
                     self._completed[handover.old.name] = handover
             self._unsettled.append(handover.directories)
@@ -507,7 +520,7 @@ class RecordingSessions:
         self.current, self.handover = None, None
 
     def stop(self, now: ClockReading) -> None:
-        """Ends all sessions, and waits for that within the patience of the children."""
+        """Ends all sessions, and waits for them as long as the children's patience lasts."""
         self.end_all(now)
         for child in end_all([session.child for session in self.running]):
             self.events.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
@@ -528,10 +541,10 @@ class RecordingSessions:
         return session
 
     def _update_list(self, session: RecordingSession) -> None:
-        """Lists the directory that the child made, and its splits; a fault is retried."""
+        """Lists the directory and the splits that the child made; tried again after a fault."""
         with self.events.lasting_if_refused("recording_not_listed", session.name):
             session.is_listed = session.is_listed or self.orders.own.complete(session.name)
-            # Else another disk may lie there.
+            # If the directory is missing, another disk may lie there.
             if session.is_listed and session.splits.exists:
                 has_ended = session.state is SessionState.ENDED
                 self.orders.own.note(session.name, session.splits.seen, ended=has_ended)
@@ -542,14 +555,14 @@ class RecordingSessions:
         changes = session.splits.observe(now.monotonic_s)
         if session.splits.bytes_written > before:
             session.grew_at = now.wall
-            # The end of a file is written when its recording ends, too.
+            # A recording that ends grows by the end of its file.
             if session.is_recording and session.age_s(now) >= SETTLE_S:
                 self.grew_s = now.monotonic_s
         for name in changes.closed:
             self.events.info("split_closed", recording=session.name, file=name)
             self.orders.reception.learn(session.name, session.splits.directory / name)
         if changes.closed or session.state is SessionState.ENDED:
-            # What a split shows to be missing is counted first.
+            # After `learn`: what a split itself shows to be missing is counted first.
             for topic, count in session.take_lost().items():
                 self.orders.reception.lost(session.name, topic, count)
         if changes.closed:
@@ -572,8 +585,7 @@ class RecordingSessions:
             if line.topic is None:
                 continue
             if line.kind is LineKind.QOS_REFUSED:
-                # Of two policies that do not fit only one is named: a volatile publisher may be
-                # best effort, but then another line says that.
+                # The line names one policy that does not fit; another line names the other.
                 best_effort = "DURABILITY" not in line.text
                 reception.refused(session.name, line.topic, best_effort=best_effort)
             elif line.kind is LineKind.SEVERAL_TYPES and line.topic in session.subscribed:
@@ -605,7 +617,7 @@ class RecordingSessions:
         self.events.info("rotated", recording=handover.old.name, next=handover.new.name)
 
     def _abandon(self, handover: HandoverTransfer) -> None:
-        """Ends the new session; the old one continues."""
+        """Ends the new session of a handover; the old one continues."""
         self.handover = None
         self._unsettled.append(handover.directories)
         with self._reporting_failures(handover.old):
@@ -613,7 +625,7 @@ class RecordingSessions:
         handover.new.end()
 
     def _go_on_without(self, session: RecordingSession) -> None:
-        """Goes on without a session: with the other one of a handover, if there is one."""
+        """Continues without a session, with the other one of its handover if there is one."""
         handover = self.handover
         if handover is not None and session is handover.new:
             self._abandon(handover)
@@ -626,7 +638,7 @@ class RecordingSessions:
                 self.settle_handovers()
 
     def recover(self) -> None:
-        """Settles what an earlier run left, which is looked for once, and what could not be yet.
+        """Settles the handovers that are still open; the first call finds those of an earlier run.
 
         Raises:
             OSError: the bag directory cannot be listed.
@@ -637,10 +649,9 @@ class RecordingSessions:
         self.settle_handovers()
 
     def settle_handovers(self) -> None:
-        """Completes handovers whose recordings have ended, and compares the two where they can be.
+        """Completes and compares the handovers whose recordings have ended.
 
-        Those of recordings that run wait. What fails, as on a full disk, is reported and tried
-        again with the next call.
+        A failure, as on a full disk, is reported, and the next call tries again.
         """
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
@@ -650,7 +661,7 @@ class RecordingSessions:
                     self._unsettled.remove((old, new))
 
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
-        """Reads what an ended session left, and makes it durable."""
+        """Notes the last splits of an ended session, makes them durable and reports on them."""
         session.state = SessionState.ENDED
         self.running = tuple(other for other in self.running if other is not session)
         self._observe_session(session, now)
@@ -660,21 +671,14 @@ class RecordingSessions:
                 handover.add_late_splits()
         self._update_list(session)
         self.events.ended(session.name)
-        splits = session.splits
+        splits, lived_s = session.splits, session.age_s(now)
         if remove_if_empty(splits.directory):
             self.events.info("recording_empty", recording=session.name)
         self._flush_later(session, splits.directory, (METADATA_FILE,))
         self._flush_later(session, self._bag_dir, ())
         self._ended_bytes += splits.bytes_written
-        lived_s = session.age_s(now)
-        silent = sorted(session.subscribed - splits.received)
-        if silent and lived_s >= WHOLE_RECORDING_S:
-            sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
-            if not splits.received:
-                topics = counted(len(silent), "topic")
-                sentence = f"subscribed to {topics} and received nothing from any of them; "
-                sentence += self.orders.advice()
-            self.events.warn("topics_silent", sentence, recording=session.name)
+        if lived_s >= WHOLE_RECORDING_S:
+            self._report_silent_topics(session)
         self.events.info(
             "recording_ended",
             recording=session.name,
@@ -684,9 +688,20 @@ class RecordingSessions:
             lived_s=round(lived_s, 3),
         )
 
+    def _report_silent_topics(self, session: RecordingSession) -> None:
+        silent = sorted(session.subscribed - session.splits.received)
+        if not silent:
+            return
+        sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
+        if not session.splits.received:
+            topics = counted(len(silent), "topic")
+            sentence = f"subscribed to {topics} and received nothing from any of them; "
+            sentence += self.orders.advice()
+        self.events.warn("topics_silent", sentence, recording=session.name)
+
     @contextmanager
     def _reporting_failures(self, session: RecordingSession) -> Iterator[None]:
-        """Reports an error of the handover from this session, and continues after the block."""
+        """Reports an error of the session's handover, and continues after the block."""
         try:
             yield
         except (RecorderError, OSError) as error:
