@@ -1,4 +1,4 @@
-"""What the recorder reports: log events, and the newest of them that was a fault."""
+"""The recorder's log events, and its newest fault."""
 
 from __future__ import annotations
 
@@ -29,14 +29,17 @@ _ADVICE = {
 }
 
 _LASTING = frozenset({LineKind.UNKNOWN_TYPE, LineKind.SEVERAL_TYPES, LineKind.QOS_REFUSED})
+"""Faults of a topic that stays unrecorded until somebody mends its publishers."""
 _MOST_TOPICS = 1000
 
 
 class EventLog:
-    """Log events of the recorder.
+    """Logs events of the recorder, and remembers the newest fault.
 
     Attributes:
-        recovered: whether recording has gone on since the newest fault.
+        last_error: the newest fault, as a sentence.
+        last_error_at: when it was logged (wall time).
+        recovered: whether recording has gone on since then.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -46,7 +49,7 @@ class EventLog:
         self.recovered = False
         self._lasting: tuple[str, str] | None = None
         self._unresolved: set[tuple[str, str]] = set()
-        self._of_topics: set[tuple[str, str]] = set()
+        self._said: set[tuple[str, str]] = set()
 
     def info(self, event: str, **values: object) -> None:
         """Logs an event of normal operation."""
@@ -58,7 +61,7 @@ class EventLog:
         _log.warning(event, reason=sentence, **values)
 
     def remark(self, event: str, sentence: str, **values: object) -> None:
-        """Logs a warning about the robot, which is no fault of the recorder."""
+        """Logs a warning about the robot. It is no fault of the recorder."""
         _log.warning(event, reason=sentence, **values)
 
     def fail(self, event: str, sentence: str, **values: object) -> None:
@@ -67,7 +70,7 @@ class EventLog:
         _log.error(event, reason=sentence, **values)
 
     def lasting(self, event: str, subject: str, fault: str | None, **values: object) -> None:
-        """Logs a fault as `fail` does, once for each subject until it is None."""
+        """Logs a fault of a subject as `fail` does, once until the fault is None."""
         if fault is None:
             self._unresolved.discard((event, subject))
         elif (event, subject) not in self._unresolved:
@@ -77,7 +80,7 @@ class EventLog:
 
     @contextmanager
     def lasting_if_refused(self, event: str, subject: str, **values: object) -> Iterator[None]:
-        """Logs a `RecorderError` of the block as `lasting`; without one the fault is over."""
+        """Logs a `RecorderError` of the block with `lasting`. Without one the fault is over."""
         try:
             yield
         except RecorderError as error:
@@ -86,11 +89,11 @@ class EventLog:
             self.lasting(event, subject, None)
 
     def recorded(self) -> None:
-        """Notes that recording goes on: the last fault is past, unless it lasts."""
+        """Notes that recording goes on: the newest fault is over, unless it lasts."""
         self.recovered = self.last_error is not None and self._lasting not in self._unresolved
 
     def ended(self, recording: str) -> None:
-        """Notes that a recording has ended, and with it its lasting faults."""
+        """Notes that a recording has ended: its lasting faults are over."""
         self._unresolved = {
             (event, subject)
             for event, subject in self._unresolved
@@ -102,29 +105,34 @@ class EventLog:
         self.recovered, self._lasting = False, None
 
     def report_faults(self, faults: Mapping[str, str]) -> None:
-        """Logs each task of the housekeeper that fails, once for as long as it does."""
+        """Logs each failing task of the housekeeper, once until it succeeds."""
         failed = [task for event, task in self._unresolved if event == "housekeeping_failed"]
         for task in (*failed, *faults):
             self.lasting("housekeeping_failed", task, faults.get(task), task=task)
 
     def report_output(self, recording: str, lines: Iterable[Line]) -> None:
-        """Logs what the `ros2 bag record` of a recording printed."""
+        """Logs the lines that the `ros2 bag record` of a recording printed."""
         for line in lines:
             if line.kind in _INFORM:
                 topic = {} if line.topic is None else {"topic": line.topic}
                 self.info(line.kind.value, recording=recording, **topic)
             elif line.kind in _ADVICE:
-                # What to do about it; of a topic that stays unrecorded, once as a fault: each new
-                # recorder says it again, which is no newer fault than why it was started.
-                about, known = f"{line.topic}: " if line.topic else "", False
-                if line.topic is not None and line.kind in _LASTING:
-                    known = (line.kind, line.topic) in self._of_topics
-                    if len(self._of_topics) < _MOST_TOPICS:
-                        self._of_topics.add((line.kind, line.topic))
-                report = self.remark if known else self.warn
+                about = f"{line.topic}: " if line.topic else ""
                 sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
+                # Each new recorder repeats this: it must not replace the fault that led to it.
+                report = self.remark if self._is_repeated(line) else self.warn
                 report(line.kind.value, sentence, recording=recording)
             elif line.kind is LineKind.ERROR:
                 self.fail("recorder_error", line.text, recording=recording)
             else:
                 self.warn("recorder_warning", line.text, recording=recording)
+
+    def _is_repeated(self, line: Line) -> bool:
+        """Returns whether an earlier line said this of its topic; remembers the line."""
+        if line.topic is None or line.kind not in _LASTING:
+            return False
+        said = line.kind, line.topic
+        is_repeated = said in self._said
+        if len(self._said) < _MOST_TOPICS:
+            self._said.add(said)
+        return is_repeated

@@ -1,7 +1,4 @@
-"""Keeps the bag directory in order for a recorder: repairs what crashes left, deletes by limits.
-
-What a crash left is repaired when the index finds it, and nothing writes it.
-"""
+"""Keeps the bag directory in order for a recorder: repairs files, saves moments, deletes bags."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -55,13 +52,14 @@ MOST_REPAIRED_BYTES: Final = 1 << 30
 _MB: Final = 10**6
 _MCAP: Final = ".mcap"
 _LAST_STEPS: Final = 2
+"""So many steps of screening a recorder that stops still does."""
 _WRITTEN_AT_ONCE: Final = 2
-"""Recordings, during a rotation."""
+"""So many recordings are written during a rotation."""
 _log = get_logger(__name__)
 
 
 class HouseStatus(NamedTuple):
-    """What the heartbeat shows of a housekeeper's work, under the same names."""
+    """The fields of the heartbeat that a housekeeper sets."""
 
     age_held: str | None = None
     unshipped: str | None = None
@@ -72,23 +70,23 @@ class HouseStatus(NamedTuple):
 
 
 class Housekeeping:
-    """Repairs and deletes in one bag directory, which its caller has locked.
+    """Repairs, saves and deletes in one bag directory, which its caller has locked.
 
-    The recorder calls it between two ticks, so a call returns at once. What takes a while is done
-    in the background: the first scan of a week of bags takes from seconds to minutes. What is still
+    The recorder calls it between two ticks, so a call returns at once and the work is done in the
+    background: the first scan of a week of bags takes from seconds to minutes. Work that is still
     under way is not begun again.
 
     Args:
-        limits: how much is kept. If bags of other programs do not count, they are not repaired
-            either.
-        is_synchronised: whether the system clock is synchronised; may take some seconds.
-        moments_bytes: how much of the budget saved moments may take.
-        rule_bytes: how much of that each rule may take.
-        watch: makes the rules' watch over what is recorded; None where there are no rules.
-        screening: excludes messages before splits are served; None where nothing is excluded.
+        limits: how much is kept, and whether bags of other programs count; if they do not, they are
+            not repaired either.
+        is_synchronised: returns whether the system clock is synchronised; may take some seconds.
+        moments_bytes: the part of the budget that saved moments may take.
+        rule_bytes: the part of it that each rule may take.
+        watch: makes the rules' watch over recordings; None without rules.
+        screening: excludes messages before splits are served; None if nothing is excluded.
         grace_s: for how long a query may work on an older snapshot of the bags.
-        memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
-        cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
+        memory: keeps messages of deleted bags, or deletes those kept; None for neither.
+        cutter: cuts topics with a shorter life out of bags; None if no topic has one.
     """
 
     def __init__(
@@ -158,13 +156,10 @@ class Housekeeping:
         self._unwritten: list[Loss] = []
 
     def prepare(self) -> None:
-        """Notes that an earlier run was cut short, and removes what it began or left without a bag.
-
-        Nothing may be recording.
+        """Cleans up after an earlier run that was cut short. Call it before anything is recorded.
 
         Raises:
-            OSError: the bag directory, or the list of the recorder's own recordings, cannot be
-                read.
+            OSError: the bag directory or the list of own recordings cannot be read.
         """
         heartbeat, now = read_heartbeat(self._bag_dir).heartbeat, self._clock.now()
         if heartbeat is not None and heartbeat.state is not RecorderState.STOPPED:
@@ -177,10 +172,10 @@ class Housekeeping:
                 self._note_interruption(min(heartbeat.since, now), now, "paused")
         if self._limits.keeps_foreign:
             for directory in filter(is_folder, self._bag_dir.iterdir()):
-                # Killed before it was listed as a directory: nothing shows whose it is.
+                # A kill came before its directory was listed: nothing shows whose it is.
                 if self._own.began(directory):
                     remove_if_empty(directory)
-        # Killed between the deletion of a last bag and of its directory.
+        # A kill may have come between the deletion of a last bag and of its directory.
         directories = (self._bag_dir / name for name in self._own.names())
         self._collector.emptied.update(filter(self._own.owns, directories))
         self._clear_memory()
@@ -193,7 +188,7 @@ class Housekeeping:
             _log.error("memory_not_limited", reason=error.strerror or str(error))
 
     def make_room(self, free_bytes_wanted: int) -> None:
-        """Begins to delete, oldest first, until so much is free, or nothing may be deleted."""
+        """Begins to delete the oldest bags until so much is free, or no bag may be deleted."""
         self._add_unless_under_way("make_room", partial(self._delete_for_room, free_bytes_wanted))
 
     def is_making_room(self) -> bool:
@@ -201,12 +196,12 @@ class Housekeeping:
         return self._background.is_under_way("make_room")
 
     def apply(self) -> None:
-        """Begins to delete what exceeds the limits, and to repair what nothing writes any more."""
+        """Begins to delete bags that exceed the limits, and to repair unfinished files."""
         self._add_unless_under_way("apply", self._collect_and_repair)
 
     def keep_moments(self) -> None:
-        """Begins to save the moments that were asked for, or wait for bags; about once a second."""
-        self._add_unless_under_way("keep_moments", self._save_moments)
+        """Begins to save requested and pending moments. Call it about once a second."""
+        self._add_unless_under_way("keep_moments", self._save_requested_moments)
 
     def wait(self) -> None:
         """Waits until nothing is under way."""
@@ -234,28 +229,32 @@ class Housekeeping:
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
-    def _save_moments(self, *, in_pass: bool = False) -> None:
-        """Saves the moments that were asked for, and those of rules.
+    def _save_requested_moments(self) -> None:
+        """Saves requested and pending moments, and those of rules if a recording began anew."""
+        self._moments.open()
+        has_restarted = self._triggers is not None and bool(self._triggers.restarts)
+        if has_restarted or self._moments.has_work():
+            with self._index.undisturbed() as snapshot:
+                if self._moments.has_work():
+                    self._moments.keep(snapshot)
+                if self._triggers is not None and has_restarted:
+                    self._triggers.look(snapshot)
 
-        Rules look before each pass, and at once where a recording began anew.
-        """
-        if not in_pass:
-            self._moments.open()
-        looks = self._triggers is not None and (in_pass or bool(self._triggers.restarts))
-        if not (in_pass or looks or self._moments.has_work()):
-            return
+    def _save_moments_in_pass(self) -> None:
+        """Saves pending moments and those of all rules, before a pass may delete their bags."""
         with self._index.undisturbed() as snapshot:
             if self._moments.has_work():
                 self._moments.keep(snapshot)
-            if in_pass:
-                self._moments.relink_sidecars()
-            if self._triggers is not None and looks:
+            self._moments.relink_sidecars()
+            if self._triggers is not None:
                 self._triggers.look(snapshot)
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
-        """Records that a recording ended unexpectedly, or was paused until now.
+        """Writes down that a recording ended unexpectedly, or was paused until now.
 
-        It last grew at the wall time `first`; `how` is a key of `INTERRUPTIONS`.
+        Args:
+            first: when the recording last grew (wall time).
+            how: a key of `INTERRUPTIONS`.
         """
         now = self._clock.now()
         if self._triggers is not None and how != "paused":
@@ -263,12 +262,12 @@ class Housekeeping:
         self._note_interruption(min(first, now), now, how)
 
     def _note_interruption(self, first: Ns, now: Ns, how: Interruption) -> None:
-        with self._lock:  # what another thread has written is cleared
+        with self._lock:
             self._unwritten.append(Loss(EVERY_TOPIC, first, now + 1, 0, how))
         self._write_losses()
 
     def _write_losses(self) -> None:
-        """Writes what is noted as missing; what the disk refuses waits for the next call."""
+        """Writes the losses that are noted; if the disk fails they wait for the next call."""
         with self._lock:
             try:
                 if self._unwritten:
@@ -279,29 +278,29 @@ class Housekeeping:
                 self._unwritten.clear()
 
     def announce(self, recording: str) -> None:
-        """Holds a recording back until it is screened, where something is to be excluded.
+        """Holds a new recording back until it is screened, if messages are to be excluded.
 
         Raises:
-            RecorderError: that cannot be written down.
+            RecorderError: the recording cannot be held back.
         """
         if self._screening is not None:
             self._screening.announce(recording)
 
     def screen(self, live: Collection[str]) -> None:
-        """Begins to screen closed splits; `live` are the recordings that are being written.
+        """Begins to screen closed splits. Call it from the thread that begins recordings.
 
-        Called about every two seconds, from the thread that begins recordings.
+        `live` names the recordings that are being written.
         """
         if self._screening is None or self._background.is_under_way("screen"):
             return
-        # What is live is known now, and not when the thread begins.
+        # Planned now: `live` may be out of date when the thread begins.
         try:
             self._background.add("screen", self._screening.plan(live))
         except (EpisodicError, OSError) as error:
             self._background.failed("screen", str(error))
 
     def finish(self) -> None:
-        """Screens what is left, some splits of each recording, and waits for what is under way."""
+        """Screens some more splits of each recording, and waits for all work that is under way."""
         for _ in range(_LAST_STEPS):
             self._background.add("screen", self._screen_rest)
         self._background.wait()
@@ -311,7 +310,7 @@ class Housekeeping:
             self._screening.plan(())()
 
     def status(self) -> HouseStatus:
-        """Returns what the last pass found, and what is held back at this moment."""
+        """Returns the results of the last pass, and what is held back at this moment."""
         if self._screening is None:
             return self._status
         return self._status._replace(
@@ -320,37 +319,30 @@ class Housekeeping:
         )
 
     def excluded_latched(self) -> frozenset[str]:
-        """Returns the latched topics whose newest message is excluded whenever it is received."""
+        """Returns the latched topics whose newest message is excluded."""
         return frozenset() if self._screening is None else self._screening.excluded_latched()
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
-        """Counts recorded time, by which recordings age where the wall clock is wrong.
+        """Counts recorded time, by which recordings age if the wall clock is wrong.
 
-        Called several times a second, with no recordings while nothing is recorded.
+        Call it several times a second, with no recordings while nothing is recorded.
         """
         self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 
     def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
         try:
-            self._save_moments(in_pass=True)
+            self._save_moments_in_pass()
         except (EpisodicError, OSError) as error:
             # Only reported: if it stopped the deletion, the disk would fill.
             _log.error("moments_not_minded", reason=str(error))
         self._clear_memory()
         before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
-        limit = f"{self._limits.max_age_ns / (3600 * NS_PER_S):g} h"
-        age_held = (
-            f"{counted(collected.held, 'bag is', 'bags are')} older than {limit} "
-            "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
-            "They are deleted when it is synchronised with a time server (timedatectl shows that), "
-            f"or when {limit} have been recorded after them"
-        )
         self._status = self._status._replace(
-            age_held=age_held if collected.held else None,
+            age_held=self._describe_held(collected.held),
             counted_bytes=collected.total_bytes,
             state_bytes=collected.state_bytes,
         )
@@ -368,42 +360,44 @@ class Housekeeping:
             duration_ms=ms_since(begun),
             **wanted,
         )
-        self._report(before, collected)
+        self._report_changes(before, collected)
         self._write_losses()  # there may be room now
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
         return collected
 
+    def _describe_held(self, bags: int) -> str | None:
+        if not bags:
+            return None
+        limit = f"{self._limits.max_age_ns / (3600 * NS_PER_S):g} h"
+        return (
+            f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
+            "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
+            "They are deleted when it is synchronised with a time server (timedatectl shows that), "
+            f"or when {limit} have been recorded after them"
+        )
+
     def _collect(self, free_bytes_wanted: int | None) -> Collected:
         with self._index.undisturbed(patrolling=True) as snapshot:
             heartbeat = self._index.heartbeat()
-            begun = heartbeat.recordings if heartbeat else self._own.in_order()[-_WRITTEN_AT_ONCE:]
-            known = self._index.known_bags(begun, snapshot)
+            live = heartbeat.recordings if heartbeat else self._own.in_order()[-_WRITTEN_AT_ONCE:]
+            known = self._index.known_bags(live, snapshot)
             needed = frozenset[str]()
             try:
                 if self._triggers is not None:
                     needed = self._triggers.needed(snapshot)
-            except OSError:  # which was reported when moments were minded
-                # Age deletes none then, and the budget the oldest, so that the disk does not fill.
+            except OSError:  # reported when moments were saved
+                # Age then deletes no bag. The budget deletes the oldest, or the disk would fill.
                 needed = frozenset(bag.file for bag in snapshot.bags)
             collected = self._collector.apply(known, snapshot, needed, free_bytes_wanted)
         if collected.bags or collected.cut:
             self._index.refresh()
         return collected
 
-    def _report(self, before: Collected, collected: Collected) -> None:
-        """Reports what began or ended with a pass, and what it deleted unshipped."""
-        if unshipped := collected.unshipped:
-            self._unshipped += len(unshipped)
-            bags = counted(self._unshipped, "bag was", "bags were")
-            newest = unshipped[: -MAX_NAMED - 1 : -1]
-            sentence = (
-                f"since the recorder started, {bags} deleted unshipped, to make room "
-                f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
-            )
-            self._status = self._status._replace(unshipped=sentence)
-            names = [*unshipped]
-            _log.warning("unshipped_deleted", bags=len(names), names=names, reason=sentence)
+    def _report_changes(self, before: Collected, collected: Collected) -> None:
+        """Reports what a pass deleted unshipped, and the faults that began or ended with it."""
+        if collected.unshipped:
+            self._report_unshipped(collected.unshipped)
         if collected.held and not before.held:
             _log.warning("age_held", bags=collected.held, reason=self._status.age_held)
         elif before.held and not collected.held:
@@ -429,43 +423,61 @@ class Housekeeping:
                 f"{(total - state - saved) / _MB:.3g} MB; raise retention.max_total_gb",
             )
 
+    def _report_unshipped(self, bags: Sequence[str]) -> None:
+        self._unshipped += len(bags)
+        deleted = counted(self._unshipped, "bag was", "bags were")
+        newest = bags[: -MAX_NAMED - 1 : -1]
+        sentence = (
+            f"since the recorder started, {deleted} deleted unshipped, to make room "
+            f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
+        )
+        self._status = self._status._replace(unshipped=sentence)
+        _log.warning("unshipped_deleted", bags=len(bags), names=[*bags], reason=sentence)
+
     def _repair_unfinished(self, snapshot: Snapshot) -> int:
-        """Repairs files that the index found unfinished and nothing writes; returns how many."""
+        """Repairs files that a crash left unfinished; returns how many."""
+        files = [*self._unfinished_files(snapshot)]
+        opened = open_files() if files else ()
+        repaired = 0
+        for path, status in files:
+            size = status.st_size
+            is_small = size <= MOST_REPAIRED_BYTES
+            if is_small and self._measure_free(self._bag_dir) < size:
+                continue  # until there is room for the new file beside it
+            if (status.st_dev, status.st_ino) in opened:
+                continue
+            self._tried.add((path, size, status.st_mtime_ns))
+            if is_small:
+                with suppress(OSError):
+                    repaired += self._repair_file(path)
+            else:
+                reason = (
+                    f"{size} bytes are too many to repair while recording: "
+                    f"run ros2-memory recover {path}"
+                )
+                _log.error("bag_not_repaired", path=str(path), reason=reason)
+        return repaired
+
+    def _unfinished_files(self, snapshot: Snapshot) -> Iterator[tuple[Path, os.stat_result]]:
+        """Yields the files without an end that no recording of ours writes, unless tried before."""
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
         paths += [aside.path for aside in snapshot.active if aside.reason == HELD_BACK]
-        # Live or not.
         named = {self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings}
-        repaired = 0
-        opened: Collection[tuple[int, int]] | None = None
         for path in paths:
             try:
                 status = path.lstat()
             except OSError:
                 continue
-            state = path, status.st_size, status.st_mtime_ns
-            if path.suffix != _MCAP or state in self._tried or path.parent in named:
+            if (path, status.st_size, status.st_mtime_ns) in self._tried:
                 continue
-            if self._links.is_saved(str(path)) or not self._may_repair(path, status):
+            if path.suffix != _MCAP or path.parent in named or self._links.is_saved(str(path)):
                 continue
-            is_small = status.st_size <= MOST_REPAIRED_BYTES
-            if is_small and self._measure_free(self._bag_dir) < status.st_size:
-                continue  # until there is room for the new file beside it
-            opened = open_files() if opened is None else opened
-            if (status.st_dev, status.st_ino) in opened:
-                continue
-            self._tried.add(state)
-            if not is_small:
-                size = f"{status.st_size} bytes are too many to repair while recording"
-                reason = f"{size}: run ros2-memory recover {path}"
-                _log.error("bag_not_repaired", path=str(path), reason=reason)
-                continue
-            with suppress(OSError):
-                repaired += self._repair_file(path)
-        return repaired
+            if self._may_repair(path, status):
+                yield path, status
 
     def _may_repair(self, path: Path, status: os.stat_result) -> bool:
-        """Whether a file is the recorder's, or of another program and unchanged for a while.
+        """Whether a file is the recorder's own, or a foreign one that nothing has written lately.
 
         The heartbeat does not name what other programs write.
         """
@@ -475,7 +487,7 @@ class Housekeeping:
         return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)
 
     def _repair_file(self, path: Path) -> bool:
-        """Repairs one file and reports the result; returns whether it was not whole."""
+        """Repairs one file and reports the result; returns whether the file was damaged."""
         begun = time.perf_counter_ns()
         try:
             repaired = self._repairer.repair(path)

@@ -1,4 +1,4 @@
-"""What becomes of the topics that are to be recorded, and what is not recorded as it should be."""
+"""Finds the topics that are not recorded as they should be."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.sessions import Orders, RecordingSession, RecordingSessions
 
 UNHEARD_S: Final = 30.0
-"""A topic that is offered for so long, and of which nothing came, is not recorded."""
+"""A topic that is offered for so long, and never came, is not recorded."""
 TYPES_S: Final = 15.0
-"""By then a recording has subscribed to all topics of known types that are offered."""
+"""After so long a recording has subscribed to all offered topics of known types."""
 IDLE_SPLITS: Final = 2
-"""Recordings that have not grown for longer than so many splits are idle."""
+"""Recordings that have not grown for so many splits are idle."""
 
 
 class Shortfall(NamedTuple):
-    """The topics that are not recorded as they should be, as the heartbeat has them."""
+    """The topics that are not recorded as they should be: fields of the heartbeat."""
 
     unknown_types: tuple[str, ...] = ()
     unheard: tuple[str, ...] = ()
@@ -33,12 +33,11 @@ class Shortfall(NamedTuple):
 
 
 class TopicWatch:
-    """Watches the topics of all recordings, and names each fault once.
+    """Watches the topics of all recordings, and reports each fault once.
 
     Attributes:
-        waiting_for: why no message has arrived since recording started, as a sentence; else None.
-        gone: the topics that some publisher has offered since the start, and none does any more.
-        shortfall: the topics that are not recorded as they should be.
+        waiting_for: a sentence on why no message has arrived since the start; None if one has.
+        gone: the topics that a publisher has offered since the start, and none offers any more.
     """
 
     def __init__(self, orders: Orders, events: EventLog) -> None:
@@ -52,11 +51,10 @@ class TopicWatch:
         self._named_missing = frozenset[str]()
         self._unheard_from_s: float | None = None
         self._began_s: float | None = None
-        # Since when each topic is offered.
         self._offered_since_s: dict[str, float] = {}
 
     def began(self, now: ClockReading) -> None:
-        """Notes that a recording begins while none runs."""
+        """Notes that a recording begins, and no other one runs."""
         self._unheard_from_s = now.monotonic_s
 
     def look(self, now: ClockReading, sessions: RecordingSessions) -> None:
@@ -80,7 +78,7 @@ class TopicWatch:
             self._events.remark("required_missing", sentence)
 
     def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
-        """Returns the topics that no publisher has offered; none before a recorder has looked."""
+        """Returns the topics that no publisher has offered; none before a child records."""
         for session in sessions.running:
             self._offered |= session.subscribed | session.splits.received
         if not any(session.has_recorded for session in sessions.running):
@@ -90,54 +88,60 @@ class TopicWatch:
         return tuple(sorted({*self._topics.selection.exact} - offered))
 
     def _look_for_messages(self, now: ClockReading, sessions: RecordingSessions) -> None:
-        """Looks whether any message has arrived since recording started.
+        """Reports that no message has arrived since recording started.
 
-        What was heard once is silent later, and not waited for.
+        A robot that was heard once and is silent now is not waited for.
         """
-        if any(map(self._hears, sessions.running)):
+        current = sessions.current
+        if any(self._hears(session) for session in sessions.running):
             self._unheard_from_s = None
-        since_s, current = self._unheard_from_s, sessions.current
+        self.waiting_for = None
+        if current is None:
+            self._events.lasting("recording_waits", "", None)
+            return
         patience_s = max(WAITING_S, self._orders.split_duration_s)
-        if current is not None and current.splits.bytes_written:
-            # What it has is known when its first split is closed.
+        if current.splits.bytes_written:
+            # Its messages are known when its first split is closed.
             patience_s += self._orders.split_duration_s
-        if current is None or since_s is None or now.monotonic_s - since_s < patience_s:
-            self.waiting_for = None
-        elif self._orders.simulated:
-            self.waiting_for = (
+        since_s = self._unheard_from_s
+        if since_s is not None and now.monotonic_s - since_s >= patience_s:
+            self.waiting_for = self._describe_waiting(current)
+        self._events.lasting("recording_waits", "", self.waiting_for, recording=current.name)
+
+    def _describe_waiting(self, current: RecordingSession) -> str:
+        if self._orders.simulated:
+            return (
                 "nothing has been recorded: recording.use_sim_time is on, and nothing is written "
                 "before /clock arrives"
             )
-        elif others := current.subscribed - OWN_TOPICS:
+        others = current.subscribed - OWN_TOPICS
+        if others:
             topics = counted(len(others), "topic is", "topics are")
-            self.waiting_for = (
+            return (
                 f"nothing has been recorded, although {topics} subscribed to; "
                 f"{self._orders.advice()}"
             )
-        else:
-            self.waiting_for = (
-                "nothing has been recorded of the robot: no publisher offers any of the listed "
-                "topics in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and "
-                "topics.yaml with the robot's"
-            )
-        name = current and current.name
-        self._events.lasting("recording_waits", "", self.waiting_for, recording=name)
+        return (
+            "nothing has been recorded of the robot: no publisher offers any of the listed "
+            "topics in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and "
+            "topics.yaml with the robot's"
+        )
 
     def _hears(self, session: RecordingSession) -> bool:
-        """Whether a session has recorded something that may be of the robot."""
+        """Whether a session has recorded messages that may come from the robot."""
         splits = session.splits
         if splits.received - OWN_TOPICS:
             return True
-        # Other bytes may come from nodes of the recorder's own user, as those of /rosout do.
+        # Other bytes may come from nodes of the recorder's own user, as /rosout does.
         others = session.subscribed.union(self._topics.selection.exact) - OWN_TOPICS
         if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
             return False
         return bool(splits.messages or splits.bytes_written)
 
     def _name_absent(self, current: RecordingSession, sessions: RecordingSessions) -> None:
-        """Names topics that no publisher offers: none did since the start, or none does any more.
+        """Reports topics that no publisher has offered, or that none offers any more.
 
-        Each is named once; one that comes back may be named again.
+        Each is reported once; a topic that comes back may be reported again.
         """
         missing = frozenset(self.missing(sessions))
         if new := sorted(missing - self._named_missing):
@@ -164,14 +168,14 @@ class TopicWatch:
         offered = set[str]().union(*(session.subscribed for session in running))
         unknown = set[str]().union(*(session.of_unknown_type for session in running))
         if len(running) > 1 or current.age_s(now) < TYPES_S:
-            # A recording that has not had the time to find all that is offered.
+            # A new recording has not discovered all topics yet.
             offered.update(self._offered_since_s)
             unknown.update(self.shortfall.unknown_types)
         self._offered_since_s = {
             topic: self._offered_since_s.get(topic, now_s) for topic in offered
         }
         split_s = self._orders.split_duration_s
-        # What comes slowly is written when its split is closed.
+        # Slow topics reach the disk only when their split is closed.
         written_until_s = sessions.closed_s if current.splits.bytes_written else now_s - split_s
         idle_s = max(0.0, now_s - sessions.grew_s - IDLE_SPLITS * split_s)
         silent, rates_hz = self._orders.reception.arrivals(ns_from_unix(idle_s))
@@ -180,7 +184,7 @@ class TopicWatch:
             unheard=tuple(
                 topic
                 for topic in sorted({*offered} - sessions.heard - OWN_TOPICS)
-                # Services and actions speak when they are used.
+                # Services and actions publish only when they are used.
                 if "/_" not in topic and written_until_s - self._offered_since_s[topic] >= UNHEARD_S
             ),
             fell_silent=tuple(sorted(silent & offered)),
@@ -199,7 +203,7 @@ class TopicWatch:
         silent: Collection[str],
         rates_hz: Mapping[str, float],
     ) -> Iterator[str]:
-        """Yields why topics are not recorded as required, a sentence each."""
+        """Yields a sentence for each topic that is not recorded as `recording.required` asks."""
         for required in self._orders.required:
             entry = TopicSelection((required.topic,))
             matching = filter(entry.matches, {*self._offered_since_s, *heard, *unknown})

@@ -1,7 +1,7 @@
 """Keeps a recording going: begins, rotates, pauses and restarts it, and reports what happens.
 
-Everything happens in `tick`, which the main thread calls several times a second and which does not
-wait. `policies` and `handover` decide what to do, and `sessions` does it; here they meet.
+The main thread calls `tick` several times a second, which never waits. `policies` and `handover`
+decide what to do, `sessions` does it, and this module connects them.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
 from ros2_memory.core.errors import RecorderError
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.housekeeping import Housekeeping
+    from ros2_memory.recorder.reception import Rotation
 
 HEARTBEAT_S: Final = 5.0
 """How often `recorder.json` is written."""
@@ -44,32 +45,44 @@ SPACE_S: Final = 1.0
 MOMENTS_S: Final = 1.0
 """How often requests to save a moment are looked for: their callers wait for the reply."""
 SCREENING_S: Final = 2.0
-"""How often closed splits are looked for that are to be screened."""
+"""How often closed splits are looked for that may have messages to exclude."""
 FAULT_S: Final = 60.0
-"""How often a failing task, which every tick tries again, is reported."""
+"""How often the fault of a failing task is reported; every tick tries the task again."""
 RETENTION_S: Final = 10.0
-"""How often the limits are applied when splits were closed."""
+"""How often the limits are applied after splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
-"""How often the limits are applied when no split was closed: bags still get older."""
+"""How often the limits are applied without closed splits: bags still get older."""
 UNSETTLED_S: Final = 60.0
-"""How often handovers are tried again that could not be settled, beside at each closed split."""
+"""How often handovers that could not be settled are tried again; each closed split does so, too."""
 LIST_S: Final = 2.0
-"""How often the file of topics is looked at."""
+"""How often the file of topics is read."""
 TOPICS_S: Final = 1.0
 """How often topics are looked for that are not recorded as they should be."""
+
+
+class _Task(NamedTuple):
+    """A task of `tick`: what it runs, how often, and whether it needs the bag directory's disk.
+
+    Its name is in the log event `supervision_failed`.
+    """
+
+    name: str
+    run: Callable[[ClockReading], object]
+    every_s: float = 0.0
+    needs_disk: bool = False
 
 
 class Supervisor:
     """Keeps one recording going, two during a handover.
 
     Args:
-        free_bytes_of: measures what the file system of a directory has left.
-        device: gives the device that a directory lies on.
-        keep_alive: tells the service manager's watchdog that the recorder runs; called before each
-            task, since a slow disk takes seconds for what one writes.
+        free_bytes_of: returns the free bytes on the disk of a directory.
+        device: returns the device of a directory.
+        keep_alive: tells the service manager's watchdog that the recorder runs. It is called before
+            each task, since a slow disk may take seconds for one.
 
     Attributes:
-        stopped: whether it does nothing at this time.
+        stopped: whether `start` was not called yet, or `stop` was.
     """
 
     def __init__(
@@ -109,18 +122,36 @@ class Supervisor:
         self._due_s: dict[str, float] = {}
         self._last = self._now()
         self._applied_s = -QUIET_RETENTION_S
+        self._tasks = (
+            _Task("disk", self._check_disk),
+            _Task("look", self._observe, OBSERVE_S),
+            _Task("deaths", self._check_exits),
+            _Task("space", self._check_space, SPACE_S, needs_disk=True),
+            _Task("takeover", self._check_handover),
+            _Task("list", self._check_list, LIST_S),
+            _Task("rotation", self._check_rotation),
+            _Task("restart", self._check_restart, needs_disk=True),
+            _Task("topics", lambda now: self._topic_watch.look(now, self._sessions), TOPICS_S),
+            _Task("interruptions", self._report_interruptions, needs_disk=True),
+            _Task("recorded", self._note_recorded),
+            _Task("settle", lambda _: self._sessions.recover(), UNSETTLED_S, needs_disk=True),
+            _Task("faults", lambda _: self._events.report_faults(orders.background.faults())),
+            _Task("house", self._apply_retention, needs_disk=True),
+            _Task("moments", lambda _: housekeeper.keep_moments(), MOMENTS_S, needs_disk=True),
+            _Task("screen", self._screen, SCREENING_S, needs_disk=True),
+        )
 
     @property
     def is_recording(self) -> bool:
-        """Whether a recorder runs and has reported that it records."""
+        """Whether a child runs, and has reported that it records."""
         current = self._sessions.current
         return current is not None and current.is_recording and current.child.exit_status() is None
 
     def start(self) -> None:
-        """Begins a first recording, unless one is under way or the disk is full.
+        """Begins a first recording, unless the recorder runs already or the disk is full.
 
         Raises:
-            RecorderError: it cannot start.
+            RecorderError: the recording cannot start.
         """
         if not self.stopped:
             return
@@ -142,7 +173,7 @@ class Supervisor:
         self._write_heartbeat()
 
     def tick(self) -> None:
-        """Does what is due. Raises nothing: a failure is reported and tried again."""
+        """Runs the tasks that are due. Raises nothing: a failure is reported and tried again."""
         if self.stopped:
             return
         now = self._now()
@@ -154,7 +185,7 @@ class Supervisor:
         self._write_heartbeat(only_changes=not self._is_due("beat", HEARTBEAT_S, now))
 
     def stop(self) -> None:
-        """Ends everything that runs, within the patience of its children."""
+        """Ends all recordings, and waits for them as long as the children's patience lasts."""
         if self.stopped:
             return
         self.stopped = True
@@ -167,43 +198,24 @@ class Supervisor:
                 self._housekeeper.note_restart(self._paused_at, "paused")
                 self._paused_at = None
             self._housekeeper.finish()
-            # What was held back could not be compared before.
+            # Splits that were held back are compared only now.
             self._sessions.settle_handovers()
         self._orders.background.wait()
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:
-        background = self._orders.background
-        # The names are those of the documented log event. How often each is due, in seconds, and
-        # whether it needs the disk of the bag directory.
-        tasks: tuple[tuple[str, float, bool, Callable[[ClockReading], object]], ...] = (
-            ("disk", 0.0, False, self._check_disk),
-            ("look", OBSERVE_S, False, self._observe),
-            ("deaths", 0.0, False, self._check_exits),
-            ("space", SPACE_S, True, self._check_space),
-            ("takeover", 0.0, False, self._check_handover),
-            ("list", LIST_S, False, self._check_list),
-            ("rotation", 0.0, False, self._check_rotation),
-            ("restart", 0.0, True, self._check_restart),
-            ("topics", TOPICS_S, False, lambda at: self._topic_watch.look(at, self._sessions)),
-            ("interruptions", 0.0, True, self._report_interruptions),
-            ("recorded", 0.0, False, self._note_recorded),
-            ("settle", UNSETTLED_S, True, lambda _: self._sessions.recover()),
-            ("faults", 0.0, False, lambda _: self._events.report_faults(background.faults())),
-            ("house", 0.0, True, self._apply_retention),
-            ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
-            ("screen", SCREENING_S, True, lambda _: self._housekeeper.screen(self._names())),
-        )
-        for name, every_s, needs_disk, task in tasks:
-            if (needs_disk and self._disk.away) or not self._is_due(name, every_s, now):
+        for task in self._tasks:
+            if (task.needs_disk and self._disk.away) or not self._is_due(
+                task.name, task.every_s, now
+            ):
                 continue
             self._keep_alive()
             try:
-                task(now)
+                task.run(now)
             except OSError as error:
                 # A disk or a server may fail at any access: the next tick tries again.
-                if self._is_due(f"report {name}", FAULT_S, now):
-                    self._events.fail("supervision_failed", str(error), task=name)
+                if self._is_due(f"report {task.name}", FAULT_S, now):
+                    self._events.fail("supervision_failed", str(error), task=task.name)
 
     def _observe(self, now: ClockReading) -> None:
         closed = self._sessions.observe(now)
@@ -215,7 +227,7 @@ class Supervisor:
                 self._events.recorded()
 
     def _check_disk(self, now: ClockReading) -> None:
-        """Ends recording while another disk lies under the bag directory than at the start."""
+        """Ends recording while another disk than at the start is mounted at the bag directory."""
         recordings = [session.name for session in self._sessions.running if session.splits.exists]
         was_away, is_away = self._disk.away, self._disk.is_away(recordings)
         self._reception.may_write = not is_away
@@ -243,11 +255,12 @@ class Supervisor:
             self._silence.began(now.monotonic_s, SETTLE_S)
 
     def _check_space(self, now: ClockReading) -> None:
-        """Deletes more, pauses and resumes, by what the disk has left."""
+        """Deletes bags, pauses or resumes recording, by the free space on the disk."""
         least, free = self._orders.min_free_bytes, self._free_bytes()
-        # More than what it was paused for.
         enough = round(least * RESUME_FACTOR)
-        if free is not None and self._paused:
+        if free is None:
+            return
+        if self._paused:
             if free >= enough:
                 self._paused = False
                 self._due_s["restart"] = now.monotonic_s
@@ -256,13 +269,13 @@ class Supervisor:
                 # Bags that were being written when recording was paused may be deleted by now.
                 self._housekeeper.make_room(enough)
             return
-        if free is not None and free < least and not self._room_requested:
+        if free < least and not self._room_requested:
             self._housekeeper.make_room(enough)
             free = self._free_bytes()
-        if free is None:
-            return
+            if free is None:
+                return
         self._room_requested = free < least
-        # Room that is being made is waited for while half of it is free.
+        # Recording waits for room that is being made while half of it is free.
         is_waiting = self._housekeeper.is_making_room() and free >= least // 2
         if free < least and not is_waiting:
             self._paused = True
@@ -312,7 +325,7 @@ class Supervisor:
             )
             self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = is_silent and not is_over
-        # A recorder that receives nothing may have missed what is latched now.
+        # A recorder that receives nothing may have missed the newest latched messages.
         self._reception.skip_latched(() if is_silent else self._housekeeper.excluded_latched())
         try:
             self._sessions.begin_handover(now)
@@ -322,25 +335,25 @@ class Supervisor:
             return
         self._rotate_now = False
         if resubscribe is not None:
-            self._reception.rotation_begun(resubscribe, now.monotonic_s)
-            event, sentence = resubscribe.event, resubscribe.sentence
-            if resubscribe.is_fault:
-                self._events.warn(event, sentence, recording=current.name)
-            else:
-                self._events.info(event, reason=sentence, recording=current.name)
+            self._report_resubscription(resubscribe, current.name, now)
+
+    def _report_resubscription(self, rotation: Rotation, recording: str, now: ClockReading) -> None:
+        self._reception.rotation_begun(rotation, now.monotonic_s)
+        if rotation.is_fault:
+            self._events.warn(rotation.event, rotation.sentence, recording=recording)
+        else:
+            self._events.info(rotation.event, reason=rotation.sentence, recording=recording)
 
     def _check_list(self, _: ClockReading) -> None:
-        """Has a new recording begin where the list of topics was changed."""
-        before = self._orders.topics.selection.listed
-        if self._orders.topics.look():
-            listed_now = self._orders.topics.selection.listed
+        """Requests a rotation if the list of topics was changed."""
+        topics = self._orders.topics
+        before = {*topics.selection.listed}
+        if topics.look():
+            after = {*topics.selection.listed}
             self._rotate_now = True
-            self._events.info(
-                "topics_changed",
-                added=sorted({*listed_now} - {*before}),
-                dropped=sorted({*before} - {*listed_now}),
-            )
-        self._events.lasting("topics_refused", "", self._orders.topics.refused)
+            added, dropped = sorted(after - before), sorted(before - after)
+            self._events.info("topics_changed", added=added, dropped=dropped)
+        self._events.lasting("topics_refused", "", topics.refused)
 
     def _check_restart(self, now: ClockReading) -> None:
         if self._sessions.current is not None or self._paused:
@@ -371,6 +384,9 @@ class Supervisor:
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
 
+    def _screen(self, _: ClockReading) -> None:
+        self._housekeeper.screen(self._names())
+
     def _apply_retention(self, now: ClockReading) -> None:
         every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S
         if now.monotonic_s - self._applied_s >= every_s:
@@ -379,16 +395,16 @@ class Supervisor:
             self._housekeeper.apply()
 
     def _announce(self, name: str) -> None:
-        """Names a recording before anything of it exists.
+        """Writes down the name of a recording before anything of it exists.
 
         Raises:
-            RecorderError: it must not begin.
+            RecorderError: the name cannot be written, so the recording must not begin.
         """
         self._housekeeper.announce(name)
         self._write_heartbeat(announced=name)
 
     def _add_interruption(self, first: Ns, how: Interruption) -> None:
-        # What hangs when everything is ended is followed by no other recording.
+        # No recording follows one that hangs when all are ended.
         if not self.stopped:
             self._interruptions.append((first, how))
 
@@ -403,14 +419,14 @@ class Supervisor:
         announced: str | None = None,
         only_changes: bool = False,
     ) -> None:
-        """Writes a heartbeat; one that cannot be written is reported and stops nothing.
+        """Writes a heartbeat; a failure is reported and stops nothing.
 
         Args:
-            state: what it says that the recorder does; None for what it does.
-            announced: a recording that is about to be begun.
+            state: the recorder's state; None for the present one.
+            announced: the name of a recording that is about to begin.
             only_changes: write nothing unless more than times and amounts changed.
         """
-        # While the bags' own disk is unmounted nothing is written to the disk below it.
+        # The disk below an unmounted one must stay empty.
         if self._disk.away:
             return
         last, now, state = self._beat, self._orders.clock.now(), state or self._state
@@ -425,7 +441,7 @@ class Supervisor:
     def _make_heartbeat(
         self, now: Ns, state: RecorderState, since: Ns, announced: str | None
     ) -> Heartbeat:
-        """Returns what `recorder.json` is to say now."""
+        """Returns the heartbeat of this moment."""
         sessions, watch, events = self._sessions, self._topic_watch, self._events
         names = dict.fromkeys(filter(None, (*self._names(), announced)))
         subscribed = set[str]().union(*(session.subscribed for session in sessions.running))
@@ -476,14 +492,14 @@ class Supervisor:
             self._events.lasting("free_space_unknown", "", fault)
 
     def _is_due(self, task: str, every_s: float, now: ClockReading) -> bool:
-        """Whether a task is due; if so, it is not due again for `every_s` seconds."""
+        """Returns whether a task is due, and if so has it wait `every_s` seconds."""
         if now.monotonic_s < self._due_s.get(task, 0.0):
             return False
         self._due_s[task] = now.monotonic_s + every_s
         return True
 
     def _put_off(self, task: str, now: ClockReading) -> None:
-        """Has a task that failed wait before the next attempt."""
+        """Delays the next attempt of a task that failed."""
         self._due_s[task] = now.monotonic_s + self._backoff[task].failed()
 
     def _names(self) -> list[str]:
@@ -498,10 +514,10 @@ def _without_amounts(beat: Heartbeat) -> Heartbeat:
 
 
 def make_bag_dir(bag_dir: Path) -> None:
-    """Makes the bag directory where it does not exist.
+    """Makes the bag directory if it does not exist.
 
     Raises:
-        RecorderError: it cannot be made.
+        RecorderError: the directory cannot be made.
     """
     try:
         bag_dir.mkdir(parents=True, exist_ok=True)
