@@ -42,6 +42,7 @@ from ros2_memory.retention.policy import SMALL_BUDGET_GB, small_budget
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.recorder.base import Recorder
 
@@ -50,7 +51,7 @@ FAILED: Final = 1
 INTERRUPTED: Final = 130
 TICK_S: Final = 0.2
 CACHE_MB: Final = 1
-"""Every bag is read once: a cache of chunks would only take memory."""
+"""Every bag is read once: a larger cache of chunks would only take memory."""
 ENDING_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log = get_logger(__name__)
@@ -72,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 "nothing_to_record",
                 reason=f"recorder=none: bags come from elsewhere (set {chosen_by})",
             )
-            # To a service manager an end before this is a failure, to be tried again for ever.
+            # A service manager restarts a program for ever that ends before it is ready.
             notify(READY)
             return 0
         try:
@@ -86,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stderr.write(f"{PROGRAM} cannot record: {error}\n")
             return FAILED
         except KeyboardInterrupt:
-            # It came while the bag directory was put in order, which can be interrupted.
+            # It came before the signal handlers were set.
             return INTERRUPTED
     return 0
 
@@ -95,15 +96,7 @@ def _record(settings: Settings) -> None:
     # Nothing is deleted before the list of topics and the environment proved fit for recording.
     recording = settings.recording
     load_topics(recording.topics_file)
-    if recording.split_duration_s > recording.session_duration_s:
-        _log.warning(
-            "split_longer_than_session",
-            reason=f"recording.split_duration_s ({recording.split_duration_s}) is longer than "
-            f"recording.session_duration_s ({recording.session_duration_s:g}), which ends splits "
-            "earlier",
-        )
-    if settings.retention.max_total_gb < SMALL_BUDGET_GB:
-        _log.warning("budget_small", reason=small_budget(settings.retention.max_total_gb))
+    _warn_of_settings(settings)
     bag_dir = recording.bag_dir.absolute()
     reader = BagDirReader(build_reader(settings, cache_mb=CACHE_MB), bag_dir, every_message=True)
     own = OwnRecordings(bag_dir)
@@ -129,12 +122,7 @@ def _record(settings: Settings) -> None:
         recorder.check()
         own.claim()
         if recording.clear_on_startup:
-            cleared = clear_bags(bag_dir, own if settings.retention.foreign == "keep" else None)
-            _log.warning("bags_cleared", files=cleared.files, bytes=cleared.bytes)
-            for fault in cleared.faults:
-                _log.error("not_cleared", reason=fault)
-            if cleared.more:
-                _log.error("not_cleared", reason=f"{cleared.more} more cannot be deleted")
+            _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
         try:
             housekeeper.prepare()
         except (EpisodicError, OSError) as error:
@@ -142,8 +130,7 @@ def _record(settings: Settings) -> None:
     except BaseException:
         lock.release()
         raise
-    # From here on it is held until this process ends: what is still under way in its threads then
-    # must meet no other recorder.
+    # From here on the lock is held until the process ends: threads may still be writing at the end.
     _log.info("starting", bag_dir=str(bag_dir), files=files_in_use(settings))
     if unused := unused_config():
         _log.warning("config_unused", reason=unused)
@@ -151,11 +138,34 @@ def _record(settings: Settings) -> None:
     _log.info("stopped")
 
 
-def _record_until_signal(recorder: Recorder, lock: BagDirLock) -> None:
-    """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
+def _warn_of_settings(settings: Settings) -> None:
+    recording = settings.recording
+    if recording.split_duration_s > recording.session_duration_s:
+        _log.warning(
+            "split_longer_than_session",
+            reason=f"recording.split_duration_s ({recording.split_duration_s}) is longer than "
+            f"recording.session_duration_s ({recording.session_duration_s:g}), which ends splits "
+            "earlier",
+        )
+    if settings.retention.max_total_gb < SMALL_BUDGET_GB:
+        _log.warning("budget_small", reason=small_budget(settings.retention.max_total_gb))
 
-    Meanwhile it takes the lock again if its file has gone. Must be called from the main thread,
-    which the recorder's processes die with.
+
+def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:
+    """Deletes the bags in the bag directory; with a list of own recordings only those."""
+    cleared = clear_bags(bag_dir, own)
+    _log.warning("bags_cleared", files=cleared.files, bytes=cleared.bytes)
+    for fault in cleared.faults:
+        _log.error("not_cleared", reason=fault)
+    if cleared.more:
+        _log.error("not_cleared", reason=f"{cleared.more} more cannot be deleted")
+
+
+def _record_until_signal(recorder: Recorder, lock: BagDirLock) -> None:
+    """Records until SIGTERM, SIGINT or SIGHUP comes, then ends the recordings.
+
+    Takes the lock again if its file has gone. Call it from the main thread: child processes die
+    with the thread that starts them.
 
     Raises:
         EpisodicError: recording cannot begin, or another recorder took the bag directory.
@@ -178,11 +188,11 @@ def _record_until_signal(recorder: Recorder, lock: BagDirLock) -> None:
 
 @contextmanager
 def _ending_signals() -> Iterator[list[int]]:
-    """Yields a list to which the ending signals are appended; they interrupt nothing.
+    """Yields a list that receives the numbers of ending signals; they interrupt nothing.
 
-    They are not blocked and waited for with sigwait(3): a thread that a library started before
-    would receive them, and they would end the program. SIGCHLD is not ignored either, or the system
-    would reap children, and other processes could take their numbers.
+    sigwait(3) does not do: a thread that a library started earlier would receive the signals, and
+    they would end the program. SIGCHLD must not be ignored, or the system would reap children, and
+    other processes could take their numbers.
     """
     received: list[int] = []
     with ExitStack() as restore:

@@ -1,4 +1,4 @@
-"""Does beside the recorder's loop what takes a while: the disk may take seconds for a call."""
+"""Runs slow jobs beside the recorder's loop: the disk may take seconds for one call."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 PATIENCE_S: Final = 8.0
-"""How long a recorder that stops waits for what is under way; the service manager allows 40 s."""
+"""How long a recorder that stops waits for jobs; the service manager allows 40 s."""
 
 _log = get_logger(__name__)
 
 
 class Background:
-    """Runs jobs in threads: those of one task one after the other, in their order."""
+    """Runs jobs in threads, the jobs of one task in order, one after the other."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -27,7 +27,7 @@ class Background:
         self._faults: dict[str, str] = {}
 
     def add(self, task: str, job: Callable[[], object]) -> None:
-        """Adds a job to those of a task."""
+        """Adds a job to a task; starts the task's thread if none runs."""
         with self._changed:
             if task in self._jobs:
                 self._jobs[task].append(job)
@@ -36,11 +36,11 @@ class Background:
         threading.Thread(target=self._work, args=(task,), name=task, daemon=True).start()
 
     def is_under_way(self, task: str) -> bool:
-        """Whether a task has a job that has not ended."""
+        """Whether a job of a task has not ended."""
         return task in self._jobs
 
     def run(self, task: str, job: Callable[[], object]) -> None:
-        """Runs a job at once, and keeps why it failed. Raises nothing."""
+        """Runs a job in this thread, and remembers why it failed. Raises nothing."""
         try:
             job()
         except (EpisodicError, OSError) as error:
@@ -52,15 +52,15 @@ class Background:
             self._faults.pop(task, None)
 
     def failed(self, task: str, reason: str) -> None:
-        """Notes that the last job of a task failed."""
+        """Remembers why the newest job of a task failed."""
         self._faults[task] = reason
 
     def faults(self) -> Mapping[str, str]:
-        """Maps each task whose last job failed to the reason."""
+        """Returns the reason for each task whose newest job failed."""
         return dict(self._faults)
 
     def wait(self, patience_s: float | None = PATIENCE_S) -> None:
-        """Waits until nothing is under way, or so long; None: however long that takes."""
+        """Waits until all jobs have ended, for at most `patience_s`; None waits for ever."""
         with self._changed:
             self._changed.wait_for(lambda: not self._jobs, patience_s)
 

@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 class Recorder(ABC):
     """Records the robot's topics into the bag directory until it is stopped.
 
-    A recorder is driven from one thread: the one that starts it also ticks and stops it. Other
-    programs read what it does from the heartbeat file (see `bag_dir.heartbeat`).
+    One thread starts, ticks and stops it. Other programs read its state from the heartbeat file
+    (see `bag_dir.heartbeat`).
     """
 
     @abstractmethod
@@ -38,15 +38,15 @@ class Recorder(ABC):
 
     @abstractmethod
     def tick(self) -> None:
-        """Does what is due at this moment. Does not wait, and raises nothing."""
+        """Runs the tasks that are due. Does not wait, and raises nothing."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Ends recording within a bounded time, and closes what can be closed.
+        """Ends recording within a bounded time, and closes the files that can be closed.
 
-        When it returns, nothing of this recorder runs and `is_running` is False. Stopping a
+        When it returns, no process of this recorder runs and `is_running` is False. Stopping a
         recorder that does not run does nothing, so it is safe in every clean-up. Raises nothing
-        for a child process that ended badly: the next start repairs what it left.
+        for a child process that ended badly: the next start repairs its files.
         """
 
     @abstractmethod

@@ -1,8 +1,8 @@
-"""Keeps the index of the bag directory: which bags answer queries, and what was set aside.
+"""Keeps the index of the bag directory: the bags that answer queries, and the files set aside.
 
-A scan reads what changed (see `index.bag_table`) and swaps in a new `Snapshot`: a query that has
-one works on a consistent index for as long as it needs. No thread is started: a query, or a caller
-of `refresh`, runs the scan itself.
+A scan reads the files that changed (see `index.bag_table`) and swaps in a new `Snapshot`. A query
+works on its snapshot for as long as it needs. No thread is started: a query, or a caller of
+`refresh`, runs the scan itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import time
 from contextlib import contextmanager, nullcontext
 from copy import copy
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import read_handover
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 SPLITS_OF_PATIENCE: Final = 3
-"""A file unchanged for so many splits is not being written, unless a heartbeat names it."""
+"""A file that did not change for so many splits is closed, unless a heartbeat names it."""
 
 _log = get_logger(__name__)
 
@@ -44,19 +43,19 @@ class IndexManager:
     """Keeps the snapshot of one bag directory. Thread-safe.
 
     Args:
-        refresh_s: how old a snapshot may become before a query has it renewed.
-        known: gives closed files which were read earlier, in order of time. A first scan does not
-            read them again if they are unchanged.
-        include_active: whether the readable part of a file that is being written answers, too. Not
-            for programs that delete, repair or save bags, which work on finished files.
-        trusts_mtime: whether a young file without an end is being written; else it may be a copy,
-            and its content decides.
-        only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
-        setting: the one that names the bag directory, for sentences.
-        large: the turn to hold much of a bag, for which no scan waits.
+        refresh_s: the age of a snapshot at which a query scans again.
+        known: returns closed files that were read earlier, in order of time. The first scan does
+            not read them again if they are unchanged.
+        include_active: whether the readable part of a file that is being written answers, too.
+            Programs that delete, repair or save bags work on finished files.
+        trusts_mtime: whether a young file without an end counts as being written. Otherwise it may
+            be a copy, and its content decides.
+        only: the name of the one recording that counts (see `index.scan.Tree`); None for all.
+        setting: the setting that names the bag directory, for sentences.
+        large: the turn to hold much of a bag, which no scan waits for.
 
     Attributes:
-        published: the result of the last scan, however old; None before the first has ended.
+        published: the newest snapshot, however old; None before the first scan has ended.
     """
 
     def __init__(
@@ -77,28 +76,33 @@ class IndexManager:
         self._large = large or LargeReads()
         self._trusts_mtime = trusts_mtime
         self.bag_dir = bag_dir
+        self._reader = reader
+        self._known = known
+        self._setting = setting
+        self._only = () if only is None else (only,)
         self._include_active = include_active
         self._clock = clock
         self._refresh: Ns = ns_from_unix(refresh_s)
         self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._lock = threading.Lock()
         self.published: Snapshot | None = None
-        self._new_table = partial(
-            BagTable,
-            bag_dir,
-            reader,
-            known=known,
-            setting=setting,
-            only=() if only is None else (only,),
-        )
         self._table = self._new_table()
 
-    def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """Returns the current snapshot, after a new scan if it is out of date.
+    def _new_table(self) -> BagTable:
+        return BagTable(
+            self.bag_dir,
+            self._reader,
+            known=self._known,
+            setting=self._setting,
+            only=self._only,
+        )
 
-        It is when it is older than `refresh_s`, or when `reach`, the latest log time that the query
-        is about, lies past the end of the newest bag. Callers that come while a scan runs wait for
-        it and share its result.
+    def snapshot(self, reach: Ns | None = None) -> Snapshot:
+        """Returns the current snapshot, after a scan if it is out of date.
+
+        A snapshot is out of date if it is older than `refresh_s`, or if `reach`, the latest log
+        time of the query, lies after the newest bag. Callers that come while a scan runs share its
+        result.
         """
         current = self.published
         if (
@@ -121,40 +125,38 @@ class IndexManager:
 
     @contextmanager
     def undisturbed(self, *, patrolling: bool = False) -> Iterator[Snapshot]:
-        """Yields the result of a scan; within the block no other one enters, or scans.
+        """Yields a new snapshot. Other callers wait until the block ends.
 
-        `patrolling`: whether directories that did not change are looked at again.
+        `patrolling` scans directories that did not change as well.
         """
         with self._lock:
             yield self._scan(patrolling=patrolling)
 
     def alone(self, recording: str) -> IndexManager:
-        """Returns the index of one recording of these; it reads no bag that this one has read."""
+        """Returns an index of one recording, which reads no bag that this index has read."""
         alone = copy(self)
         alone._lock, alone.published = threading.Lock(), None
-        only = *self._new_table.keywords["only"], recording
-        alone._new_table = partial(
-            self._new_table,
-            known=lambda: [part.bags for part in self.snapshot().timeline.recorded_segments],
-            only=only,
-        )
+        alone._known = lambda: [part.bags for part in self.snapshot().timeline.recorded_segments]
+        alone._only = (*self._only, recording)
         alone._table = alone._new_table()
         return alone
 
     def known_bags(self, named: Collection[str], snapshot: Snapshot) -> KnownBags:
-        """Returns what retention considers, within `undisturbed`, which gave the snapshot.
+        """Returns the bags that retention considers. Call it within `undisturbed`.
 
-        `named` are recordings that are being written.
+        Args:
+            named: the recordings that are being written.
+            snapshot: the snapshot that `undisturbed` yields.
         """
         return self._table.known(named, snapshot.scanned_at)
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
-        """Returns the recordings that a handover names as those before and after one."""
+        """Returns the names of the recordings before and after one, by its `handover.json`."""
         handover = read_handover(recording).handover
-        return tuple(filter(None, (handover.previous, handover.next)))
+        return tuple(name for name in (handover.previous, handover.next) if name)
 
     def heartbeat(self) -> Heartbeat | None:
-        """Returns the recorder's last heartbeat, live or not; None if it cannot be read."""
+        """Returns the recorder's newest heartbeat, live or not; None if it cannot be read."""
         return read_heartbeat(self.bag_dir).heartbeat
 
     # The methods below run under the lock.
@@ -162,12 +164,12 @@ class IndexManager:
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         begun, before = time.perf_counter_ns(), self.published
         context = self._context()
-        # Who has the turn may wait for this scan.
+        # The holder of the turn may itself wait for this scan.
         with self._large.exempt(), _gc_paused() if before is None else nullcontext():
             try:
                 change = self._table.update(context, patrolling=patrolling)
             except BaseException:
-                # A new table: the interrupted one will not be shown again what changed.
+                # The interrupted table would miss the changes that it was just shown.
                 self._table = self._new_table()
                 raise
             if before is not None and not change.is_new:
@@ -194,24 +196,24 @@ class IndexManager:
     def _report(
         self, before: Snapshot | None, after: Snapshot, change: TableChange, begun: Ns
     ) -> None:
-        removed, added, _ = change
-        reported_before = set() if before is None else set(before.damaged)
+        known_damaged = set() if before is None else set(before.damaged)
         for aside in after.damaged:
-            if aside not in reported_before:
+            if aside not in known_damaged:
                 _log.warning("bag_damaged", path=str(aside.path), reason=aside.reason)
-        # A file that grows and answers is read again with every query: not worth a line each time.
-        grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
-        changed = before is None or _logged_figures(before) != _logged_figures(after)
         if after.problem is not None and (before is None or before.problem != after.problem):
             _log.warning(
                 "bag_directory_not_read", reason=after.problem, bag_dir=str(self.bag_dir.absolute())
             )
-        (_log.info if changed and not grew else _log.debug)(
+        # Every query scans a file that grows and answers: not worth a line each time.
+        bags = (*change.removed, *change.added)
+        only_grew = change.removed and all(bag.state is BagState.ACTIVE for bag in bags)
+        changed = before is None or _logged_figures(before) != _logged_figures(after)
+        (_log.info if changed and not only_grew else _log.debug)(
             "index_scanned",
             bag_dir=str(self.bag_dir),
             bags=len(after.bags),
-            added=len(added),
-            removed=len(removed),
+            added=len(change.added),
+            removed=len(change.removed),
             active=len(after.active),
             damaged=len(after.damaged),
             unread=len(after.unread),
@@ -222,20 +224,23 @@ class IndexManager:
 
 
 def _logged_figures(snapshot: Snapshot) -> tuple[object, ...]:
-    """Returns what a line about a scan shows, but for what came and went."""
+    """Returns what decides whether a scan is worth a line in the log."""
     return (
         snapshot.timeline.recorded_segments,
-        *(map(len, (snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty))),
+        len(snapshot.active),
+        len(snapshot.damaged),
+        len(snapshot.unread),
+        len(snapshot.empty),
         snapshot.problem,
     )
 
 
 @contextmanager
 def _gc_paused() -> Iterator[None]:
-    """Pauses Python's garbage collector, and exempts from it what the block made.
+    """Pauses Python's garbage collector, and exempts the objects that the block made.
 
-    The objects that the first scan makes of a week's files stay alive, and examining all of them
-    again and again takes longer than making them.
+    The first scan of a week makes objects that stay alive. To examine them again and again takes
+    longer than to make them.
     """
     if not gc.isenabled():
         yield

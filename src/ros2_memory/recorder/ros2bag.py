@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.storage.base import BagReader
 
-__all__ = ["Ros2BagRecorder", "record_argv"]
-
 ROSOUT: Final = "/rosout"
 LOGS_KEPT: Final = 20
 
@@ -50,12 +48,11 @@ class Ros2BagRecorder(Recorder):
     """Records with `ros2 bag record`, and keeps it recording while `tick` is called.
 
     Args:
-        latched_topics: topics whose publishers are transient local; all of their messages are
-            recorded, however many there are.
-        repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
-            distribution can do that. Their log times may lie long before the split.
+        latched_topics: topics of transient local publishers; all of their messages are recorded.
+        repeat_latched: topics, as `topic` or `topic=depth`, whose last messages begin every split
+            if the distribution can do that. Their log times may lie long before the split.
         keep_open: file descriptors that `ros2 bag record` inherits.
-        excluding: the topics by which `recording.exclude_when` excludes, each with its rule.
+        excluding: the topics that rules of `recording.exclude_when` read, each with its rule.
     """
 
     def __init__(
@@ -97,7 +94,7 @@ class Ros2BagRecorder(Recorder):
             self._queue_bytes,
             bag_dir=self._bag_dir,
             latched=latched_topics,
-            # Each recording would receive the log of an excluded time again.
+            # Each new recording would receive the latched log of an excluded time again.
             volatile={ROSOUT} - excluding.keys() if excluding else (),
             background=background,
         )
@@ -120,7 +117,7 @@ class Ros2BagRecorder(Recorder):
         self._supervisor = Supervisor(self._orders, housekeeper)
 
     def check(self) -> None:
-        """Makes the environment of `ros2` and reads its options from its help."""
+        """Reads the list of topics, and finds `ros2`, its environment and its options."""
         self._topics.load()
         self._ros = find_installation(self._setup_files, self._bag_dir / ROS_LOG_DIR)
         services = self._topics.selection.services
@@ -133,7 +130,7 @@ class Ros2BagRecorder(Recorder):
         self._checked = True
 
     def start(self) -> None:
-        """Begins to record, after `check` if that was not called since the last start."""
+        """Begins to record; calls `check` first unless that was done since the last start."""
         if not self._supervisor.stopped:
             return
         if not self._checked:
@@ -143,15 +140,15 @@ class Ros2BagRecorder(Recorder):
         self._supervisor.start()
 
     def tick(self) -> None:
-        """Does what supervision needs at this moment."""
+        """Runs the tasks of supervision that are due."""
         self._supervisor.tick()
 
     def stop(self) -> None:
-        """Ends recording, within the bounded patience of its children."""
+        """Ends recording, and waits for the children as long as their patience lasts."""
         self._supervisor.stop()
 
     def is_running(self) -> bool:
-        """Whether a child runs and has reported that it records."""
+        """Whether a child runs, and has reported that it records."""
         return self._supervisor.is_recording
 
     def _start_child(self, name: str, directory: Path) -> Child:
@@ -182,10 +179,10 @@ class Ros2BagRecorder(Recorder):
 
 
 def _delete_old_logs(log_dir: Path) -> None:
-    """Deletes all but the newest logs of `ros2`, whose lines the event log has as well."""
+    """Deletes all but the newest logs of `ros2`; the event log has their lines as well."""
     with suppress(OSError):
         if log_dir.is_symlink():
-            return  # the files elsewhere are not ours
+            return  # files elsewhere are not ours
         logs = sorted(log_dir.iterdir(), key=lambda path: path.lstat().st_mtime_ns)
         for path in logs[:-LOGS_KEPT]:
             with suppress(OSError):  # such as a directory

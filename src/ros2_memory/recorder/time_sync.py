@@ -1,6 +1,6 @@
 """Asks the operating system whether its clock is synchronised with a time server.
 
-Nothing else makes its dates fit to delete by: a clock that was set by hand, or that starts wrong
+Only then may its dates decide what is deleted: a clock that was set by hand, or that starts wrong
 because its battery is empty, looks like any other.
 """
 
@@ -23,14 +23,14 @@ _PASSED_ON: Final = ("PATH", "DBUS_SYSTEM_BUS_ADDRESS")
 
 
 def is_synchronised() -> bool:
-    """Whether timedated reports the clock synchronised, or the kernel where there is no timedated.
+    """Whether timedated, or the kernel if there is no timedated, reports a synchronised clock.
 
-    timedated first: the recorder's unit sets `ProtectClock=yes`, whose filter refuses adjtimex(2),
-    while the system bus is a socket that it may connect to. Both report the same: the kernel's
-    error bound, which chronyd, ntpd, ptp4l and systemd-timesyncd keep small, which any other step
-    of the clock resets, and which grows beyond 16 s about nine hours after the last of them ended.
+    timedated comes first: the recorder's unit sets `ProtectClock=yes`, whose filter refuses
+    adjtimex(2) and allows the system bus. Both report the kernel's error bound. chronyd, ntpd,
+    ptp4l and systemd-timesyncd keep it small, any other step of the clock resets it, and it grows
+    beyond 16 s about nine hours after the last of them ended.
 
-    It may take some seconds. Raises nothing; False also where neither can be asked.
+    Takes up to some seconds. Raises nothing; False if neither answers.
     """
     answer = _ask_timedated()
     if answer is not None:

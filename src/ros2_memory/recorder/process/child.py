@@ -53,12 +53,12 @@ class Patience(NamedTuple):
 
 
 class Child:
-    """A running program, and what it printed. Built by `start`; used from one thread.
+    """A running program, and the lines that it printed. Use it from one thread.
 
     Attributes:
-        pid: its process number, which is also its group's.
-        patience_s: for how many seconds `end` is worth calling: not even SIGKILL ends a process
-            that waits for a disk.
+        pid: the number of its process, and of its group.
+        patience_s: for how many seconds to call `end`; not even SIGKILL ends a process that waits
+            for a disk.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], patience: Patience) -> None:
@@ -88,17 +88,17 @@ class Child:
         patience: Patience | None = None,
         stderr: int | None = subprocess.STDOUT,
     ) -> Child:
-        """Starts `argv`, whose first element is the path of a program.
+        """Starts a program without a shell.
 
         Args:
-            argv: the program and its arguments, as they are: no shell sees them.
+            argv: the path of the program, and its arguments.
             env: its whole environment.
             keep_open: file descriptors that it inherits besides its output.
-            patience: how long to wait for it when it is to end.
-            stderr: where its errors go; None for where this program's go.
+            patience: how long to wait for it after each signal.
+            stderr: where its stderr goes; None leaves it to this program's stderr.
 
         Raises:
-            RecorderError: it cannot be started.
+            RecorderError: the program cannot be started.
         """
         if threading.current_thread() is not threading.main_thread():
             raise RecorderError("a child must be started from the main thread: it dies with it")
@@ -107,14 +107,14 @@ class Child:
         return cls(process, patience or Patience())
 
     def take_lines(self) -> list[str]:
-        """Returns what it printed since the last call, oldest first."""
-        # As many as there are at this moment: the reading thread may add without end.
+        """Returns the lines that it printed since the last call, oldest first."""
+        # Only those of this moment: the reading thread may add lines without end.
         return [self._lines.popleft() for _ in range(len(self._lines))]
 
     def exit_status(self) -> int | None:
-        """Returns None while it runs, then its exit code, or minus a signal's number.
+        """Returns None while it runs, then its exit code, or minus the number of a signal.
 
-        Whatever is left of its group is killed first. All its output can then be taken.
+        The rest of its group is killed first. `take_lines` then returns all its output.
         """
         if self._status is not None:
             return self._status
@@ -123,15 +123,15 @@ class Child:
                 return None
             self._signal_group(signal.SIGKILL)
         except ChildProcessError:
-            pass  # already reaped, if SIGCHLD is ignored: the number may belong to another process
+            pass  # already reaped: the number may belong to another process by now
         self._status = self._process.wait()
         self._reader.join(_READER_PATIENCE_S)
         return self._status
 
     def end(self) -> int | None:
-        """Asks it to end, without waiting; must be called again until there is an exit status.
+        """Asks it to end, without waiting. Call it again until it returns an exit status.
 
-        The first call sends SIGINT, and later ones SIGTERM and SIGKILL as its patience runs out.
+        The first call sends SIGINT, later ones SIGTERM and SIGKILL as the patience runs out.
         """
         status = self.exit_status()
         if status is not None:
@@ -151,7 +151,7 @@ class Child:
 
 
 def end_all(children: Collection[Child]) -> list[Child]:
-    """Ends all children at once; returns those that not even SIGKILL ended in time."""
+    """Ends all children at once; returns those that still run after their patience."""
     patience_s = max((child.patience_s for child in children), default=0.0)
     give_up = time.monotonic() + patience_s
     while True:
@@ -164,12 +164,12 @@ def end_all(children: Collection[Child]) -> list[Child]:
 def run_bounded(
     argv: Sequence[str], env: Mapping[str, str], timeout_s: float
 ) -> subprocess.CompletedProcess[bytes]:
-    """Runs a program to its end, and does not wait for what it leaves running in the background.
+    """Runs a program to its end, without waiting for processes that it leaves running.
 
-    Its output goes to files for that: `subprocess.run` waits until every copy of a pipe is closed.
+    Its output goes to files: `subprocess.run` would wait until every copy of a pipe is closed.
 
     Raises:
-        RecorderError: it cannot be started, or runs for longer than `timeout_s`.
+        RecorderError: the program cannot be started, or runs for longer than `timeout_s`.
     """
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
         process = _spawn(argv, env, output.fileno(), errors.fileno(), ())

@@ -59,11 +59,11 @@ def record_argv(
         qos_file: QoS overrides, see `Reception` in `reception.py`.
         storage_file: how MCAP is written, see `storage_config`.
         node_name: the name of the recorder's node, if the distribution can set it.
-        cache_bytes: size of each of the two buffers in which messages wait for the disk. rosbag2's
-            own 100 MiB are more than a machine may spare beside two recorders' queues.
+        cache_bytes: the size of each of the two buffers in which messages wait for the disk; a
+            machine may not have rosbag2's own 100 MiB beside two recorders' queues.
         use_sim_time: whether log times come from `/clock`, before which nothing is recorded.
-        repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
-            distribution can do that.
+        repeat_latched: topics, as `topic` or `topic=depth`, whose last messages begin every split
+            if the distribution can do that.
         known_options: the options that this distribution has, see `options_in_help`.
     """
     argv = [ros2, "bag", "record", "-s", "mcap", "-d", str(split_duration_s), "-o", str(directory)]
@@ -72,10 +72,13 @@ def record_argv(
     argv += ["-e", topics.regex]
     argv += ["--qos-profile-overrides-path", str(qos_file)]
     argv += ["--storage-config-file", str(storage_file)]
-    argv += ["--include-hidden-topics"] * topics.hidden + ["--use-sim-time"] * use_sim_time
+    if topics.hidden:
+        argv.append("--include-hidden-topics")
+    if use_sim_time:
+        argv.append("--use-sim-time")
     optional: dict[str, Sequence[str | int] | None] = {
         CACHE: [cache_bytes],
-        # At most one message a second; without a rate they may be switched off.
+        # At most one message a second; without a rate statistics may be switched off.
         STATISTICS: [1],
         KEYBOARD: [],
         NODE_NAME: [node_name],
@@ -106,11 +109,11 @@ def options_in_help(text: str) -> frozenset[str]:
 
 
 def storage_config(chunk_bytes: int) -> str:
-    """Returns YAML for `--storage-config-file`: zstd, in chunks of so many uncompressed bytes.
+    """Returns YAML for `--storage-config-file`: zstd, in chunks of `chunk_bytes` uncompressed.
 
-    A chunk that is not full yet is lost with the process, so the size bounds the loss (README of
-    the ROS package rosbag2_storage_mcap). By default rosbag2 writes no CRC of a chunk, and a bit
-    that flips on the disk would be a wrong value that nothing shows.
+    A chunk that is not full is lost with the process, so its size bounds the loss (README of the
+    ROS package rosbag2_storage_mcap). By default rosbag2 writes no CRC of a chunk: nothing would
+    show a bit that flips on the disk.
     """
     how = {"chunkSize": chunk_bytes, "compression": "Zstd", "noChunkCRC": False}
     return yaml.safe_dump(how, sort_keys=True)

@@ -65,49 +65,52 @@ def robot_environment(
     log_dir: Path,
     inherited: Mapping[str, str] | None = None,
 ) -> dict[str, str]:
-    """Returns the environment for `ros2`: the inherited one without ours, after the setup files.
+    """Returns the environment for `ros2`.
 
-    `ROS_DOMAIN_ID`, the RMW's settings and everything else of the robot pass through.
+    It is the inherited one without our own variables, after the setup files. `ROS_DOMAIN_ID`, the
+    RMW's settings and all other variables of the robot pass through.
 
     Args:
-        setup_files: bash scripts, sourced in this order; none where `ros2` is on PATH already.
-        log_dir: where ROS writes the log of each run, unless the environment has ROS_LOG_DIR.
-        inherited: the environment to begin with; the process's own where None.
+        setup_files: bash scripts, sourced in this order; none if `ros2` is on PATH already.
+        log_dir: the directory for ROS's logs, unless the environment has ROS_LOG_DIR.
+        inherited: the environment to begin with; None for the process's own.
 
     Raises:
         RecorderError: a setup file is missing or fails; the message names it.
     """
     base = without_ours(os.environ if inherited is None else inherited)
     if setup_files:
-        # Setup files set it; an earlier value is not the robot's.
+        # Setup files set PYTHONPATH; an earlier value is not the robot's.
         base.pop("PYTHONPATH", None)
         base = _sourced(setup_files, base)
     return {"ROS_LOG_DIR": str(log_dir), **base, **_READABLE_OUTPUT}
 
 
 def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
-    """Removes our virtual environment and the service manager's variables from an environment."""
+    """Returns an environment without our virtual environment and service manager's variables."""
     prefixes = [inherited["VIRTUAL_ENV"]] if inherited.get("VIRTUAL_ENV") else []
     if sys.prefix != sys.base_prefix:
         prefixes.append(sys.prefix)
     env = {name: value for name, value in inherited.items() if name not in _OURS}
     for name in ("PATH", "PYTHONPATH"):
         if name in env:
-            parts = env[name].split(os.pathsep)
-            kept = [part for part in parts if not any(map(Path(part).is_relative_to, prefixes))]
-            env[name] = os.pathsep.join(kept)
+            env[name] = os.pathsep.join(
+                part
+                for part in env[name].split(os.pathsep)
+                if not any(Path(part).is_relative_to(prefix) for prefix in prefixes)
+            )
     if not env.get("PYTHONPATH"):
         env.pop("PYTHONPATH", None)
     return env
 
 
 def rmw_of(env: Mapping[str, str]) -> str:
-    """Returns the RMW that nodes in an environment use; `rmw_fastrtps_cpp` unless it is set."""
+    """Returns the RMW of nodes in an environment; `rmw_fastrtps_cpp` by default."""
     return env.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"
 
 
 def advice_on_rmw(env: Mapping[str, str]) -> str | None:
-    """Returns what a recorder needs with an RMW that is not Fast DDS; None with Fast DDS."""
+    """Returns advice on what a recorder needs with Zenoh or Cyclone DDS; None with others."""
     rmw = rmw_of(env)
     if "zenoh" in rmw:
         return (
@@ -124,12 +127,13 @@ def advice_on_rmw(env: Mapping[str, str]) -> str | None:
 
 
 def advice_on_silence(env: Mapping[str, str]) -> str:
-    """Returns advice for subscriptions that receive nothing, by the environment.
+    """Returns advice for subscriptions that receive nothing.
 
-    rmw_fastrtps sets its own transports in the discovery range LOCALHOST, whatever
-    FASTDDS_BUILTIN_TRANSPORTS is, and among them shared memory that another user cannot read.
+    In the discovery range LOCALHOST, rmw_fastrtps ignores FASTDDS_BUILTIN_TRANSPORTS and uses
+    shared memory, which another user cannot read.
     """
-    if advice := advice_on_rmw(env):
+    advice = advice_on_rmw(env)
+    if advice:
         return advice
     if "fastrtps" not in rmw_of(env):
         return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
@@ -153,7 +157,7 @@ def find_ros2(env: Mapping[str, str]) -> str:
     """Returns the path of the `ros2` program.
 
     Raises:
-        RecorderError: it is not on the environment's PATH.
+        RecorderError: `ros2` is not on the environment's PATH.
     """
     program = shutil.which("ros2", path=env.get("PATH", os.defpath))
     if program is None:
@@ -198,7 +202,8 @@ class Installation(NamedTuple):
     """A ROS 2 that can record.
 
     Attributes:
-        env: the whole environment that it runs in.
+        ros2: the path of the program.
+        env: its whole environment.
         options: the long options of its `ros2 bag record`.
     """
 
@@ -208,14 +213,14 @@ class Installation(NamedTuple):
 
 
 def find_installation(setup_files: Sequence[Path], log_dir: Path) -> Installation:
-    """Makes the environment of `ros2`, and reads its options from its help.
+    """Returns the robot's `ros2`, with its environment and its options.
 
     Raises:
         RecorderError: a setup file fails, there is no `ros2`, or it cannot record MCAP.
     """
     env = robot_environment(setup_files, log_dir)
     ros2 = find_ros2(env)
-    # Nothing is recorded yet, or never (`ros2-memory doctor`): no log goes beside the bags.
+    # `ros2-memory doctor` calls this as well: no log goes beside the bags.
     with TemporaryDirectory() as elsewhere:
         finished = run_bounded(
             [ros2, *HELP_ARGV], {**env, "ROS_LOG_DIR": elsewhere}, HELP_TIMEOUT_S
@@ -239,9 +244,9 @@ def find_installation(setup_files: Sequence[Path], log_dir: Path) -> Installatio
 def setup_files_here(
     configured: Sequence[Path], env: Mapping[str, str], distributions: Path = DISTRIBUTIONS
 ) -> tuple[Path, ...]:
-    """Returns the configured setup files; none where `ros2` is on PATH; else the newest one's.
+    """Returns the configured setup files, or that of the newest distribution.
 
-    Distributions are named in the order of the alphabet. One of ROS 1 has no `ros2`.
+    None is needed if `ros2` is on PATH. Names of distributions are in the order of the alphabet.
 
     Raises:
         RecorderError: there is no ROS 2.
@@ -251,7 +256,7 @@ def setup_files_here(
     setups = [
         file
         for file in sorted(distributions.glob("*/setup.bash"))
-        if file.with_name("bin").joinpath("ros2").is_file()
+        if file.with_name("bin").joinpath("ros2").is_file()  # not in ROS 1
     ]
     if not setups:
         raise RecorderError(

@@ -13,7 +13,7 @@ from typing import Final
 
 
 class LineKind(StrEnum):
-    """What a line reports, mostly by the log event that tells it."""
+    """The meaning of a line; most values are names of log events."""
 
     READY = "recording"
     SUBSCRIBED = "subscribed"
@@ -30,7 +30,7 @@ class LineKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line: what it reports, its text, and the topic and a count, where it has them."""
+    """One line: its meaning and text, and the topic and the count if it names them."""
 
     kind: LineKind
     text: str
@@ -66,7 +66,7 @@ _BY_LEVEL: Final = {"WARN": LineKind.WARNING, "ERROR": LineKind.ERROR, "FATAL": 
 
 
 def parse_line(raw: str) -> Line:
-    """Parses one line of the output. Never fails."""
+    """Returns the meaning of one line of the output. Raises nothing."""
     line = _ANSI.sub("", raw).strip()
     logged = _LOGGED.search(line)
     text = logged["text"].strip() if logged else line

@@ -47,20 +47,17 @@ class TopicSelection:
 
     @property
     def exact(self) -> tuple[str, ...]:
-        """The entries that are names, not globs."""
+        """The entries that are names, not globs, and are recorded."""
         return tuple(entry for entry in self.entries if "*" not in entry and self.matches(entry))
 
     @property
     def hidden(self) -> bool:
-        """Whether an entry is a hidden topic: one with a part that begins with `_`.
-
-        The recorder leaves those out without `--include-hidden-topics`.
-        """
+        """Whether a part of an entry begins with `_`: it needs `--include-hidden-topics`."""
         return any("/_" in entry for entry in self.entries)
 
     @property
     def listed(self) -> tuple[str, ...]:
-        """All that the file lists: entries, and then exclusions."""
+        """The lines of the file: its entries, then its exclusions."""
         return (*self.entries, *(f"not {entry}" for entry in self.excluded))
 
     @property
@@ -72,13 +69,13 @@ class TopicSelection:
     def regex(self) -> str:
         """An anchored ECMAScript (and Python) regular expression that matches only these topics.
 
-        Only in this form does every distribution from Humble to Rolling accept topics, and only
-        with it does the recorder never stop discovering.
+        Every distribution from Humble to Rolling accepts topics in this form, and with it the
+        recorder never stops discovering.
         """
         selected = "|".join(_pattern(entry) for entry in self.entries)
         if not self.excluded:
             return f"^({selected})$"
-        # Not every distribution has an option for it, and their names for it differ.
+        # Options for exclusions differ between distributions, and some have none.
         return f"^(?!({'|'.join(_pattern(entry) for entry in self.excluded)})$)({selected})$"
 
     def matches(self, topic: str) -> bool:
@@ -90,10 +87,11 @@ class TopicsFile:
     """The list of topics in use, and its file, which may change while the recorder runs.
 
     Args:
-        needed: topics that a list must have, each with what needs it.
+        needed: topics that every list must have, each with the setting that needs it.
 
     Attributes:
-        refused: why the file's present content is not used, as a sentence; else None.
+        selection: the list in use.
+        refused: a sentence on why the file's present content is not used; None if it is used.
     """
 
     def __init__(self, path: Path, needed: Mapping[str, str] | None = None) -> None:
@@ -108,7 +106,7 @@ class TopicsFile:
         """Reads the file.
 
         Raises:
-            ConfigError: see `load_topics`, or the list lacks a topic that it must have.
+            ConfigError: see `load_topics`, or the list lacks a needed topic.
         """
         self._seen = self._content()
         self._use()
@@ -122,9 +120,9 @@ class TopicsFile:
         self.selection = selection
 
     def look(self) -> bool:
-        """Reads the file again where it has changed; returns whether another list is in use.
+        """Reads the file again if it has changed; returns whether the list in use has changed.
 
-        A content counts when two looks have found it: it may be half written. One that is refused
+        New content counts from the second look on, since it may be half written. Refused content
         leaves the list as it was. Raises nothing.
         """
         before, self._seen = self._seen, self._content()
@@ -147,11 +145,11 @@ class TopicsFile:
 
 
 def load_topics(path: Path, data: bytes | None = None) -> TopicSelection:
-    """Returns the topics that the file lists; `data` is its content where that is known.
+    """Returns the topics that a file lists; `data` is its content if it was read before.
 
     Raises:
-        ConfigError: the file is missing, is not such a list, lists nothing, or an entry is no
-            topic name; the message names the file and the entry.
+        ConfigError: the file is missing, is not such a list, lists nothing, or has an entry that is
+            not a topic name; the message names the file and the entry.
     """
     try:
         text = (path.read_bytes() if data is None else data).decode()
@@ -178,7 +176,7 @@ def load_topics(path: Path, data: bytes | None = None) -> TopicSelection:
                 f"/odom, of at most {MAX_NAME} characters, whose parts have ASCII letters, digits "
                 "and _, and begin with no digit; a * matches inside one part"
             )
-    selection = TopicSelection(*(tuple(dict.fromkeys(names)) for names in (topics, excluded)))
+    selection = TopicSelection(tuple(dict.fromkeys(topics)), tuple(dict.fromkeys(excluded)))
     if len(selection.regex) > MAX_REGEX:
         raise ConfigError(
             f"{path}: {len(selection.entries)} topics make a pattern of more than {MAX_REGEX} "
