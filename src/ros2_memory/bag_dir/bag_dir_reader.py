@@ -1,12 +1,11 @@
-"""The reader of a bag directory: an adapter of `BagReader`, and what the directory adds to it.
+"""Reads the bags of one bag directory through another `BagReader`, with three rules added.
 
-- It stays inside the directory. The index follows no symbolic link, but seconds pass between a scan
-  and a query, in which a folder can be replaced by a link to somewhere else. `O_NOFOLLOW` protects
-  the last part of a path; this reader checks the parts before it.
-- It leaves out messages that count in another recording, by `handover.json`, so that no count, sum,
-  search or answer has to consider them.
-- It finds the messages of a bag under another hard link when retention deleted the path that the
-  index knows, and a saved moment still has the bag.
+- It stays inside the directory. Seconds pass between a scan and a query, in which somebody may
+  replace a folder by a link. `O_NOFOLLOW` protects the last part of a path; this reader checks the
+  parts before it.
+- It leaves out messages that count in another recording, by `handover.json`.
+- If retention deleted the path that the index knows, it reads the bag under another hard link, in a
+  saved moment.
 """
 
 from __future__ import annotations
@@ -50,13 +49,13 @@ _sidecar: Final = until_changed(HANDOVER_FILE, most=4096)(sure_handover)
 class BagDirReader(BagReader):
     """Reads bags through an adapter, under the rules of a bag directory.
 
-    Latched messages always count: a recording that receives one again is recognised by topic,
-    publish time and payload.
+    Latched messages always count: queries recognise a repeated one by topic, publish time and
+    payload.
 
     Args:
-        reader: the adapter, which alone decodes messages.
-        bag_dir: the directory that paths must lie in, which may be a link itself; None allows any.
-        every_message: ignores `handover.json`, to compare counts with the files.
+        reader: the adapter, which decodes messages.
+        bag_dir: the directory that paths must lie in, which may be a link; None allows any path.
+        every_message: ignores `handover.json`, so that counts are those of the files.
     """
 
     reader: BagReader
@@ -69,10 +68,10 @@ class BagDirReader(BagReader):
         return self.reader.reads(path)
 
     def closing(self, path: Path) -> Closing:
-        """Returns whether the writer has finished the file, which must lie in the directory.
+        """Returns whether the writer has finished the file.
 
         Raises:
-            BagError: as the adapter, or the path leads out of the bag directory.
+            BagError: see the adapter; or the path leads out of the bag directory.
         """
         return self.reader.closing(self._confined(path))
 
@@ -80,7 +79,7 @@ class BagDirReader(BagReader):
         """Returns counts and times of the messages that count in this recording.
 
         Raises:
-            BagError: as the adapter, or the path leads out of the bag directory.
+            BagError: see the adapter; or the path leads out of the bag directory.
         """
         summary = self.reader.summarize(self._confined(path))
         handover, problem = self._sidecar_of(path)
@@ -108,7 +107,7 @@ class BagDirReader(BagReader):
         """Yields the messages that count in this recording.
 
         Raises:
-            BagError: as the adapter, or the path leads out of the bag directory.
+            BagError: see the adapter; or the path leads out of the bag directory.
         """
 
         def opened() -> Iterator[Iterator[Record]]:
@@ -119,8 +118,8 @@ class BagDirReader(BagReader):
             records = self.reader.records(located, topics, window, newest_first=newest_first)
             yield records if rule is None else filter(rule.counts, records)
 
-        # A generator would end at the first error; after a damaged chunk the adapter's iterator
-        # goes on behind it, and so do `filter` and `chain`.
+        # A generator would end at the first error. The adapter's iterator goes on behind a damaged
+        # chunk, and so do `filter` and `chain`.
         return chain.from_iterable(opened())
 
     def batches(
@@ -134,7 +133,7 @@ class BagDirReader(BagReader):
         """Yields the messages that count in this recording, many at once.
 
         Raises:
-            BagError: as the adapter, or the path leads out of the bag directory.
+            BagError: see the adapter; or the path leads out of the bag directory.
         """
 
         def opened() -> Iterator[Iterator[Batch]]:
@@ -143,7 +142,7 @@ class BagDirReader(BagReader):
             if rule is None:
                 yield self.reader.batches(located, topics, window, bare=bare)
             elif not rule.hides_all:
-                # Which messages count is known by their publish times and payloads.
+                # Not bare: publish times and payloads decide which messages count.
                 batches = self.reader.batches(located, topics, window)
                 yield map(partial(_counted_batch, rule), batches)
 
@@ -170,11 +169,11 @@ class BagDirReader(BagReader):
         return self.reader.definition(channel)
 
     def _confined(self, path: Path) -> Path:
-        """Returns the path, which must lie in the bag directory and behind no link inside it.
+        """Returns the path unless it leads out of the bag directory, or through a link in it.
 
         Raises:
             BagVanishedError: a folder of the path does not exist.
-            BagUnreachableError: the disk does not tell.
+            BagUnreachableError: the disk fails.
             BagError: the path leads out of the directory.
         """
         if self.bag_dir is None:
@@ -198,32 +197,32 @@ class BagDirReader(BagReader):
         return path
 
     def _located(self, path: Path) -> Path:
-        """Returns where the bag's messages are: the path, or another hard link of a deleted one.
+        """Returns the path, or another hard link of the bag if the path was deleted.
 
         Raises:
-            BagError: as `_confined`.
+            BagError: see `_confined`.
         """
-        if self.bag_dir is not None and not os.path.lexists(path):
-            recorded = Path(HardLinks(self.bag_dir).recorded_as(str(path)))
-            name = os.path.relpath(recorded, self.bag_dir)
-            links = [recorded]
-            with suppress(OSError):
-                links += (
-                    folder / name for folder in sorted((self.bag_dir / MOMENTS_FOLDER).iterdir())
-                )
-            path = next((link for link in links if os.path.lexists(link)), path)
-        return self._confined(path)
+        if self.bag_dir is None or os.path.lexists(path):
+            return self._confined(path)
+        recorded = Path(HardLinks(self.bag_dir).recorded_as(str(path)))
+        name = os.path.relpath(recorded, self.bag_dir)
+        links = [recorded]
+        with suppress(OSError):
+            moments = sorted((self.bag_dir / MOMENTS_FOLDER).iterdir())
+            links += [moment / name for moment in moments]
+        existing = [link for link in links if os.path.lexists(link)]
+        return self._confined(existing[0] if existing else path)
 
     def _rule_of(self, path: Path, topics: Collection[str], window: TimeWindow) -> FileRule | None:
-        """Returns which messages of the topics in a window count; None where all do."""
+        """Returns which messages of the topics count in a window; None if all do."""
         rule = self._sidecar_of(path).handover.rule(path.name)
         return rule if rule is not None and rule.touches(window, topics) else None
 
     def _sidecar_of(self, path: Path) -> HandoverReading:
-        """Returns the sidecar of a file's recording, parsed again only when it has changed.
+        """Returns the sidecar of a file's recording; it is parsed again if it has changed.
 
         Raises:
-            BagUnreachableError: the disk fails, so which messages count is unknown.
+            BagUnreachableError: the disk fails, so it is unknown which messages count.
         """
         if self.every_message:
             return HandoverReading(Handover(), None)
@@ -240,21 +239,21 @@ class BagDirReader(BagReader):
     def _counted_summary(
         self, path: Path, topic: TopicSummary, rule: FileRule
     ) -> TopicSummary | None:
-        """Returns the topic without the messages that count elsewhere; None if none is left."""
+        """Returns the topic without messages that count elsewhere; None if no message is left."""
         span = TimeWindow(topic.first, topic.last + 1)
         if (topic.latched and not rule.hides_latched) or not rule.touches(span, [topic.topic]):
             return topic
-        # Excluded messages lie in few chunks: only these are read, but for listed ones.
         windows = [span]
         if topic.topic not in rule.elsewhere:
-            excluded = (span.intersect(exclusion.logged) for exclusion in rule.exclusions)
+            # Without listed messages, only the few chunks with excluded ones are read.
+            excluded = [span.intersect(exclusion.logged) for exclusion in rule.exclusions]
             spans = united((window.start, window.stop) for window in excluded)
             windows = [TimeWindow(start, stop) for start, stop in spans]
-        lost = sum(
-            record.channel.type == topic.type and not rule.counts(record)
-            for window in windows
-            for record in self.reader.records(path, [topic.topic], window)
-        )
+        lost = 0
+        for window in windows:
+            for record in self.reader.records(path, [topic.topic], window):
+                if record.channel.type == topic.type and not rule.counts(record):
+                    lost += 1
         if not lost:
             return topic
         first = self._end_of(path, topic, newest_first=False)
@@ -264,11 +263,12 @@ class BagDirReader(BagReader):
         return replace(topic, count=topic.count - lost, first=first, last=last)
 
     def _end_of(self, path: Path, topic: TopicSummary, *, newest_first: bool) -> Ns | None:
-        """Returns the log time (ns) of the first or last message of a topic that counts, if any."""
+        """Returns the log time (ns) of the topic's first or last message that counts, if any."""
         span = TimeWindow(topic.first, topic.last + 1)
-        records = self.records(path, [topic.topic], span, newest_first=newest_first)
-        of_type = (record.log_time for record in records if record.channel.type == topic.type)
-        return next(of_type, None)
+        for record in self.records(path, [topic.topic], span, newest_first=newest_first):
+            if record.channel.type == topic.type:
+                return record.log_time
+        return None
 
 
 def _counted_batch(rule: FileRule, batch: Batch) -> Batch:

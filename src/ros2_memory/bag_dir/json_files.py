@@ -1,12 +1,12 @@
-"""JSON files that the two programs share, and that another version, or a person, may have written.
+"""JSON files that the two programs share. Another version, or a person, may have written them.
 
-A log is one object a line. Rows are appended and flushed, all of them or none, so a power cut
-leaves at most a part of the last line, which the next append ends. A line ends with a check, so
-that a flipped bit makes no other number; one without is not believed. A line that is damaged, or
-of another version, spoils no other. A document is one object, which is replaced by rename.
+A log has one object a line. Rows are appended and flushed, all of them or none, so a power cut
+leaves at most a part of the last line, which the next append ends. Each line ends with a checksum;
+a line without one is not believed. A line that is damaged, or of another version, spoils no other.
+A document is one object, which is replaced by rename.
 
-They stay files, not a database: a person reads them, and so does a server that may not write here,
-while the recorder is killed; SQLite needs to write before it can read what a kill left.
+They are files and no database: a person can read them, and so can a server that may not write here
+after the recorder was killed. SQLite must write before it can read what a kill left.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ READABLE: Final = 0o644
 """Permissions of a file that the other program reads; it may run as another user."""
 
 MOST_BYTES: Final = 64 << 20
-"""Of a log, and of a document that grows with the number of bags or messages."""
+"""The size limit of a log, and of a document that grows with the number of bags or messages."""
 _FORMAT: Final = 1  # of each document
 _SURROGATE: Final = re.compile(r"\\ud[89a-f]", re.IGNORECASE)
 _CHECK: Final = b', "crc32": "'
 
 
 class Line(NamedTuple, Generic[_T]):
-    """One line of a log: its row, or None and what is wrong with it.
+    """One line of a log: its row, or the error if it has none.
 
-    `number` counts from 1; 0 stands for all lines that are left out, for they are too many.
+    `number` counts from 1; 0 stands for the lines at the start of a file that is too large.
     """
 
     number: int
@@ -78,12 +78,11 @@ class JsonLog(Generic[_T]):
     """A log in the bag directory, whose rows are of one dataclass.
 
     Args:
-        most_bytes: of a longer file only the end is read.
-        is_brief: whether fields that have their default are not written.
+        most_bytes: only the end of a longer file is read.
+        is_brief: whether fields with their default value are left out of the file.
 
     Attributes:
-        current: returns the same as `rows`, which it calls only once the file has changed; None
-            where that fails.
+        current: `rows`, cached until the file changes; returns None instead of raising.
     """
 
     name: str
@@ -96,14 +95,14 @@ class JsonLog(Generic[_T]):
         self.current = until_changed(self.name)(self.rows)
 
     @cached_property
-    def _adapter(self) -> TypeAdapter[_T]:  # takes some ms to make, and most files are never there
+    def _adapter(self) -> TypeAdapter[_T]:  # takes some ms to make, and most files never exist
         return TypeAdapter(self.row)
 
     def lines(self, bag_dir: Path) -> Iterator[Line[_T]]:
         """Yields the lines that are not empty.
 
         Raises:
-            OSError: the file cannot be read, or there is none.
+            OSError: the file does not exist, or cannot be read.
             ValueError: it is not a regular file.
         """
         with open_plain(state_path(bag_dir, self.name)) as stream:
@@ -116,15 +115,18 @@ class JsonLog(Generic[_T]):
             for number, line in enumerate(stream, 1):
                 text = line.strip()
                 if text:
-                    try:
-                        row = parsed(self._adapter, text)
-                        _require_check(text)
-                        yield Line(number, text, row, None)
-                    except ValueError as error:
-                        yield Line(number, text, None, error)
+                    yield self._parse(number, text)
+
+    def _parse(self, number: int, text: bytes) -> Line[_T]:
+        try:
+            row = parsed(self._adapter, text)
+            _require_check(text)
+        except ValueError as error:
+            return Line(number, text, None, error)
+        return Line(number, text, row, None)
 
     def rows(self, bag_dir: Path) -> list[_T]:
-        """Returns the rows, the oldest first, whatever other lines hold; none without a file.
+        """Returns the rows, oldest first, without damaged lines; none if there is no file.
 
         Raises:
             OSError: the file cannot be read.
@@ -136,13 +138,13 @@ class JsonLog(Generic[_T]):
             return []
 
     def all_rows(self, bag_dir: Path) -> Iterator[tuple[int, _T]]:
-        """Yields every row with the number of its line, of a log that is of no use without one.
+        """Yields every row with its line number, of a log that is useless with a row missing.
 
-        A line that a crash cut short is left out: what it announces was not begun.
+        A line that a crash cut short is left out: the work that it announces was not begun.
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: a line is damaged, which the sentence names, or the file is too large.
+            ValueError: the file is too large, or a line is damaged; the sentence names the line.
         """
         try:
             lines = [*self.lines(bag_dir)]
@@ -153,7 +155,8 @@ class JsonLog(Generic[_T]):
                 yield line.number, line.row
             elif not isinstance(line.error, json.JSONDecodeError):
                 raise ValueError(f"line {line.number}: {line.error}")
-            # A whole line ends with its check; one whose check was cut off, with a list.
+            # A line that a crash cut short has no end; a whole one ends with its checksum (or, if
+            # only that was cut off, with a list).
             elif not line.text.startswith(b"{") or line.text.endswith((b"]}", b'"}')):
                 raise ValueError(f"line {line.number}: it is damaged: {line.error}")
 
@@ -164,10 +167,10 @@ class JsonLog(Generic[_T]):
         return "".join(f"{_with_check(line).decode()}\n" for line in lines)
 
     def append(self, bag_dir: Path, rows: Iterable[_T]) -> int:
-        """Appends rows durably; returns how many bytes the file has then.
+        """Appends rows durably; returns the size of the file in bytes.
 
         Raises:
-            OSError: they cannot be written, and none is appended.
+            OSError: the rows cannot be written, and none is appended.
         """
         target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
@@ -176,10 +179,10 @@ class JsonLog(Generic[_T]):
         return target.stat().st_size
 
     def replace(self, bag_dir: Path, rows: Iterable[_T]) -> None:
-        """Replaces the file by one with these rows.
+        """Replaces all rows.
 
         Raises:
-            OSError: it cannot be written; the old one remains.
+            OSError: the file cannot be written; the old one remains.
         """
         target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
@@ -189,14 +192,13 @@ class JsonLog(Generic[_T]):
 
 @dataclass(eq=False, repr=False)
 class JsonDocument(Generic[_T]):
-    """A document in the bag directory, which holds one value of a dataclass.
+    """A document in the bag directory: one value of a dataclass.
 
     Args:
         most_bytes: a longer file is not read.
 
     Attributes:
-        current: returns the same as `read`, which it calls only once the file has changed; None
-            where that fails.
+        current: `read`, cached until the file changes; returns None instead of raising.
     """
 
     name: str
@@ -212,11 +214,11 @@ class JsonDocument(Generic[_T]):
         return TypeAdapter(self.content)
 
     def read(self, bag_dir: Path) -> _T | None:
-        """Returns the value; None where there is no file.
+        """Returns the value; None if there is no file.
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is damaged, or of another format.
+            ValueError: the file is damaged, or of another format.
         """
         try:
             text = read_small_file(state_path(bag_dir, self.name), self.most_bytes)
@@ -228,12 +230,12 @@ class JsonDocument(Generic[_T]):
         """Replaces the file durably.
 
         Raises:
-            OSError: it cannot be written; the old one remains.
+            OSError: the file cannot be written; the old one remains.
         """
         target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         content = {"format": _FORMAT, **self._adapter.dump_python(value)}
-        # Escaped, as paths need that are not UTF-8.
+        # ASCII with escapes: a path that is not UTF-8 has lone surrogates.
         text = json.dumps(content, separators=(",", ":"))
         write_durably(target, text, mode=READABLE)
 
@@ -241,7 +243,7 @@ class JsonDocument(Generic[_T]):
         """Removes the file durably.
 
         Raises:
-            OSError: it cannot be removed.
+            OSError: the file cannot be removed.
         """
         target = bag_dir / self.name
         target.unlink(missing_ok=True)
@@ -251,15 +253,15 @@ class JsonDocument(Generic[_T]):
 def until_changed(
     name: str, most: int = 2
 ) -> Callable[[Callable[[Path], _T]], Callable[[Path], _T | None]]:
-    """Has a function of a directory called again only once a file there has changed.
+    """Returns a decorator that caches a function of a directory until a file there changes.
 
-    For files that every answer needs, in `most` directories. Where there is none, the function is
-    called each time; where it cannot be read, None is returned.
+    The function is called each time while the file does not exist. If the file cannot be read, the
+    result is None. `most` is the number of directories that are cached.
     """
 
     def decorate(read: Callable[[Path], _T]) -> Callable[[Path], _T | None]:
         @lru_cache(most)
-        def known(bag_dir: Path, _stamp: tuple[int, int, int]) -> _T:
+        def cached(bag_dir: Path, _stamp: tuple[int, int, int]) -> _T:
             return read(bag_dir)
 
         @wraps(read)
@@ -269,7 +271,7 @@ def until_changed(
                     status = (bag_dir / name).lstat()
                 except (FileNotFoundError, NotADirectoryError):
                     return read(bag_dir)
-                return known(bag_dir, (status.st_ino, status.st_mtime_ns, status.st_size))
+                return cached(bag_dir, (status.st_ino, status.st_mtime_ns, status.st_size))
             return None
 
         return current
@@ -284,16 +286,20 @@ def parsed(
     *,
     has_paths: bool = True,
 ) -> _T:
-    """Returns the value that a JSON object describes; keys of other versions are ignored.
+    """Returns the value of a JSON object. Unknown keys are ignored: another version may write more.
 
-    Its `format` must be the version, where one is given.
+    Args:
+        adapter: validates the object.
+        text: the object.
+        version: the `format` that the object must have; None for any.
+        has_paths: whether texts may have lone surrogates, as bytes of paths that are not UTF-8.
 
     Raises:
-        ValueError: it is none, or of another format, or a key is missing or wrong; the sentence
-            names the first one. Or it has a lone surrogate that is no byte of a path.
+        ValueError: the text is not such an object, or is of another format; or a key is missing or
+            wrong, which the sentence names.
     """
     try:
-        # Of bytes json.loads accepts what is no UTF-8.
+        # json.loads accepts bytes that are not UTF-8.
         text = text if isinstance(text, str) else text.decode()
         value: object = json.loads(text)
         if has_paths and _SURROGATE.search(text):
@@ -316,7 +322,7 @@ def state_path(bag_dir: Path, name: str) -> Path:
     """Returns the path of a file in the bag directory.
 
     Raises:
-        OSError: its folder is a symbolic link, so that nothing shows whether there is a file.
+        OSError: its folder is a symbolic link, which is not followed.
     """
     path = bag_dir / name
     if path.parent != bag_dir and path.parent.is_symlink():
@@ -325,7 +331,7 @@ def state_path(bag_dir: Path, name: str) -> Path:
 
 
 def give_to_owner(path: Path, bag_dir: Path) -> None:
-    """Gives a file that root made to the owner of the bag directory, as whom the recorder runs."""
+    """Gives a file that root made to the owner of the bag directory, whom the recorder runs as."""
     with suppress(OSError):
         owner = bag_dir.stat()
         if path.lstat().st_uid != owner.st_uid:
@@ -333,11 +339,11 @@ def give_to_owner(path: Path, bag_dir: Path) -> None:
 
 
 def _with_check(begun: bytes) -> bytes:
-    """Returns the line that begins so, closed by the CRC-32 of that."""
+    """Returns a line of JSON without its last brace, closed with its CRC-32."""
     return b'%b%b%08x"}' % (begun, _CHECK, crc32(begun))
 
 
 def _require_check(line: bytes) -> None:
-    """Raises ValueError where a line has no check, or that fails."""
+    """Raises ValueError if the checksum of a line is missing or wrong."""
     if line != _with_check(line.rpartition(_CHECK)[0]):
         raise ValueError("its check (crc32) is missing or fails: it is damaged, or was edited")

@@ -1,18 +1,19 @@
-"""`metadata.yaml` of a recording: reading what it lists, and correcting it.
+"""Reads and corrects the `metadata.yaml` of a recording.
 
 rosbag2 and its readers refuse a recording whose metadata.yaml lists a file that does not exist, and
-trust the counts and times in it, so it is written again after files were deleted or repaired. The
-format is rosbag2's (rosbag2_storage, `yaml.hpp`), from version 5 on, which describes each file;
-`ros2 bag reindex` would write the same from the files themselves.
+trust its counts and times. So it is written again after files were deleted or repaired. The format
+is that of rosbag2 (rosbag2_storage, `yaml.hpp`) from version 5 on, which describes each file. `ros2
+bag reindex` would write the same.
 """
 
 from __future__ import annotations
 
 import posixpath
 import re
+import sys
 from collections import Counter, defaultdict
 from contextlib import suppress
-from operator import itemgetter
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import yaml
@@ -23,7 +24,7 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import COMPRESSED
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 _MAX_BYTES: Final = 64 << 20
 _STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
 _ROOT: Final = "rosbag2_bagfile_information"
-# Patterns, not YAML: parsing the list of a day of splits takes 0.8 s (8640 files).
-# Nothing is tried twice: a line may have thousands of spaces.
+# Patterns: a YAML parser takes 0.8 s for the list of a day of splits (8640 files). They do not
+# backtrack: a line may have thousands of spaces.
 _NAME: Final = r"[ \t]*+['\"]?+([^'\"\r\n]++)['\"]?+$"
 _BAG_NAME: Final = re.compile(rf"[ \t]*+(?:- )?(?:- |path:){_NAME}")
 _PATH_KEY: Final = re.compile(rf"path:{_NAME}")
@@ -42,19 +43,20 @@ _NAMED_POLICY: Final = re.compile(r"reliability:\s*[a-z]")
 _FIRST_OF_FILES: Final = 5
 _FIRST_OF_TYPE_HASHES: Final = 7
 _FIRST_OF_NAMED_QOS: Final = 9
-"""Versions of the format in which these came."""
+"""The versions of the format that introduced these."""
 _LOADER: Final[type[yaml.SafeLoader | yaml.CSafeLoader]] = getattr(
     yaml, "CSafeLoader", yaml.SafeLoader
 )
 
 
 class Listing(NamedTuple):
-    """What a metadata.yaml lists.
+    """The files that a metadata.yaml lists.
 
     Attributes:
-        names: of the bag files, in order.
-        messages: in each file, by its name without `.zstd`; empty before version 5.
-        total: messages in all files; None where it is not given.
+        names: the names of the bag files, in order.
+        messages: the number of messages in each file, by its name without `.zstd`; empty before
+            version 5.
+        total: the number of messages in all files; None if it is not given.
     """
 
     names: tuple[str, ...]
@@ -63,44 +65,60 @@ class Listing(NamedTuple):
 
 
 def parse_listing(text: str) -> Listing:
-    """Returns what a metadata.yaml lists; nothing if it is not one."""
-    names: list[str] = []
-    totals: list[tuple[int, int | None]] = []
+    """Returns the files that a metadata.yaml lists; none if the text is no metadata.yaml."""
+    lines = text.split("\n")
+    messages, total = _message_counts(lines)
+    return Listing(tuple(_bag_names(lines)), messages, total)
+
+
+def _bag_names(lines: Iterable[str]) -> Iterator[str]:
+    for line in lines:
+        if "." in line:
+            bag_name = _BAG_NAME.match(line.rstrip())
+            if bag_name and bag_kind(bag_name[1]):
+                yield posixpath.basename(bag_name[1])
+
+
+def _message_counts(lines: Iterable[str]) -> tuple[dict[str, int], int | None]:
+    """Returns the number of messages in each file, and in the whole recording."""
     messages: dict[str, int] = {}
+    total: int | None = None
+    total_indent = sys.maxsize
     path: str | None = None
     count: int | None = None
     # Line by line: patterns over the whole text take twice as long, and a week has 1,000 of them.
-    for line in (*text.split("\n"), "- "):
+    for line in chain(lines, ["- "]):
         key = line.lstrip(" ")
         is_item = key.startswith("- ")
         if is_item:
-            # What is known of the item before; of any order of keys: not only rosbag2 writes YAML.
+            # The keys of an item come in any order: not only rosbag2 writes these files.
             if path is not None and count is not None:
                 messages[bare_name(path)] = count
             path = count = None
             key = key[2:].lstrip(" ")
         if key.startswith("path:"):
             path_key = _PATH_KEY.match(key.rstrip())
-            path = path_key[1] if path_key and path is None else path
+            if path_key and path is None:
+                path = path_key[1]
         elif key.startswith("message_count:") and (count_key := _COUNT_KEY.match(key)):
-            number = int(count_key[1])
-            count = number if count is None else count
-            if not is_item:
-                totals.append((len(line) - len(key), number))
-        if "." in line:
-            bag_name = _BAG_NAME.match(line.rstrip())
-            if bag_name and bag_kind(bag_name[1]):
-                names.append(posixpath.basename(bag_name[1]))
-    # That of the whole recording is indented least.
-    _, total = min(totals, key=itemgetter(0), default=(0, None))
-    return Listing(tuple(names), messages, total)
+            number, indent = int(count_key[1]), len(line) - len(key)
+            if count is None:
+                count = number
+            # The count of the whole recording is indented least.
+            if not is_item and indent < total_indent:
+                total, total_indent = number, indent
+    return messages, total
 
 
 def read_listing(path: Path | str, directory: int | None = None) -> Listing:
-    """Returns what a file lists; its path may be relative to an open directory.
+    """Returns the files that a metadata.yaml lists.
+
+    Args:
+        path: its path, which may be relative to `directory`.
+        directory: the descriptor of an open directory.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
         ValueError: it is not a regular file.
     """
     with open_plain(path, directory) as stream:
@@ -117,15 +135,15 @@ class Contents(NamedTuple):
 def correct(recording: Path, reader: BagReader) -> bool:
     """Corrects metadata.yaml by the content of the recording's files, all of one kind.
 
-    If it is absent or empty, it is created if the files are named as rosbag2 names them.
+    A missing or empty one is created if the files have names of rosbag2.
 
     Returns:
-        Whether it was written.
+        Whether metadata.yaml was written.
 
     Raises:
-        BagError: one of the files cannot be read.
+        BagError: a bag cannot be read.
         OSError: metadata.yaml cannot be read or written; the old one remains.
-        ValueError: a file is incomplete, or metadata.yaml is of an unknown form; it is unchanged.
+        ValueError: a bag is incomplete, or metadata.yaml has an unknown form; it is unchanged.
     """
     path = recording / METADATA_FILE
     files = bags_in(recording)
@@ -146,7 +164,7 @@ def correct(recording: Path, reader: BagReader) -> bool:
 
 
 def why_not_corrected(recording: Path, reader: BagReader) -> str | None:
-    """Corrects metadata.yaml where there is one; returns why that failed, or None."""
+    """Corrects metadata.yaml if it exists; returns why that failed, or None."""
     try:
         if (recording / METADATA_FILE).exists():
             correct(recording, reader)
@@ -156,7 +174,7 @@ def why_not_corrected(recording: Path, reader: BagReader) -> str | None:
 
 
 def is_named_by_rosbag2(recording: Path) -> bool:
-    """Returns whether the bags of a recording are MCAP files with the names that rosbag2 gives."""
+    """Returns whether all bags of a recording are MCAP files with names of rosbag2."""
     numbers = (split_number(recording.name, path.name) for path in bags_in(recording))
     return None not in numbers
 
@@ -165,11 +183,11 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     """Returns the text of a metadata.yaml that describes these files.
 
     Args:
-        text: the old one, whose descriptions of topics remain; empty where there was none.
+        text: the old text, whose descriptions of topics remain; empty if there was none.
         files: the files of the recording by name, at least one.
 
     Raises:
-        ValueError: the old one is no metadata.yaml of a known form.
+        ValueError: the old text is no metadata.yaml of a known form.
     """
     channels = [channel for contents in files.values() for channel in contents.channels]
     content: object = _parse(text) if text else {_ROOT: _new_information(channels)}
@@ -192,7 +210,7 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
 
 
 def _set_files(info: dict[object, object], files: Mapping[str, Contents]) -> None:
-    """Sets times, paths and the description of each file, in order of time."""
+    """Sets the times, paths and descriptions of the files, in order of time."""
     paths = {bare_name(path): str(path) for path in _list(info, "relative_file_paths")}
     spans = {
         name: (summary.start, summary.end)
@@ -220,47 +238,45 @@ def _set_topics(
     counts: Counter[tuple[str, str]],
     version: int,
 ) -> None:
-    """Sets the count of each topic, by name and type, and its QoS where no channel has that."""
+    """Sets the message count of each topic, and its QoS if no channel has the stated one."""
     topics = [_mapping(item, "topics") for item in _list(info, "topics_with_message_count")]
-    # A day of splits has a million channels, and few QoS.
+    # A day of splits has a million channels, but few different ones.
+    unlisted: dict[tuple[str, str], Channel] = {}
     offered_qos: defaultdict[tuple[str, str], dict[str, None]] = defaultdict(dict)
     for channel in channels:
-        offered_qos[channel.topic, channel.type][_qos(channel)] = None
-    listed = set()
+        key = channel.topic, channel.type
+        unlisted.setdefault(key, channel)
+        offered_qos[key][_qos(channel)] = None
     for topic in topics:
         topic_metadata = _mapping(topic.get("topic_metadata"), "topic_metadata")
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
-        listed.add(key)
+        unlisted.pop(key, None)
         topic["message_count"] = counts[key]
         offered = [_offered(text, version) for text in offered_qos[key]]
         # rosbags returns no message of a channel whose profiles differ from these.
         if offered and topic_metadata.get("offered_qos_profiles") not in offered:
             topic_metadata["offered_qos_profiles"] = offered[0]
-    for channel in channels:
-        key = channel.topic, channel.type
-        if key not in listed:
-            listed.add(key)
-            new: dict[object, object] = {
-                "name": channel.topic,
-                "type": channel.type,
-                "serialization_format": channel.encoding,
-                "offered_qos_profiles": _offered(_qos(channel), version),
-            }
-            if version >= _FIRST_OF_TYPE_HASHES:
-                type_hash = dict(channel.metadata).get("topic_type_hash", "")
-                new["type_description_hash"] = type_hash
-            topics.append({"topic_metadata": new, "message_count": counts[key]})
+    for key, channel in unlisted.items():
+        new: dict[object, object] = {
+            "name": channel.topic,
+            "type": channel.type,
+            "serialization_format": channel.encoding,
+            "offered_qos_profiles": _offered(_qos(channel), version),
+        }
+        if version >= _FIRST_OF_TYPE_HASHES:
+            new["type_description_hash"] = dict(channel.metadata).get("topic_type_hash", "")
+        topics.append({"topic_metadata": new, "message_count": counts[key]})
     info["topics_with_message_count"] = topics
 
 
 def _new_information(channels: Sequence[Channel]) -> dict[str, object]:
     """Returns the content of a new metadata.yaml, before counts, times and topics are set.
 
-    The version is the oldest one that fits the QoS profiles in the files: from 9 on rosbag2 writes
-    policies by name, before by number.
+    The version is the oldest one that fits the QoS profiles in the files: before version 9 rosbag2
+    writes policies by number, then by name.
     """
     is_named = any(_NAMED_POLICY.search(_qos(channel)) for channel in channels)
-    return {
+    information: dict[str, object] = {
         "version": _FIRST_OF_NAMED_QOS if is_named else _FIRST_OF_FILES,
         "storage_identifier": "mcap",
         "duration": {},
@@ -271,12 +287,14 @@ def _new_information(channels: Sequence[Channel]) -> dict[str, object]:
         "compression_mode": "",
         "relative_file_paths": [],
         "files": [],
-        **({"custom_data": None, "ros_distro": ""} if is_named else {}),
     }
+    if is_named:
+        information |= {"custom_data": None, "ros_distro": ""}
+    return information
 
 
 def _offered(text: str, version: int) -> object:
-    """Returns the QoS profiles as this version has them: as a list, before version 9 as text."""
+    """Returns QoS profiles as a version has them: text before version 9, then a list."""
     return text if version < _FIRST_OF_NAMED_QOS else _parse(text) or []
 
 
@@ -300,7 +318,7 @@ def _parse(text: str) -> object:
     """Returns the value of a YAML text.
 
     Raises:
-        ValueError: it is no YAML.
+        ValueError: the text is no YAML.
     """
     try:
         value: object = yaml.load(text, _LOADER)  # noqa: S506 - a safe one
