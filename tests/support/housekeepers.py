@@ -180,7 +180,7 @@ def list_ended(bag_dir: Path, name: str) -> OwnRecordings:
     own = OwnRecordings(bag_dir)
     own.begin(name)
     own.complete(name)
-    own.note(name, {path.name for path in (bag_dir / name).glob("*.mcap")}, ended=True)
+    own.note_splits(name, {path.name for path in (bag_dir / name).glob("*.mcap")}, ended=True)
     return own
 
 

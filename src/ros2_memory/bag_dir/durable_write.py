@@ -1,7 +1,7 @@
-"""Writing files so that they survive a power cut, and reading files that anybody may have written.
+"""Writes files that survive a power cut, and reads files that anybody may have written.
 
-A file's content is on the disk once the file was flushed, and its name once its directory was.
-No symbolic link is followed: what is written or read lies in the bag directory itself.
+The content of a file is on the disk once the file was flushed, and its name once the directory was.
+No symbolic link is followed, so all files lie in the bag directory itself.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _READ: Final = os.O_RDONLY | _COMMON
 def write_durably(target: Path, text: str, *, mode: int | None = None) -> None:
     """Replaces a file atomically: a reader sees the old content, or all of the new text.
 
-    `mode` are its permissions, whatever the umask; None leaves them to the umask.
+    `mode` sets the file's permissions; None leaves them to the umask.
 
     Raises:
         OSError: the file cannot be written; the old one remains.
@@ -37,12 +37,12 @@ def write_durably(target: Path, text: str, *, mode: int | None = None) -> None:
 
 
 def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> None:
-    """Replaces files one after the other, each atomically, once all texts are on disk.
+    """Replaces files one after the other, each atomically, once all texts are on the disk.
 
-    So a full disk leaves all of them as they are; a power cut may come between two of them.
+    So a full disk leaves all files as they are; a power cut may come between two of them.
 
     Raises:
-        OSError: a text cannot be written; `filename` is its file.
+        OSError: a file cannot be written; `filename` names it.
     """
     temporary = {target: target.with_name(f".{target.name}.tmp") for target in texts}
     try:
@@ -58,7 +58,7 @@ def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> 
             beside.replace(target)
             flush(target.parent)
     except OSError as error:
-        error.filename = str(target)  # a full disk names none
+        error.filename = str(target)  # the error of a full disk has no file name
         for beside in temporary.values():
             with suppress(OSError):
                 beside.unlink(missing_ok=True)
@@ -66,10 +66,10 @@ def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> 
 
 
 def append_durably(target: Path, text: str) -> None:
-    """Appends lines to a regular file, which is created if it is absent, and flushes it.
+    """Appends lines to a regular file, which is made if it is missing, and flushes it.
 
     Raises:
-        OSError: the lines cannot be written, and nothing is appended.
+        OSError: the lines cannot be written, and none is appended.
     """
     descriptor = os.open(target, _APPEND, 0o666)
     try:
@@ -84,9 +84,10 @@ def append_durably(target: Path, text: str) -> None:
 
 
 def append_lines(descriptor: int, text: str) -> None:
-    """Appends all lines or none to a file open for reading and appending, and flushes it.
+    """Appends all lines or none to an open file, and flushes it.
 
-    A last line that a crash cut short is ended first, so that it spoils no line but itself.
+    A last line that a crash cut short is ended first, so that it spoils no other line. The
+    descriptor must be open for reading and appending.
 
     Raises:
         OSError: the lines cannot be written.
@@ -105,7 +106,7 @@ def append_lines(descriptor: int, text: str) -> None:
 
 
 def open_plain(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
-    """Opens a regular file for reading; never waits, and follows no link.
+    """Opens a regular file for reading. Never waits, and follows no link.
 
     Raises:
         OSError: the file cannot be opened.
@@ -119,7 +120,7 @@ def open_plain(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
 
 
 def read_small_file(path: Path | str, most_bytes: int = MAX_SMALL_FILE) -> str:
-    """Returns the text of a regular file of at most so many bytes; never waits.
+    """Returns the text of a regular file of at most `most_bytes`. Never waits.
 
     Raises:
         OSError: the file cannot be read.
@@ -133,7 +134,7 @@ def read_small_file(path: Path | str, most_bytes: int = MAX_SMALL_FILE) -> str:
 
 
 def is_open_file(path: Path, descriptor: int) -> bool:
-    """Returns whether a path still names the file that is open; True where that is unknown."""
+    """Whether a path still names an open file; True if the disk does not tell."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:
@@ -143,10 +144,10 @@ def is_open_file(path: Path, descriptor: int) -> bool:
 
 
 def flush(path: Path) -> None:
-    """Waits until a file's content, or the names in a directory, are on the disk.
+    """Waits until the content of a file, or the names in a directory, are on the disk.
 
     Raises:
-        OSError: they cannot be flushed.
+        OSError: the flush fails.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -156,10 +157,10 @@ def flush(path: Path) -> None:
 
 
 def flush_bags(directory: Path, names: Iterable[str]) -> list[str]:
-    """Flushes closed splits, then the directory that names them.
+    """Flushes closed splits, then their directory. Splits that were deleted are left out.
 
     Returns:
-        A sentence for each that could not be flushed; a split deleted meanwhile is not reported.
+        A sentence for each file that could not be flushed.
     """
     faults: list[str] = []
     for path in [*(directory / name for name in names), directory]:

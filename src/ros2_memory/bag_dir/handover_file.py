@@ -1,11 +1,10 @@
 """`handover.json` in a recording's directory: which of its messages count.
 
-While one recording takes over from another both run for some seconds, and record the same messages.
-The recorder, which alone knows that they overlapped, writes down a cut in publish time: a message
-published before it counts in the old recording, any other in the new one. Publish time is the same
-in both, to the nanosecond; log time is not. Clocks step, so times alone prove nothing: a cut
-applies only in the files that were open, to messages with a log time in the overlap. Everywhere
-else every message counts.
+While one recording takes over from another, both run for some seconds and record the same messages.
+The recorder writes down a cut in publish time: a message published before the cut counts in the old
+recording, any other in the new one. The publish time of a message is the same in both, to the
+nanosecond; its log time is not. Clocks step, so a cut applies only in the files that were open, to
+messages with a log time in the overlap. Elsewhere every message counts.
 
     rec_A: {"format": 1, "state": "counts", "clock": "publish", "next": "rec_B",
             "counts_until_ns": 1795150000500000000,
@@ -14,15 +13,13 @@ else every message counts.
             "counts_from_ns": 1795150000500000000,
             "begin": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_B_0.mcap"]}, ...}
 
-A cut alone would hide what only one of the two has on disk, because the other stalled. So once the
-files on both sides are closed the recorder compares them (`recorder.handover`), and lists the
-messages for which the cut is not the answer: those that count here all the same (`also_counts`),
-and those that do not (`counts_elsewhere`), by file and topic. A message is the same in both
-recordings by topic, publish time and payload.
+If one recorder stalled, the cut would hide messages that only the other one has. So once the files
+on both sides are closed, the recorder compares them (`recorder.handover`), and lists the messages
+that the cut gets wrong, by file and topic: `also_counts` here, or `counts_elsewhere`. A message is
+the same in both recordings by topic, publish time and payload.
 
-Every recording receives latched messages again, long after they were published. A cut cannot
-separate them; they are recognised by topic, publish time and payload as well, in queries, so no cut
-applies to a latched channel.
+Every recording receives latched messages again, long after they were published, so no cut applies
+to a latched channel. Queries recognise them by topic, publish time and payload.
 """
 
 from __future__ import annotations
@@ -61,12 +58,12 @@ class Counting(StrEnum):
     """Whether a recording counts."""
 
     COUNTS = "counts"
-    PENDING = "pending"  # its handover is not finished: the previous recording still has everything
-    VOID = "void"  # its handover failed: the previous recording went on, and has everything
+    PENDING = "pending"  # it is taking over: the previous recording still has all messages
+    VOID = "void"  # it did not take over: the previous recording went on, and has all messages
 
 
 class CutClock(StrEnum):
-    """The clock of the cut; where publish and log times are equal, both give the same cut."""
+    """The clock of the cut: LOG if publish times equal log times."""
 
     PUBLISH = "publish"
     LOG = "log"
@@ -81,9 +78,9 @@ def _checked_name(value: str) -> str:
 _Name: TypeAlias = Annotated[str, AfterValidator(_checked_name)]
 _MessageId: TypeAlias = Annotated[str, StringConstraints(pattern=r"^-?\d{1,19} [0-9a-f]{8}$")]
 MessageList: TypeAlias = "dict[str, dict[str, tuple[_MessageId, ...]]]"
-"""Messages by file and topic: publish time in nanoseconds and CRC-32 of the payload, as text."""
+"""Messages by file and topic, as `message_id` returns them."""
 _Time: TypeAlias = Int64 | None
-# The keys of the file: those of times end in `_ns`.
+# In the file, keys of times end in `_ns`.
 _KEYS: Final = ConfigDict(
     alias_generator=lambda name: f"{name}_ns" if name.endswith(("_from", "_until")) else name,
     defer_build=True,
@@ -94,7 +91,7 @@ _KEYS: Final = ConfigDict(
 class Overlap:
     """Where a cut applies: in these files, to log times in the half-open `[log_from, log_until)`.
 
-    None leaves a side open: log times of a simulated clock cannot be foreseen.
+    None leaves a side open: the log times of a simulated clock are unknown in advance.
     """
 
     __pydantic_config__ = _KEYS
@@ -106,12 +103,19 @@ class Overlap:
 
 @dataclass(frozen=True, slots=True)
 class Handover:
-    """The content of `handover.json`; by default everything counts.
+    """The content of `handover.json`; by default every message counts.
 
-    `previous` and `next` are names of recordings beside this one. Messages published before
-    `counts_from` (in `begin`), and at or after `counts_until` (in `end`), count elsewhere, but for
-    those listed. A `next` without `counts_until` is a handover that was begun and not finished.
-    `compared` is False until the recording was compared with the previous one.
+    A `next` without `counts_until` is a handover that was begun and not finished.
+
+    Attributes:
+        previous: the name of the recording that this one took over from.
+        counts_from: in `begin`, messages published earlier count in the previous recording.
+        next: the name of the recording that took over from this one.
+        counts_until: in `end`, messages published then or later count in the next recording.
+        compared: False until the recording was compared with the previous one; None in files of
+            versions that did not compare.
+        also_counts: messages that count here, against the cut.
+        counts_elsewhere: messages that do not count here, against the cut.
     """
 
     __pydantic_config__ = _KEYS
@@ -125,35 +129,33 @@ class Handover:
     counts_until: _Time = None
     end: Overlap | None = None
     notes: tuple[str, ...] = ()
-    compared: bool | None = None  # None: by a version that did not compare
+    compared: bool | None = None
     also_counts: MessageList = field(default_factory=dict)
     counts_elsewhere: MessageList = field(default_factory=dict)
 
     @property
     def hides_all(self) -> bool:
-        """Returns whether no message of the recording counts, but for those in `also_counts`."""
+        """Whether no message of the recording counts except those in `also_counts`."""
         return self.state is not Counting.COUNTS
 
     def exclusions(self, file_name: str) -> tuple[Exclusion, ...]:
-        """Returns what the cuts exclude of one bag file, if not `hides_all`; mostly nothing."""
+        """Returns what the two cuts exclude of one bag file; they do not matter if `hides_all`."""
         sides = (
             (self.begin, MIN_NS, self.counts_from),
             (self.end, self.counts_until, MAX_NS),
         )
-        return tuple(
-            Exclusion(
-                TimeWindow(start, stop),
-                TimeWindow(
+        exclusions: list[Exclusion] = []
+        for overlap, start, stop in sides:
+            if overlap and start is not None and stop is not None and file_name in overlap.files:
+                logged = TimeWindow(
                     MIN_NS if overlap.log_from is None else overlap.log_from,
                     MAX_NS if overlap.log_until is None else overlap.log_until,
-                ),
-            )
-            for overlap, start, stop in sides
-            if overlap and start is not None and stop is not None and file_name in overlap.files
-        )
+                )
+                exclusions.append(Exclusion(TimeWindow(start, stop), logged))
+        return tuple(exclusions)
 
     def rule(self, file_name: str) -> FileRule | None:
-        """Returns which messages of one bag file count; None where all do, as in most files."""
+        """Returns which messages of one bag file count; None if all do, as in most files."""
         exclusions = (_EVERYTHING,) if self.hides_all else self.exclusions(file_name)
         also = self.also_counts.get(file_name, {})
         elsewhere = self.counts_elsewhere.get(file_name, {})
@@ -166,15 +168,15 @@ _HANDOVER: Final = TypeAdapter(Handover)
 
 
 class Exclusion(NamedTuple):
-    """Messages of one file that count in another recording, by both of their times."""
+    """Publish and log times of messages in one file that count in another recording."""
 
     published: TimeWindow
     logged: TimeWindow
 
     def excludes(self, publish_time: Ns, log_time: Ns) -> bool:
-        """Returns whether a message with these times counts in another recording.
+        """Whether a message with these times counts in another recording.
 
-        A publish time of 0 means none: then the cut is by log time.
+        A publish time of 0 means that there is none: then the log time decides.
         """
         is_published = self.published.contains(publish_time or log_time)
         return is_published and self.logged.contains(log_time)
@@ -184,7 +186,7 @@ _EVERYTHING: Final = Exclusion(TimeWindow.everything(), TimeWindow.everything())
 
 
 def message_id(publish_time: Ns, payload: bytes) -> str:
-    """Returns what identifies a message of a topic in both recordings, as sidecars list it."""
+    """Returns the identity of a topic's message: its publish time (ns) and its payload's CRC-32."""
     return f"{publish_time} {crc32(payload):08x}"
 
 
@@ -194,7 +196,14 @@ def _as_set(listed: tuple[str, ...]) -> frozenset[str]:
 
 
 class FileRule(NamedTuple):
-    """Which messages of one bag file count: all but the excluded, and but for the listed ones."""
+    """Which messages of one bag file count.
+
+    Attributes:
+        exclusions: messages that do not count unless `also` lists them.
+        also: listed messages that count, by topic.
+        elsewhere: listed messages that do not count, by topic.
+        hides_latched: whether exclusions apply to latched messages as well.
+    """
 
     exclusions: tuple[Exclusion, ...]
     also: Mapping[str, tuple[str, ...]]
@@ -207,37 +216,38 @@ class FileRule(NamedTuple):
         return self.hides_latched and not self.also
 
     def counts(self, record: Record) -> bool:
-        """Returns whether a message of the file counts."""
+        """Whether a message of the file counts."""
         channel = record.channel
-        excluded = (self.hides_latched or not channel.latched) and any(
+        is_excluded = (self.hides_latched or not channel.latched) and any(
             exclusion.excludes(record.publish_time, record.log_time)
             for exclusion in self.exclusions
         )
-        listed = (self.also if excluded else self.elsewhere).get(channel.topic)
+        listed = (self.also if is_excluded else self.elsewhere).get(channel.topic)
         if not listed:
-            return not excluded
-        return (message_id(record.publish_time, record.payload) in _as_set(listed)) == excluded
+            return not is_excluded
+        is_listed = message_id(record.publish_time, record.payload) in _as_set(listed)
+        return is_listed == is_excluded
 
     def touches(self, window: TimeWindow, topics: Collection[str]) -> bool:
-        """Returns whether some message of the topics with log time in a window may not count."""
+        """Whether some message of the topics, with a log time in a window, may not count."""
         return any(topic in self.elsewhere for topic in topics) or any(
             not window.intersect(exclusion.logged).empty for exclusion in self.exclusions
         )
 
 
 _PERMANENT: Final = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG})
-"""Errors that another attempt would meet again."""
+"""Errors that do not go away by themselves."""
 
 
 class HandoverReading(NamedTuple):
-    """The content of a sidecar, and what is wrong with it; then everything counts."""
+    """The content of a sidecar, or the reason why it is not valid: then every message counts."""
 
     handover: Handover
     problem: str | None
 
 
 def read_handover(recording: Path) -> HandoverReading:
-    """Returns the sidecar of a recording; without one everything counts. Raises nothing."""
+    """Returns the sidecar of a recording. Raises nothing: without one every message counts."""
     try:
         return sure_handover(recording)
     except OSError as error:
@@ -245,10 +255,10 @@ def read_handover(recording: Path) -> HandoverReading:
 
 
 def sure_handover(recording: Path) -> HandoverReading:
-    """Returns the sidecar of a recording, as `read_handover`, unless the disk fails.
+    """Returns the sidecar of a recording, as `read_handover` does, unless the disk fails.
 
     Raises:
-        OSError: the disk fails, or a resource is exhausted: there may be a sidecar.
+        OSError: the disk fails, or a resource is exhausted, so there may be a sidecar.
     """
     try:
         text = read_small_file(recording / HANDOVER_FILE)
@@ -265,10 +275,10 @@ def sure_handover(recording: Path) -> HandoverReading:
 
 
 def handover_to_change(recording: Path) -> Handover:
-    """Returns the sidecar of a recording, to be written again with a change.
+    """Returns the sidecar of a recording, to be changed and written again.
 
     Raises:
-        RecorderError: the disk fails, so that writing would lose what is there.
+        RecorderError: the disk fails, so that writing might lose the present content.
     """
     try:
         return sure_handover(recording).handover
@@ -284,16 +294,16 @@ def write_handover(recording: Path, handover: Handover) -> None:
     """Replaces the sidecar atomically and flushes it.
 
     Raises:
-        RecorderError: it cannot be written; the old one remains.
+        RecorderError: the sidecar cannot be written; the old one remains.
     """
     write_handovers({recording: handover})
 
 
 def write_handovers(handovers: Mapping[Path, Handover]) -> None:
-    """Replaces the sidecars of recordings, in this order; on a full disk none of them.
+    """Replaces the sidecars of recordings, in this order; a full disk leaves all as they are.
 
     Raises:
-        RecorderError: one cannot be written.
+        RecorderError: a sidecar cannot be written.
     """
     texts: dict[Path, str] = {}
     for recording, handover in handovers.items():

@@ -2,8 +2,8 @@
 
 The recorder writes it, the query server reads it. The file may be of another version, cut short, or
 the operator's own, so reading never fails: it returns the reason why there is no heartbeat. The
-recorder lists a recording here before it creates its first file: while the heartbeat is live, an
-open file of a recording that is not listed counts as left behind by a crash.
+recorder lists a recording here before it makes the first file. While the heartbeat is live, an open
+file of a recording that is not listed was left behind by a crash.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
 
 HEARTBEAT_FILE: Final = "recorder.json"
 MAX_INTERVAL_S: Final = 3600.0
-"""A longer interval is refused: such a heartbeat would count as live for days."""
+"""A heartbeat with a longer interval is refused: it would count as live for days."""
 
 _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 _BLOCK_BYTES: Final = 512  # the unit of `st_blocks` on every file system
 _LIVE_INTERVALS: Final = 3
 _ENDED: Final = frozenset("ZX")
-"""States of processes that have ended and were not waited for yet."""
+"""States of processes in /proc that have ended: zombie, dead."""
 _MIN_LIVE_NS: Final[Ns] = 15 * NS_PER_S
 
 _Text: TypeAlias = Annotated[str, AfterValidator(encodable)]
@@ -58,12 +58,12 @@ class Heartbeat:
     """One heartbeat of the recorder; `docs/reference/files.md` says what its fields mean.
 
     Attributes:
-        recordings: what is being written, as directories relative to the bag directory with
+        recordings: the directories that are being written, relative to the bag directory with
             forward slashes; two during a rotation.
-        unknown_types: topics that are offered, and not recorded: `ros2 bag record` does not know
-            their type. It names one topic of each such type.
-        lost: how many messages of each topic are known to be missing of the last hour; topics
-            without a counter, or a regular header stamp, are not in it.
+        unknown_types: topics that are offered and not recorded, since `ros2 bag record` does not
+            know their type; one topic of each such type.
+        lost: the number of messages of each topic that are known to be missing in the last hour;
+            topics need a counter or a regular header stamp for it.
     """
 
     __pydantic_config__ = ConfigDict(defer_build=True)
@@ -102,11 +102,11 @@ class Heartbeat:
     list_refused: _Text | None = None
 
     def is_live(self, now: Ns) -> bool:
-        """Returns whether the recorder that wrote this is likely to be running still.
+        """Whether the recorder that wrote this probably still runs.
 
-        That is within three intervals (at least 15 s) of `updated`, on either side: a heartbeat
-        from the future was written before the clock was set back. Where its process can be looked
-        up, as on the robot itself, it must not have ended.
+        `now` must be within three intervals (at least 15 s) of `updated`, on either side: a
+        heartbeat from the future was written before the clock was set back. And its process must
+        not have ended, if it can be looked up, as on the robot itself.
         """
         limit = max(ns_from_unix(_LIVE_INTERVALS * self.interval_s), _MIN_LIVE_NS)
         return abs(now - self.updated) <= limit and not self._has_ended()
@@ -122,7 +122,7 @@ class Heartbeat:
 
 
 def runs(pid: int) -> bool:
-    """Returns whether there is a process of this id, or may be one."""
+    """Whether a process with this id exists, or may exist."""
     try:
         with suppress(PermissionError, OverflowError):
             os.kill(pid, 0)
@@ -132,9 +132,9 @@ def runs(pid: int) -> bool:
 
 
 def process_of(pid: int) -> str | None:
-    """Returns what no other process has: the boot, its namespace of process ids, and its start.
+    """Returns an identity that no other process has; None without such a process, or without /proc.
 
-    None where there is no such process, or no /proc.
+    It consists of the boot, the namespace of process ids, and the start of the process.
     """
     system, (state, began) = _system(), _state_of(pid)
     return f"{system}/{began}" if system and state else None
@@ -150,7 +150,7 @@ def _system() -> str:
 
 
 def _state_of(pid: int) -> tuple[str, str]:
-    """Returns the state and the start (ticks since boot) of a process; empty if it is not found."""
+    """Returns the state and the start (ticks since boot) of a process; empty if none is found."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
         return fields[0], fields[19]
@@ -166,12 +166,12 @@ class HeartbeatReading(NamedTuple):
 
     @property
     def recordings(self) -> tuple[str, ...]:
-        """The recordings that the heartbeat names, live or not; none without a heartbeat."""
+        """The recordings that the heartbeat names, live or not."""
         return () if self.heartbeat is None else self.heartbeat.recordings
 
 
 def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
-    """Returns the last heartbeat in `recorder.json`, live or not. Raises nothing."""
+    """Returns the heartbeat in `recorder.json`, live or not. Raises nothing."""
     try:
         text = read_small_file(f"{bag_dir}/{HEARTBEAT_FILE}")
         return HeartbeatReading(_parse(text), None)
@@ -186,12 +186,12 @@ def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
 def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
     """Replaces `recorder.json` atomically: a reader sees the old heartbeat or this one.
 
-    On a full disk the file is overwritten in place, which needs no free block: a reader at that
+    On a full disk the file is overwritten in place, which needs no free block. A reader at that
     moment may find no heartbeat, and finds this one at its next look.
 
     Raises:
-        RecorderError: the disk is full, whether the file could be overwritten or not; or the file
-            cannot be written, and the old one remains.
+        RecorderError: the disk is full, even if the file was overwritten; or the file cannot be
+            written, and the old one remains.
     """
     target = bag_dir / HEARTBEAT_FILE
     text = json.dumps(asdict(heartbeat), allow_nan=False, separators=(",", ":"))
@@ -207,13 +207,13 @@ def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
 
 
 def _overwrite_in_place(target: Path, data: bytes) -> None:
-    """Overwrites a file where its blocks have room for the data; else leaves it as it is."""
+    """Overwrites a file if its blocks have room for the data."""
     with suppress(OSError):
         descriptor = os.open(target, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
             status = os.fstat(descriptor)
             if len(data) <= status.st_blocks * _BLOCK_BYTES:
-                # Padded with blanks, so that one write covers whatever was there before.
+                # Padded with blanks, so that one write covers the old content.
                 os.pwrite(descriptor, data.ljust(status.st_size), 0)
         finally:
             os.close(descriptor)
@@ -222,7 +222,7 @@ def _overwrite_in_place(target: Path, data: bytes) -> None:
 _HEARTBEAT: Final = TypeAdapter(Heartbeat)
 
 
-# Read for every question about the present, and written every few seconds.
+# Every question about the present reads the file, which changes every few seconds.
 @lru_cache(4)
 def _parse(text: str) -> Heartbeat:
     return parsed(_HEARTBEAT, text, has_paths=False)

@@ -11,14 +11,14 @@
         metadata.yaml                      written by rosbag2 at a clean end
         handover.json                      which messages count (see `handover_file`)
       latched/carried.mcap         latched messages of deleted bags (see `retention.latched_carry`)
-      memory/20261120.thinned.mcap what stays of the bags of a day (see `recorder.days`)
-      moments/                     bags that were asked to be saved (see `moment_file`)
+      memory/20261120.thinned.mcap messages of a day's deleted bags (see `recorder.days`)
+      moments/                     bags that somebody, or a rule, saved (see `moment_file`)
         20261120T043012Z-charging/         one saved moment
           moment.json                      its label and its time
           rec_20261120T043000Z/            hard links, under the names that the bags have above
       .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
       .episodic/requests/          requests of the query server (see `moment_file`)
-      .episodic/*.json, *.jsonl    what the two programs know (see `state_files`)
+      .episodic/*.json, *.jsonl    the state of the two programs (see `state_files`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
@@ -80,9 +80,9 @@ OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 TIMED_FILES: Final = frozenset(
     {LOST_FILE, DELETED_FILE, EXPIRED_FILE, SCREENED_FILE, TRIGGERS_FILE}
 )
-"""What is known of recordings by log times, which those of the next simulation have, too."""
+"""State by log times: it would apply to the next simulation, which has the same times."""
 RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE, THINNED_NAME})
-"""Files beside the bags of a recording, which mean nothing without them."""
+"""Files beside the bags of a recording that mean nothing without the bags."""
 
 _TIME_FORMAT: Final = "%Y%m%dT%H%M%SZ"
 _DAY_FILE: Final = re.compile(r"\d{8}(?:-\d+)?\.thinned\.mcap")
@@ -90,9 +90,9 @@ _RECORDING_NAME: Final = re.compile(r"rec_(\d{8}T\d{6}Z)(?:_\d+)?")
 
 
 def has_recorded(bag_dir: Path) -> bool:
-    """Returns whether a recorder of this program has run here: whether its own files exist.
+    """Whether a recorder of this program has run here, by its files. Links do not count.
 
-    Only there is anything written beside bags. Nothing behind a link counts.
+    In other bag directories nothing is written beside bags.
     """
     for name in (HEARTBEAT_FILE, LIST_FILE):
         with suppress(OSError):
@@ -102,52 +102,52 @@ def has_recorded(bag_dir: Path) -> bool:
 
 
 def is_carried(bag: Path | str) -> bool:
-    """Returns whether a bag holds carried messages: it shows nothing of what was recorded when."""
+    """Whether a bag holds carried messages: it does not show when anything was recorded."""
     return f"/{bag}".endswith(_CARRIED)
 
 
 def is_thinned(bag: Path | str) -> bool:
-    """Returns whether a bag is a day of `memory/`: what stays of others that were deleted."""
+    """Whether a bag is a day of `memory/`."""
     folder, _, name = f"/{bag}".rpartition("/")
     return folder.endswith(f"/{MEMORY_FOLDER}") and _DAY_FILE.fullmatch(name) is not None
 
 
 def is_derived(bag: Path | str) -> bool:
-    """Returns whether a bag holds messages of other bags: carried ones, or what stays of a day."""
+    """Whether a bag holds messages of other bags: carried ones, or those of a thinned day."""
     return is_carried(bag) or is_thinned(bag)
 
 
 def utc_day(at: Ns) -> str:
-    """Returns the day of a time, as names have it: `20261120`."""
+    """Returns the day (UTC) of a time, as `20261120`."""
     return utc_stamp(at).partition("T")[0]
 
 
 def memory_file(day: str, number: int = 0) -> str:
-    """Returns the name of the file of a day; of a further one, where another cannot be changed."""
+    """Returns the name of a day's file, numbered if the first one cannot be changed."""
     return f"{day}-{number}.thinned.mcap" if number else f"{day}.thinned.mcap"
 
 
 def is_kept_apart(name: str) -> bool:
-    """Returns whether a path in the bag directory is of moments, thinned days or carried messages.
+    """Whether a path in the bag directory belongs to moments, thinned days or carried messages.
 
-    Those are in no list of recordings.
+    They are no recordings.
     """
     return name.partition("/")[0] in {MOMENTS_FOLDER, CARRY_FOLDER, MEMORY_FOLDER}
 
 
 def utc_stamp(at: Ns) -> str:
-    """Returns a time as names have it: `20261120T043000Z`."""
+    """Returns a time (UTC) as `20261120T043000Z`."""
     return datetime.fromtimestamp(at // NS_PER_S, tz=UTC).strftime(_TIME_FORMAT)
 
 
 def recording_name(now: Ns, bag_dir: Path, deleted: Container[str]) -> str:
-    """Returns a free name for a recording that begins now: its UTC time, numbered where taken.
+    """Returns a free name for a recording that begins now: its UTC time, with a number if taken.
 
-    Names are taken when two recordings begin within a second, or the clock was set back. Those of
-    `deleted` recordings are, too: files in `.episodic` still have them.
+    A name is taken if two recordings begin within a second, or the clock was set back. Names of
+    `deleted` recordings are taken as well: files in `.episodic` still have them.
 
     Raises:
-        RecorderError: the bag directory cannot be read, as on a disk that fails.
+        RecorderError: the disk fails.
     """
     stem = f"rec_{utc_stamp(now)}"
     name, number = stem, 1
@@ -161,17 +161,17 @@ def recording_name(now: Ns, bag_dir: Path, deleted: Container[str]) -> str:
 
 
 def has_own_name(name: str) -> bool:
-    """Returns whether a directory is named as `recording_name` names recordings."""
+    """Whether a directory has a name of the form that `recording_name` returns."""
     return _RECORDING_NAME.fullmatch(name) is not None
 
 
 def split_name(recording: str, number: int) -> str:
-    """Returns how `ros2 bag record` names a split of a recording."""
+    """Returns the name that `ros2 bag record` gives a split of a recording."""
     return f"{recording.rpartition('/')[2]}_{number}.mcap"
 
 
 def split_number(recording: str, file: str) -> int | None:
-    """Returns the number of a file that is named as a split of a recording; None of others."""
+    """Returns the number of a split of a recording, by its name; None of other files."""
     digits = file.removesuffix(".mcap").rpartition("_")[2]
     if not digits.isdecimal() or file != split_name(recording, int(digits)):
         return None
@@ -179,7 +179,7 @@ def split_number(recording: str, file: str) -> int | None:
 
 
 def named_start(recording: str) -> Ns | None:
-    """Returns when a recording of this program began, by its name; None for any other name."""
+    """Returns when a recording began, by its name; None of a name of other programs."""
     named = _RECORDING_NAME.fullmatch(recording)
     if named is None:
         return None
@@ -191,15 +191,15 @@ def named_start(recording: str) -> Ns | None:
 
 
 def node_name(recording: str) -> str:
-    """Returns a ROS node name for each recording.
+    """Returns the ROS node name of a recording's recorder.
 
-    Two recorders of one name, as during a handover, would make their services ambiguous.
+    During a handover, two recorders of one name would make their services ambiguous.
     """
     return f"ros2_memory_{recording}"
 
 
 def bag_kind(name: str) -> str | None:
-    """Returns the suffix of a bag's file name, one of `BAG_KINDS`; None for others and hidden."""
+    """Returns the suffix of a bag's name, one of `BAG_KINDS`; None of other or hidden files."""
     lowered = name.lower()
     if not lowered.startswith("."):
         for kind in BAG_KINDS:
@@ -212,11 +212,11 @@ def bags_in(folder: Path) -> list[Path]:
     """Returns the bag files in a directory.
 
     Raises:
-        OSError: it cannot be listed.
+        OSError: the directory cannot be listed.
     """
     return sorted(path for path in folder.iterdir() if bag_kind(path.name))
 
 
 def other_form(path: str) -> str:
-    """Returns the name of the same bag compressed as a whole, or decompressed."""
+    """Returns the name of a bag's other form: with `.zstd`, or without."""
     return path.removesuffix(COMPRESSED) if path.endswith(COMPRESSED) else path + COMPRESSED

@@ -1,7 +1,7 @@
-"""One recorder for one bag directory: a lock that the system releases when its holders die.
+"""The lock that admits one recorder to a bag directory. It is free when its holders have died.
 
-The recorder's child inherits the lock. A recorder that was killed leaves a child that needs time to
-close its files, and nobody may repair or record there before it has.
+The recorder's child inherits the lock. The child of a killed recorder needs time to close its
+files, and nobody may repair or record in the directory before.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAX_TEXT: Final = 1000
 
 @dataclass(eq=False, repr=False)
 class BagDirLock:
-    """The lock of one bag directory, held until `release` and by children that inherit it."""
+    """The lock of one bag directory. Children that inherit it hold it, too."""
 
     descriptor: int
     path: Path
@@ -42,8 +42,8 @@ class BagDirLock:
         """Acquires the lock.
 
         Raises:
-            RecorderError: another recorder holds it, which the sentence names; or no file can be
-                locked in this directory.
+            RecorderError: another recorder, which the sentence names, holds the lock; or no file
+                can be locked in this directory.
         """
         path = bag_dir / LOCK_FILE
         try:
@@ -62,17 +62,17 @@ class BagDirLock:
         return cls(descriptor, path)
 
     def renew(self) -> bool:
-        """Acquires the lock again where its file is not in the bag directory any more.
+        """Acquires the lock again if its file is not in the bag directory any more.
 
-        Somebody emptied the directory, moved it, or mounted another: the locked file then keeps
-        nobody out. The number of the descriptor stays, so that children inherit the new lock. On
-        another disk than before no file is made: it may be the mount point of an unmounted disk.
+        If somebody emptied, moved or mounted over the directory, the locked file keeps nobody out.
+        The number of the descriptor stays, so that children inherit the new lock. On another disk
+        than before no file is made: the directory may be the mount point of an unmounted disk.
 
         Returns:
-            Whether the lock was acquired again; also False where that is not possible this time.
+            Whether the lock was acquired again.
 
         Raises:
-            RecorderError: another recorder has acquired it since, which the sentence names.
+            RecorderError: another recorder, which the sentence names, has acquired the lock since.
         """
         try:
             if not self.path.parent.is_dir() or is_open_file(self.path, self.descriptor):
@@ -103,11 +103,10 @@ def _lock(descriptor: int, path: Path, patience_s: float) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             pid, host = read_holder(descriptor)
-            # A restarted container: the process before had the number that this one has.
-            is_before = pid == os.getpid()
-            alive = host != socket.gethostname() or pid is None or (not is_before and runs(pid))
             who = f"process {pid} on {host}" if pid is not None else "a process that left no name"
-            if alive:
+            # In a restarted container this process may have the number of the one before.
+            is_other = pid != os.getpid()
+            if pid is None or host != socket.gethostname() or (is_other and runs(pid)):
                 raise RecorderError(
                     f"{path.parent} is being recorded into by {who}; two recorders cannot share it"
                 ) from None
@@ -127,7 +126,7 @@ def _lock(descriptor: int, path: Path, patience_s: float) -> None:
 
 
 def write_holder(descriptor: int) -> None:
-    """Writes into the file who holds the lock; a full disk must not stop a recorder."""
+    """Writes this process into the lock file, except on a full disk: that stops no recorder."""
     text = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
     with suppress(OSError):
         # Written in place and truncated afterwards: existing blocks need no free space.
@@ -136,7 +135,7 @@ def write_holder(descriptor: int) -> None:
 
 
 def read_holder(descriptor: int) -> tuple[int | None, str | None]:
-    """Returns the process id and host in the file; None for both if there are none."""
+    """Returns the process id and the host in the lock file; None for both if it has none."""
     try:
         value: object = json.loads(os.pread(descriptor, _MAX_TEXT, 0))
     except (OSError, ValueError):

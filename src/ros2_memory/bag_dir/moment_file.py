@@ -1,21 +1,21 @@
 """Saved moments: a request to save a span of time, and `moment.json` in the moment's folder.
 
-The bags of a saved moment are hard links: retention may delete the paths where they were recorded,
-and their content stays until somebody deletes the moment's folder. Each lies under the path that it
+The bags of a saved moment are hard links. Retention may delete the paths where they were recorded;
+their content stays until somebody deletes the moment's folder. A bag lies under the path that it
 has in the bag directory (`rec_A/rec_A_7.mcap`), beside a link to the sidecar of its recording.
 
-`moment.json` exists before the first link. While bags of the moment are still being written it is
-marked as `pending`, so that a restarted recorder continues it.
+`moment.json` exists before the first link. It is marked as `pending` while bags of the moment are
+still being written, so that a restarted recorder continues it.
 
-Requests of the query server to the recorder are files in `.episodic/requests`.
-The programs share only a directory, and this is the one folder of it that the server writes to:
+The query server sends requests to the recorder as files in `.episodic/requests`, the one folder of
+the bag directory that the server writes to:
 
     <number>.json      a request, written atomically by the server
-    <number>.taken     the same, when the recorder has begun with it
+    <number>.taken     the request after the recorder has begun with it
     <number>.answer    its outcome; the server reads and deletes it
 
-A request that is still `.json` can be withdrawn, and then has no effect. The recorder trusts
-nothing here: a program that can write here can only make requests.
+A request that is still `.json` can be withdrawn, and then has no effect. The recorder trusts no
+file here: a program that can write here can only make requests.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ if TYPE_CHECKING:
 
 
 class HardLinks:
-    """The links in saved moments of one bag directory. Paths are strings, as scans have them."""
+    """The paths of saved moments in one bag directory, as strings."""
 
     def __init__(self, bag_dir: Path) -> None:
         self._root = f"{str(bag_dir).rstrip('/')}/"
         self._moments = f"{self._root}{MOMENTS_FOLDER}/"
 
     def is_saved(self, path: str) -> bool:
-        """Returns whether a path lies in the folder of the saved moments."""
+        """Whether a path lies in the folder of the saved moments."""
         return path.startswith(self._moments)
 
     def recorded_as(self, path: str) -> str:
-        """Returns where the bag of a saved moment was recorded; any other path as it is."""
+        """Returns the path where a saved moment's bag was recorded; any other path unchanged."""
         if not self.is_saved(path):
             return path
         _, slash, name = path[len(self._moments) :].partition("/")
@@ -74,14 +74,14 @@ _log = get_logger(__name__)
 FORMAT: Final = 1
 MAX_LABEL_CHARS: Final = 120
 MAX_MOMENTS: Final = 1000
-"""More than an operator would look through, and each is a folder that every scan lists."""
+"""No operator looks through more, and every scan lists the folder of each."""
 _MAX_SLUG_CHARS: Final = 40
 _INVISIBLE: Final = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
-"""Unicode categories of line ends, directions, surrogates and other controls."""
+"""Unicode categories of line ends, directions, surrogates and other control characters."""
 
 
 def fault_of_label(label: str) -> str | None:
-    """Returns what is wrong with a label, as `is ...`; None where it is valid."""
+    """Returns what is wrong with a label, as "is ..." or "has ..."; None if it is valid."""
     if not label.strip():
         return "is empty"
     if len(label) > MAX_LABEL_CHARS:
@@ -105,9 +105,9 @@ _KEYS: Final = {"number": "request", "start": "start_ns", "end": "end_ns", "aske
 
 @dataclass(frozen=True, slots=True)
 class SaveRequest:
-    """A request to save what was recorded from `start` to `end` (log times, inclusive).
+    """A request to save the messages from `start` to `end` (log times, inclusive).
 
-    `number` is its random id, `asked` the wall clock time of the request.
+    `number` is a random id, `asked` the wall time of the request.
     """
 
     __pydantic_config__ = ConfigDict(
@@ -121,7 +121,7 @@ class SaveRequest:
     asked: _Time
 
     def to_json(self) -> dict[str, object]:
-        """Returns the request as both kinds of file hold it."""
+        """Returns the keys of a request, which `moment.json` has as well."""
         return {"format": FORMAT, **REQUEST.dump_python(self, by_alias=True)}
 
 
@@ -137,11 +137,13 @@ REQUEST: Final[TypeAdapter[SaveRequest]] = TypeAdapter(_Request)
 
 @dataclass(frozen=True, slots=True)
 class SavedMoment:
-    """A moment as its file describes it.
+    """The content of `moment.json`; by default nothing is saved yet.
 
-    `pending`: it waits for bags that are still being written. `missing` are sentences on parts that
-    were not saved. By default nothing is saved yet. `rule` is the rule that asked for it, and
-    `matches` how often that fired in it; None for a moment that was requested.
+    Attributes:
+        pending: whether the moment waits for bags that are still being written.
+        missing: sentences on parts that were not saved.
+        rule: the rule that asked for the moment; None if somebody requested it.
+        matches: how often the rule fired in it.
     """
 
     __pydantic_config__ = ConfigDict(defer_build=True)
@@ -154,7 +156,7 @@ class SavedMoment:
 
 
 def _with_request(fields: dict[object, object]) -> dict[object, object]:
-    return {**fields, "request": fields}  # whose keys lie among those of the moment
+    return {**fields, "request": fields}  # the keys of both lie side by side in the file
 
 
 _Moment: TypeAlias = Annotated[SavedMoment, BeforeValidator(_with_request)]
@@ -162,7 +164,7 @@ _MOMENT: Final[TypeAdapter[SavedMoment]] = TypeAdapter(_Moment)
 
 
 class StoredMoment(NamedTuple):
-    """A saved moment and its folder; `files` are the sizes of its bags by inode."""
+    """A saved moment and its folder; `files` has the sizes of its bags (bytes) by inode."""
 
     folder: Path
     moment: SavedMoment
@@ -170,7 +172,7 @@ class StoredMoment(NamedTuple):
 
 
 def folder_name(request: SaveRequest) -> str:
-    """Returns the name of a moment's folder: the time of the request (UTC), and its label."""
+    """Returns the name of a moment's folder: the time of the request (UTC) and its label."""
     ascii_label = unicodedata.normalize("NFKD", request.label).encode("ascii", "ignore").decode()
     words = re.findall(r"[a-z0-9]+", ascii_label.lower())
     slug = "-".join(words)[:_MAX_SLUG_CHARS].strip("-") or "moment"
@@ -178,10 +180,10 @@ def folder_name(request: SaveRequest) -> str:
 
 
 def make_moment_folder(bag_dir: Path, request: SaveRequest) -> Path:
-    """Makes a folder for a moment, numbered where its name is taken.
+    """Makes a folder for a moment, with a number if its name is taken.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the folder cannot be made.
     """
     moments = bag_dir / MOMENTS_FOLDER
     if moments.is_symlink():
@@ -202,7 +204,7 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
     """Replaces a moment's file atomically and flushes it.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     content = {
         **moment.request.to_json(),
@@ -217,14 +219,14 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
 
 
 def read_saved_moment(folder: Path) -> SavedMoment | None:
-    """Returns the moment of a folder; None where there is no file, or no valid one."""
+    """Returns the moment of a folder; None if it has no valid `moment.json`."""
     with suppress(OSError, ValueError):
         return parsed(_MOMENT, read_small_file(folder / MOMENT_FILE), FORMAT)
     return None
 
 
 def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
-    """Yields the saved moments in the order of their folders' names.
+    """Yields the saved moments, sorted by the names of their folders.
 
     Raises:
         OSError: the folder of the moments cannot be listed.
@@ -243,7 +245,7 @@ def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
 
 
 def _bag_sizes(folder: Path) -> dict[int, int]:
-    """Returns the sizes of the bags below a folder, by inode."""
+    """Returns the sizes of the bags below a folder (bytes), by inode."""
     sizes: dict[int, int] = {}
     for _, entries in directories.walk(folder):
         for entry in entries:
@@ -257,10 +259,10 @@ def _bag_sizes(folder: Path) -> dict[int, int]:
 # Requests.
 
 MAX_AT_ONCE: Final = 16
-"""Requests that the recorder takes in one turn; the next turn comes moments later."""
+"""The recorder takes so many requests in one turn; the next turn comes a second later."""
 MAX_REQUEST_BYTES: Final = 4096
 STALE_NS: Final[Ns] = 60 * NS_PER_S
-"""An older request was not withdrawn because its server died."""
+"""An older request is refused: its server died before it could withdraw it."""
 _KEEP_ANSWER_NS: Final[Ns] = 600 * NS_PER_S
 _REQUEST_NAME: Final = re.compile(r"[0-9a-f]{32}\.(json|taken)")
 _OWN_NAME: Final = re.compile(r"\.?[0-9a-f]{32}\.(json|taken|answer)(\.tmp)?")
@@ -270,7 +272,7 @@ _OWN_NAME: Final = re.compile(r"\.?[0-9a-f]{32}\.(json|taken|answer)(\.tmp)?")
 class Outcome:
     """The outcome of a request: the folder of its moment, or why it was refused.
 
-    `pending`: bags of it are still being written.
+    `pending`: whether bags of the moment are still being written.
     """
 
     __pydantic_config__ = ConfigDict(defer_build=True)
@@ -296,19 +298,19 @@ class PendingRequest:
         """Writes the request.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the request cannot be written.
         """
         directories.make(self._bag_dir, self._folder)
         write_durably(self._path("json"), json.dumps(self.request.to_json()), mode=READABLE)
 
     def outcome(self) -> Outcome | None:
-        """Returns the outcome; None while there is none."""
+        """Returns the outcome; None before the recorder has answered."""
         with suppress(OSError, ValueError):
             return parsed(_OUTCOME, read_small_file(self._path("answer")), FORMAT)
         return None
 
     def withdraw(self) -> bool:
-        """Withdraws the request; False where the recorder has begun with it, or answered."""
+        """Withdraws the request; returns False if the recorder has begun with it, or answered."""
         with suppress(OSError):
             self._path("json").unlink()
             return True
@@ -324,7 +326,7 @@ class PendingRequest:
 
 
 class RequestQueue:
-    """All requests, for the recorder. Not for several threads at once."""
+    """All requests to the recorder. Not for several threads at once."""
 
     def __init__(self, bag_dir: Path) -> None:
         self._bag_dir = bag_dir
@@ -332,12 +334,12 @@ class RequestQueue:
         self._ignored: set[str] = set()
 
     def open(self) -> None:
-        """Makes the folder, so that the server needs access to nothing else. Raises nothing."""
+        """Makes the folder: the server needs write access to no other. Raises nothing."""
         with suppress(OSError):
             directories.make(self._bag_dir, self._folder)
 
     def has_requests(self) -> bool:
-        """Returns whether there are requests."""
+        """Whether there are requests."""
         try:
             with directories.opened(self._bag_dir, self._folder) as descriptor:
                 names = os.listdir(descriptor)  # noqa: PTH208 - a descriptor has no path
@@ -346,9 +348,9 @@ class RequestQueue:
         return any(self._is_request(name) for name in names)
 
     def take(self, now: Ns) -> Iterator[SaveRequest]:
-        """Yields requests, those begun earlier first.
+        """Yields requests; those that the recorder began before come first.
 
-        Those that are invalid, or that the disk does not give, are logged and answered by that.
+        Requests that are invalid or cannot be read are logged, and refused in their answer.
 
         Raises:
             OSError: the folder cannot be listed, or written to.
@@ -383,7 +385,7 @@ class RequestQueue:
         """Writes the outcome of a request, and removes the request.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the outcome cannot be written.
         """
         text = json.dumps({"format": FORMAT, **asdict(outcome)})
         write_durably(self._folder / f"{number}.answer", text, mode=READABLE)
@@ -391,11 +393,11 @@ class RequestQueue:
             (self._folder / f"{number}.taken").unlink()
 
     def _is_request(self, name: str) -> bool:
-        """Returns whether a file is a request by its name, and was not found to be invalid."""
+        """Whether a file has the name of a request, and was not refused before."""
         return name not in self._ignored and _REQUEST_NAME.fullmatch(name) is not None
 
     def _delete_left_over(self, names: list[str], now: Ns) -> None:
-        """Deletes answers that were never fetched, and unfinished files."""
+        """Deletes old answers that no server fetched, and unfinished files."""
         for name in names:
             if _OWN_NAME.fullmatch(name) and name.endswith((".answer", ".tmp")):
                 with suppress(OSError):
@@ -408,8 +410,8 @@ def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:
     """Returns the request in a file.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is invalid, or too old.
+        OSError: the file cannot be read.
+        ValueError: the request is invalid, or too old.
     """
     if path.lstat().st_size > MAX_REQUEST_BYTES:
         raise ValueError(f"it is larger than {MAX_REQUEST_BYTES} bytes")

@@ -1,6 +1,6 @@
-"""Which recordings and bags in a bag directory are its recorder's: `.episodic/recordings.jsonl`.
+"""The list of the recorder's own recordings and bags: `.episodic/recordings.jsonl`.
 
-Only those are ever deleted. The file has one JSON object a line:
+Nothing else is ever deleted. The file has one JSON object a line:
 
     {"recording": "rec_A"}                                          before its child is started
     {"recording": "rec_A", "inode": 7, "generation": 9, "splits": 3}    what the child has made
@@ -8,9 +8,8 @@ Only those are ever deleted. The file has one JSON object a line:
     {"recording": "old/run1", "inode": 8, "adopted": true, "bags": ["x.db3"]}   `ros2-memory adopt`
     {"recording": "moments/m/rec_A", ..., "adopted": true, "splits": 0, "bags": ["rec_A_7.mcap"]}
 
-The last line of a recording counts. A directory is the recorder's own while it lies under its name
-and is the very directory that was listed (see `directories.Identity`). A bag in it is the
-recorder's own by its name, see `ListRow.holds`.
+The last line of a recording counts. A directory is the recorder's own if its name and its identity
+are listed (see `directories.Identity`), and a bag in it by its name (see `ListRow.holds`).
 
 Lines are appended and flushed, so a power cut leaves at most a part of the last line, which readers
 ignore and the next writer ends. Writers take turns by `flock`. Once most lines are of recordings
@@ -89,12 +88,14 @@ def _checked_name(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ListRow:
-    """One line of the list: a recording.
+    """One line of the list: a recording. Saved moments and carried messages are listed as adopted.
 
-    `splits`: its child made the files with lower numbers; None in lines of versions before 0.1,
-    and of adopted recordings. `ended`: it makes no more. `bags`: the other bags of an adopted
-    directory, sorted; None: all that lie there. Directories of saved moments and of carried
-    messages are listed like adopted ones.
+    Attributes:
+        adopted: whether `ros2-memory adopt` listed the directory.
+        bags: the other bags of an adopted directory, sorted; None for all bags in it.
+        splits: the number of splits that the child has made; None in lines of versions before 0.1,
+            and of adopted recordings.
+        ended: whether the child makes no more splits.
     """
 
     recording: Annotated[str, AfterValidator(_checked_name)] = ""
@@ -106,23 +107,24 @@ class ListRow:
     ended: StrictBool = False
 
     def holds(self, file: str) -> bool:
-        """Returns whether a file of the recording's directory is one of its bags, by its name."""
+        """Whether a file in the recording's directory is one of its bags, by its name."""
         if self.adopted and self.bags is None:
             return True
         name, bags = file.removesuffix(COMPRESSED), self.bags or ()
-        at = bisect_left(bags, name)
-        is_listed = at < len(bags) and bags[at] == name
         number = split_number(self.recording, name)
-        is_split = number is not None and (self.splits is None or number < self.splits)
-        return is_split or is_listed
+        if number is not None and (self.splits is None or number < self.splits):
+            return True
+        index = bisect_left(bags, name)
+        return index < len(bags) and bags[index] == name
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
-        """Returns the line of the directory with these bags adopted."""
-        others = {file.removesuffix(COMPRESSED) for file in files if not self.holds(file)}
-        return replace(self, adopted=True, bags=(*sorted({*others, *(self.bags or ())}),))
+        """Returns the line with these bags of the directory adopted."""
+        bags = set(self.bags or ())
+        bags.update(file.removesuffix(COMPRESSED) for file in files if not self.holds(file))
+        return replace(self, adopted=True, bags=tuple(sorted(bags)))
 
-    def counted(self, files: Container[str]) -> int:
-        """Returns how many splits the recording has, where these files were seen."""
+    def count_splits(self, files: Container[str]) -> int:
+        """Returns the number of splits that the child has made, given the files that were seen."""
         splits = self.splits or 0
         while split_name(self.recording, splits) in files:
             splits += 1
@@ -134,7 +136,7 @@ class ListRow:
         return None if self.inode is None else Identity(self.inode, self.generation)
 
     def lists(self, identity: Identity | None) -> bool:
-        """Returns whether a directory is that of the recording."""
+        """Whether a directory with this identity is the recording's."""
         listed = self.identity
         return identity is not None and listed is not None and identity.matches(listed)
 
@@ -149,8 +151,8 @@ def _by_recording(rows: Iterable[ListRow]) -> dict[str, ListRow]:
 class OwnRecordings:
     """The list of one bag directory. Safe for several threads at once.
 
-    Queries write nothing. The recorder's own object is notified of every recording, and writes the
-    list again where it was deleted meanwhile.
+    Queries write nothing. The recorder adds every recording, and writes the list again if somebody
+    has deleted it.
     """
 
     def __init__(self, bag_dir: Path) -> None:
@@ -166,18 +168,18 @@ class OwnRecordings:
         self._begun = ""
 
     def exists(self) -> bool:
-        """Returns whether there is a list.
+        """Whether there is a list.
 
         Raises:
-            OSError: there is one that cannot be read.
+            OSError: the list cannot be read.
         """
         with self._lock:
             return self._read_if_changed()
 
     def names(self) -> Collection[str]:
-        """Returns the listed recordings, whatever lies under their names; no saved moments.
+        """Returns the listed recordings, without saved moments, whether they still exist or not.
 
-        Those that were known remain known if the list is deleted.
+        Known recordings remain known if the list is deleted.
 
         Raises:
             OSError: the list cannot be read.
@@ -185,7 +187,7 @@ class OwnRecordings:
         return [name for name in self._current_rows() if not is_kept_apart(name)]
 
     def in_order(self) -> Sequence[str]:
-        """Returns the listed recordings in the order in which they began; no adopted ones.
+        """Returns the listed recordings in the order in which they began, without adopted ones.
 
         Raises:
             OSError: the list cannot be read.
@@ -193,7 +195,7 @@ class OwnRecordings:
         return [name for name, row in self._current_rows().items() if not row.adopted]
 
     def owns_bag(self, path: Path) -> bool:
-        """Returns whether a bag file is the recorder's: see `judge`.
+        """Whether a bag file is the recorder's own, see `judge`.
 
         Raises:
             OSError: the list cannot be read.
@@ -202,26 +204,26 @@ class OwnRecordings:
         return self.judge_of(str(path.parent))(path.name)
 
     def judge_of(self, directory: str) -> Callable[[str], bool]:
-        """Returns `judge` of the directory that has this path now."""
+        """Returns `judge` for the directory that has this path now."""
         return self.judge(self.name_of(directory), known_identity(directory))
 
     def judge(self, folder: str, identity: Identity | None) -> Callable[[str], bool]:
-        """Returns what decides, by its name, whether a bag file in a directory is the recorder's.
+        """Returns a function that tells whether a bag file, by its name, is the recorder's own.
 
-        Those are the bags that the list, as last read, has by name or number. A folder of moments
-        or carried messages that was restored is in no list.
+        It uses the list as last read. A restored folder of moments or carried messages is in no
+        list.
 
         Args:
-            folder: the directory's name in the list.
-            identity: shows whether it is the one that was listed.
+            folder: the directory of the file, by its name in the list.
+            identity: the identity of the directory, which must be the listed one.
         """
         row = self._rows.get(folder)
         return row.holds if row and row.lists(identity) else lambda _: False
 
     def owns(self, directory: Path) -> bool:
-        """Returns whether a directory is a recording of this bag directory's recorder.
+        """Whether a directory is one of the recorder's own recordings.
 
-        Bags of others may lie in it all the same. One that must not be opened is left out.
+        It may hold foreign bags all the same. False if the directory must not be opened.
 
         Raises:
             OSError: the list cannot be read.
@@ -232,8 +234,8 @@ class OwnRecordings:
                 return self.lists(name, identity_of(directory))
         return False
 
-    def began(self, directory: Path) -> bool:
-        """Returns whether a recording was to begin there, and no directory was listed for it.
+    def is_announced(self, directory: Path) -> bool:
+        """Whether a recording of this name is listed, and not yet its directory.
 
         Raises:
             OSError: the list cannot be read.
@@ -242,31 +244,31 @@ class OwnRecordings:
         return row is not None and row.identity is None
 
     def lists(self, name: str, identity: Identity | None) -> bool:
-        """Returns whether the list, as last read, has a directory of this name and identity."""
+        """Whether the list, as last read, has a directory of this name and identity."""
         row = self._rows.get(name)
         return row is not None and row.lists(identity)
 
     def name_of(self, directory: Path | str) -> str:
-        """Returns a path relative to the bag directory; empty where it lies elsewhere."""
+        """Returns a path relative to the bag directory; an empty text if it lies elsewhere."""
         root, path = f"{self._bag_dir}/", str(directory)
         return path.removeprefix(root) if path.startswith(root) else ""
 
     @property
     def stamp(self) -> object:
-        """A value that changes when the list is read again."""
+        """A value that changes whenever the list is read again."""
         return self._stamp
 
-    # What follows is for the recorder, which holds the lock of the bag directory, and for
+    # The methods below are for the recorder, which holds the lock of the bag directory, and for
     # `ros2-memory adopt`.
 
     def claim(self) -> None:
-        """Brings the list up to date before anything is recorded.
+        """Brings the list up to date. Call it before anything is recorded.
 
-        Without a list it makes one, and names what looks like recordings: nothing shows whether
-        they were restored or copied. Else it drops entries of recordings that have gone, completes
-        those that a kill left without a directory, and counts the splits of those that a kill
-        ended (see `_left_by_kill`). What cannot be written is known all the same, so that space can
-        be freed on a full disk; the next recording writes it.
+        If there is no list, an empty one is made, and recordings that look like own ones are
+        reported: they may have been restored or copied. Otherwise recordings that are gone are
+        dropped, and those that a kill left incomplete are completed (see `_left_by_kill`). Changes
+        that a full disk refuses count all the same, so that space can be freed; the next recording
+        writes them.
 
         Raises:
             RecorderError: the list cannot be read, or the bag directory cannot be listed.
@@ -274,16 +276,13 @@ class OwnRecordings:
         with self._lock:
             try:
                 exists = self._read_if_changed()
-                paths = () if exists else self._bag_dir.iterdir()
-                left = sorted(
-                    path.name for path in paths if has_own_name(path.name) and is_folder(path)
-                )
+                unlisted = [] if exists else self._recordings_on_disk()
             except OSError as error:
                 raise self._failure(error, "read") from error
             rows = self._left_by_kill()
             self._add(rows)
-            if left:
-                names, count = left[:_MAX_NAMED], len(left)
+            if unlisted:
+                count, names = len(unlisted), unlisted[:_MAX_NAMED]
                 _log.warning(
                     "recordings_not_adopted", recordings=count, names=names, advice=_ADVICE
                 )
@@ -298,20 +297,24 @@ class OwnRecordings:
                 self._remember_unwritten(rows)
                 _log.error("recordings_not_listed", reason=str(self._failure(error)))
 
+    def _recordings_on_disk(self) -> list[str]:
+        paths = self._bag_dir.iterdir()
+        return sorted(path.name for path in paths if has_own_name(path.name) and is_folder(path))
+
     def begin(self, name: str) -> None:
-        """Lists a recording that is about to begin, and flushes the list.
+        """Lists a recording that is about to begin.
 
         Raises:
-            RecorderError: it cannot be listed: then it must not begin.
+            RecorderError: the list cannot be written, so the recording must not begin.
         """
         self._begun = name
         self._append([ListRow(recording=name)])
 
     def complete(self, name: str) -> bool:
-        """Lists the directory that the child made for a recording; False while there is none.
+        """Lists the directory that the child made for a recording; returns False if there is none.
 
         Raises:
-            RecorderError: it cannot be written.
+            RecorderError: the list cannot be written.
         """
         try:
             identity = identity_of(self._bag_dir / name)
@@ -322,33 +325,38 @@ class OwnRecordings:
         self._append([ListRow(name, *identity, splits=0)])
         return True
 
-    def note(self, name: str, files: Container[str], *, ended: bool = False) -> None:
-        """Notes which splits the child of a recording has made, of the files that were seen.
+    def note_splits(self, name: str, files: Container[str], *, ended: bool = False) -> None:
+        """Lists the splits that the child of a recording has made.
+
+        Args:
+            name: the recording.
+            files: the names of all files of the recording that were ever seen.
+            ended: whether the child makes no more splits.
 
         Raises:
-            RecorderError: it cannot be written. It is known all the same, so that space can be
-                freed on a full disk, and is written with the next split.
+            RecorderError: the list cannot be written. The splits count all the same, so that space
+                can be freed on a full disk, and are written with the next one.
         """
         with self._lock:
             row = self._rows.get(name)
             if row is None or row.identity is None or row.splits is None:
                 return
-            noted = replace(row, splits=row.counted(files), ended=ended)
+            new = replace(row, splits=row.count_splits(files), ended=ended)
             try:
-                if noted == row and self._read_if_changed():
+                if new == row and self._read_if_changed():
                     return
-                self._append([noted])
+                self._append([new])
             except OSError as error:
                 raise self._failure(error) from error
             except RecorderError:
-                self._remember_unwritten([noted])
+                self._remember_unwritten([new])
                 raise
 
     def adopt(self, identities: Mapping[str, Identity]) -> None:
-        """Lists directories with the bags in them, as the recorder's own from now on.
+        """Lists directories and the bags in them as the recorder's own.
 
         Raises:
-            RecorderError: they cannot be listed.
+            RecorderError: the list cannot be written.
         """
         with self._lock:
             rows: list[ListRow] = []
@@ -360,7 +368,7 @@ class OwnRecordings:
             self._append(rows)
 
     def _row_of(self, name: str, identity: Identity) -> ListRow:
-        """Returns the line of a directory, one of the list or another."""
+        """Returns the line of a directory, a new one if the directory is not listed."""
         row = self._rows.get(name)
         if row is not None and row.lists(identity):
             return row
@@ -368,9 +376,9 @@ class OwnRecordings:
         return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
 
     def hold(self, directory: Path, bags: Iterable[str]) -> None:
-        """Lists bags that the recorder puts into a directory of a moment or of carried messages.
+        """Lists bags that the recorder puts into a folder of moments, days or carried messages.
 
-        What cannot be written is known all the same, and is written with the next recording.
+        If the list cannot be written, the bags count all the same; the next recording writes them.
 
         Raises:
             OSError: the list or the directory cannot be read.
@@ -390,7 +398,7 @@ class OwnRecordings:
                 _log.error("recordings_not_listed", reason=str(error))
 
     def _remember_unwritten(self, rows: Sequence[ListRow]) -> None:
-        """Counts rows as listed that cannot be written; the next one that is written takes them."""
+        """Adds rows that cannot be written now; they are written with the next row."""
         self._unwritten |= _by_recording(rows)
         self._add(rows)
 
@@ -399,28 +407,30 @@ class OwnRecordings:
         self._rows = self._rows | _by_recording(rows)
 
     def _left_by_kill(self) -> list[ListRow]:
-        """Returns what a kill kept from being listed.
+        """Returns the lines that a kill kept from being written.
 
-        Entries without a directory whose directory our child made after all: those that the last
-        heartbeat names, which named them before the child was started. And the splits of recordings
-        that did not end.
+        Its child may have made the directory of an announced recording: the heartbeat, which is
+        written before the child is started, names the recording. And a recording that did not end
+        may have more splits.
         """
         named = read_heartbeat(self._bag_dir).recordings
         left: list[ListRow] = []
         for name, row in self._rows.items():
             with suppress(OSError):
                 directory = self._bag_dir / name
-                if row.identity is None and name in named and (found := identity_of(directory)):
-                    row = ListRow(name, *found, splits=0)  # noqa: PLW2901 - as it is now
-                    left.append(row)
+                if row.identity is None and name in named:
+                    identity = identity_of(directory)
+                    if identity is not None:
+                        row = ListRow(name, *identity, splits=0)  # noqa: PLW2901 - as it is now
+                        left.append(row)
                 if row.identity is not None and row.splits is not None and not row.ended:
                     files = {path.name for path in bags_in(directory)}
-                    left.append(replace(row, splits=row.counted(files), ended=True))
+                    left.append(replace(row, splits=row.count_splits(files), ended=True))
         return left
 
     def _missing_on_disk(self, names: Iterable[str]) -> list[str]:
-        """Returns the recordings that are no longer in the bag directory."""
-        gone = []
+        """Returns the recordings that are not in the bag directory any more."""
+        gone: list[str] = []
         for name in names:
             with suppress(OSError):  # a disk that fails hides what is there
                 if not mode_of(self._bag_dir / name):
@@ -438,7 +448,7 @@ class OwnRecordings:
             return self._rows
 
     def _read_if_changed(self) -> bool:
-        """Reads the file if it has changed; returns whether there is one."""
+        """Reads the list if it has changed; returns whether there is one."""
         try:
             status = os.lstat(state_path(self._bag_dir, LIST_FILE))
             stamp = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
@@ -460,7 +470,7 @@ class OwnRecordings:
         return True
 
     def _append(self, rows: Sequence[ListRow]) -> None:
-        """Appends entries, or writes the whole list where there is none or most of it is gone."""
+        """Appends lines; rewrites the list if it is missing, or most of its recordings are gone."""
         rows = [*self._unwritten.values(), *rows]
         try:
             with self._lock:
@@ -478,7 +488,7 @@ class OwnRecordings:
             raise self._failure(error) from error
 
     def _rewrite(self, rows: Iterable[ListRow]) -> None:
-        """Writes the list again with these entries, and without recordings that have gone."""
+        """Replaces the list by one with these lines, and without recordings that are gone."""
         before = self._rows
         try:
             with self._locked() as descriptor:
@@ -486,36 +496,39 @@ class OwnRecordings:
                     # Another program may have appended meanwhile.
                     self._stamp = None
                     self._read_if_changed()
-                # What was known and what is listed now, but for what has no directory yet.
+                # A line that announces a recording must not replace the one with its directory.
                 merged = before | {
                     name: row
                     for name, row in self._rows.items()
                     if row.identity or name not in before
                 }
                 for name in self._missing_on_disk(merged):
-                    if name != self._begun:  # its child has not made it yet
+                    if name != self._begun:  # its child has not made the directory yet
                         del merged[name]
                 merged |= _by_recording(rows)
-                folder = self._path.parent
-                if not folder.is_dir():
-                    folder.mkdir(exist_ok=True)
-                    give_to_owner(folder, self._bag_dir)
-                    flush(folder.parent)
-                write_durably(self._path, LIST.text(merged.values()))
-                give_to_owner(self._path, self._bag_dir)
+                self._write(merged.values())
         except OSError:
-            # What others appended is read again.
+            # The lines that others appended are read again.
             self._rows, self._stamp = before, None
             raise
         self._max_lines = 2 * len(merged) + _SPARE_LINES
         self._rows, self._stamp = merged, None
 
+    def _write(self, rows: Iterable[ListRow]) -> None:
+        folder = self._path.parent
+        if not folder.is_dir():
+            folder.mkdir(exist_ok=True)
+            give_to_owner(folder, self._bag_dir)
+            flush(folder.parent)
+        write_durably(self._path, LIST.text(rows))
+        give_to_owner(self._path, self._bag_dir)
+
     @contextmanager
     def _locked(self) -> Iterator[int | None]:
-        """Yields a descriptor of the list, locked; None if there is none.
+        """Yields a descriptor of the locked list; None if there is no list.
 
         Raises:
-            OSError: it cannot be opened, or another program holds the lock.
+            OSError: the list cannot be opened, or another program holds the lock.
         """
         give_up = time.monotonic() + _LOCK_WAIT_S
         while True:
@@ -527,7 +540,7 @@ class OwnRecordings:
             try:
                 with suppress(BlockingIOError):
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    # Another program may have replaced the file before it was locked.
+                    # Another program may have replaced the file before this one locked it.
                     if is_open_file(self._path, descriptor):
                         yield descriptor
                         return
@@ -556,12 +569,12 @@ _ADVICE: Final = (
 
 
 def folders_with_bags(folder: Path) -> Iterator[Path]:
-    """Yields a directory and those below it that hold bag files; follows no link below it.
+    """Yields the directories with bag files, the given one and those below it.
 
-    Hidden directories are left out, and `lost+found`.
+    Follows no link below it, and leaves out hidden directories and `lost+found`.
 
     Raises:
-        OSError: one of them cannot be listed.
+        OSError: a directory cannot be listed.
     """
 
     def fail(error: OSError) -> None:
@@ -576,9 +589,9 @@ def folders_with_bags(folder: Path) -> Iterator[Path]:
 
 
 def is_regular(path: Path) -> bool:
-    """Returns whether a path is a regular file, and no link to one.
+    """Whether a path is a regular file, and not a link to one.
 
     Raises:
-        OSError: it cannot be looked up.
+        OSError: the disk fails.
     """
     return stat.S_ISREG(mode_of(path))

@@ -1,25 +1,26 @@
-"""The files below `.episodic/`: what each row, or document, holds, and who may read it.
+"""The files below `.episodic/`: what a row or document holds, and which program writes it.
 
     recorded.jsonl     the recorder: how long it has recorded (see `retention.recorded_time`)
     lost.jsonl         the recorder, `forget`: messages that are in no bag, for the notes of answers
     expired.json       the recorder: messages that `retention.topics` takes out of bags, likewise
-    deleted.jsonl      the recorder: what retention deletes, so that nobody calls it lost
-    superseded.json    the recorder: bags of which thinned days have what stays, for the index
-    leaving.json       the recorder: when `memory/` is deleted, since `memory.keep` is false
-    shipped.jsonl      `ship`: which bags are in a lake, for retention
-    forgotten.jsonl    `forget`: what is deleted here, for the lake that may have it
+    deleted.jsonl      the recorder: bags that retention deletes, so that nobody calls them lost
+    superseded.json    the recorder: bags whose messages are in thinned days, for the index
+    leaving.json       the recorder: when it deletes `memory/`, since `memory.keep` is false
+    shipped.jsonl      `ship`: the bags that are in a lake, for retention
+    forgotten.jsonl    `forget`: messages and bags deleted here, for the lake that may have them
     erasing.json       `forget`: messages that are being taken out of bags
-    screened.json      the recorder: what `recording.exclude_when` holds back, and has excluded
-    triggers.json      the recorder: how far the rules of `recording.keep_when` know the recordings
+    screened.json      the recorder: splits that `recording.exclude_when` holds back, or has cut
+    triggers.json      the recorder: how far the rules of `recording.keep_when` have read
 
-What is about to be deleted is written before it is, so a kill hides nothing. Elsewhere are
-`recordings.jsonl` (`own_recordings`), the folder of requests (`moment_file`), and, beside the days
-that it completes, `memory/thinned.json`.
+A row is written before the bag is deleted, so a kill hides nothing. Other files are
+`recordings.jsonl` (`own_recordings`), the folder of requests (`moment_file`), and
+`memory/thinned.json`, which lies beside the days that it completes.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -85,9 +86,9 @@ RECORDED: Final = JsonLog(RECORDED_FILE, Recorded)
 # lost.jsonl
 
 MOST_LOST_BYTES: Final = 1 << 20
-"""A longer file loses its older half, unless it is half as long once stretches are joined."""
+"""A longer file loses its older half, unless joining its rows makes it half as long."""
 EVERY_TOPIC: Final = "*"
-"""Stands for the topics of a recording that ended unexpectedly."""
+"""Stands for all topics of a recording that ended unexpectedly."""
 INTERRUPTIONS: Final = MappingProxyType(
     {
         "died": "ros2 bag record died",
@@ -96,7 +97,7 @@ INTERRUPTIONS: Final = MappingProxyType(
         "paused": "recording was paused: the disk was full, or unmounted",
     }
 )
-"""How a recording may end unexpectedly, and the words for it."""
+"""The ways in which a recording may end unexpectedly, with words for them."""
 Interruption: TypeAlias = Literal["died", "hung", "unclean", "paused"]
 """A key of `INTERRUPTIONS`."""
 
@@ -105,13 +106,14 @@ Interruption: TypeAlias = Literal["died", "hung", "unclean", "paused"]
 class Loss:
     """Messages of a topic that are missing between two log times.
 
-    `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
-    may never have been published either), or rosbag2's own count; or they were deleted by request,
-    or since they had `expired` (`retention.topics`). Of a publisher that was `refused`, as its QoS
-    or type did not fit the subscription, it is not known how many there were, and `lost` 0.
-    The unexpected end of a recording is of `EVERY_TOPIC`, from when it last grew to when that was
-    noticed, or while it was `paused`, with a key of `INTERRUPTIONS`. How many messages it cost is
-    not known, and `lost` 0.
+    Attributes:
+        topic: the topic; `EVERY_TOPIC` if a recording ended unexpectedly or was paused.
+        lost: the number of missing messages; 0 if it is not known.
+        by: what shows the loss. `counter`, `stamps`: a counter in the messages, or the cadence of
+            their header stamps (then they may never have been published). `rosbag2`: its own count.
+            `refused`: the QoS or the type of a publisher did not fit. `forgotten`, `expired`: a
+            request or `retention.topics` deleted them. Or a key of `INTERRUPTIONS`: the time from
+            when the recording last grew to when that was noticed, or of the pause.
     """
 
     topic: str
@@ -125,15 +127,15 @@ LOST: Final = JsonLog(LOST_FILE, Loss, most_bytes=2 * MOST_LOST_BYTES)
 
 
 def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
-    """Appends losses. Where the file is too long, joins stretches, then drops the oldest.
+    """Appends losses. In a file that is too long, rows are joined, or the oldest dropped.
 
     Raises:
-        OSError: they cannot be written, and none is appended.
+        OSError: the losses cannot be written, and none is appended.
     """
     if LOST.append(bag_dir, losses) > MOST_LOST_BYTES:
-        with suppress(OSError):  # or with the next ones
+        with suppress(OSError):  # the next call tries again
             rows = LOST.rows(bag_dir)
-            # A publisher that is refused has a row for each split.
+            # A refused publisher has a row for each split.
             refused = _joined(row for row in rows if row.by == "refused")
             rows = [*refused, *(row for row in rows if row.by != "refused")]
             if len(LOST.text(rows)) > MOST_LOST_BYTES // 2:
@@ -142,7 +144,7 @@ def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
 
 
 def _joined(losses: Iterable[Loss]) -> list[Loss]:
-    """Returns losses in order of time; stretches of a topic that lie close together are one."""
+    """Returns losses in order of time; those of a topic that lie close together are one."""
     topics: dict[str, list[Loss]] = {}
     for loss in sorted(losses, key=attrgetter("start")):
         of_topic = topics.setdefault(loss.topic, [])
@@ -156,7 +158,7 @@ def _joined(losses: Iterable[Loss]) -> list[Loss]:
 
 
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
-    """Returns the losses that fall between two log times; none where a file cannot be read."""
+    """Returns the losses between two log times; files that cannot be read have none."""
     expired = EXPIRED.current(bag_dir) or Expired()
     losses = (*(LOST.current(bag_dir) or ()), *expired.gone, *expired.going)
     return [loss for loss in losses if loss.start < stop and start < loss.stop]
@@ -171,9 +173,10 @@ _MOST_EXPIRED: Final = 2000
 class Expired:
     """The messages that `retention.topics` took out of bags.
 
-    `gone` in order of time; stretches of a topic that lie close together are one. `going` are those
-    of the bag at the path `bag` below the bag directory, which was being rewritten; a kill may have
-    left them there.
+    Attributes:
+        gone: in order of time; losses of a topic that lie close together are one.
+        bag: the path, below the bag directory, of the bag that was being rewritten.
+        going: the messages that go from that bag; a kill may have left them there.
     """
 
     gone: tuple[Loss, ...] = ()
@@ -181,9 +184,9 @@ class Expired:
     going: tuple[Loss, ...] = ()
 
     def then(self, bag: str, going: Iterable[Loss]) -> Expired:
-        """Returns it with the messages of a bag that go next."""
+        """Returns the document with the messages that go next, from another bag."""
         going = tuple(going)
-        # What a kill left in the bag goes again.
+        # Messages that a kill left in the bag go again.
         again = {loss.topic for loss in going} if bag == self.bag else set()
         before = [loss for loss in self.going if loss.topic not in again]
         gone = _joined([*self.gone, *before])
@@ -198,19 +201,21 @@ EXPIRED: Final = JsonDocument(EXPIRED_FILE, Expired)
 _MOST_DELETED_BYTES: Final = 1 << 18
 _MOST_SPANS: Final = 1000
 _APART_NS: Final[Ns] = 20 * NS_PER_S
-"""From one split of a recording to the next no message may come for so long."""
+"""The longest time without a message from one split of a recording to the next."""
 _TOUCHING_NS: Final[Ns] = NS_PER_S
-"""From one recording to the next."""
+"""The longest time without a message from one recording to the next."""
 _LONGEST_NS: Final[Ns] = 86_400 * NS_PER_S
-"""The clock was set within a split that lasts for longer: it shows nothing."""
+"""The clock was set within a longer split: its times mean nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Deleted:
-    """What was deleted of a recording (its path below the bag directory); "" for some.
+    """Splits that were deleted.
 
-    `files` are the names of its splits, without the suffix of compression; `spans` the log times
-    (half-open) of their first and last messages, joined.
+    Attributes:
+        recording: their recording's path below the bag directory; "" for those of many recordings.
+        files: their names, without the suffix of compression.
+        spans: their log times (half-open), joined.
     """
 
     recording: str
@@ -222,18 +227,22 @@ DELETED: Final = JsonLog(DELETED_FILE, Deleted, most_bytes=4 * _MOST_DELETED_BYT
 
 
 def deleted_of(recording: str, splits: Iterable[tuple[str, Ns, Ns]]) -> Deleted:
-    """Returns the entry for splits of a recording: each its name, first and last log time."""
-    named = [*splits]
-    spans = [(first, last + 1) for _, first, last in named if 0 <= last - first <= _LONGEST_NS]
-    return Deleted(recording, tuple(name for name, _, _ in named), (*united(spans, _APART_NS),))
+    """Returns the row for splits of a recording: the name, first and last log time of each."""
+    names: list[str] = []
+    spans: list[Span] = []
+    for name, first, last in splits:
+        names.append(name)
+        if 0 <= last - first <= _LONGEST_NS:
+            spans.append((first, last + 1))
+    return Deleted(recording, tuple(names), tuple(united(spans, _APART_NS)))
 
 
 def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
-    """Appends what is about to be deleted; nobody asks about a split that is still there.
+    """Appends splits that are about to be deleted.
 
-    A file that is too long is written again: a row for each recording that is still there, and one
-    for all that have gone, whose files nothing lists any more. Where it cannot be read at that
-    moment, it stays long until the next time.
+    A file that is too long is written again, with one row for each recording that still exists, and
+    one for all others, whose files nothing lists any more. If the file cannot be read, the next
+    call tries again.
 
     Raises:
         OSError: the file cannot be written.
@@ -243,40 +252,45 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     known = _deleted_by_recording(bag_dir)
     if known is None:
         return
-    present = {name for name in known if name and (bag_dir / name).is_dir()}
-    gone = (span for name, row in known.items() if name not in present for span in row.spans)
-    rows, size = [Deleted("", (), (*united(gone, _TOUCHING_NS)[-_MOST_SPANS:],))], 0
-    # The newest recordings come last, so they are the first to stay.
-    for name in reversed([name for name in known if name in present]):
-        size += len(DELETED.text([known[name]]))
+    present: list[Deleted] = []
+    gone: list[Span] = []
+    for name, row in known.items():
+        if name and (bag_dir / name).is_dir():
+            present.append(row)
+        else:
+            gone += row.spans
+    rows = [Deleted("", spans=tuple(united(gone, _TOUCHING_NS)[-_MOST_SPANS:]))]
+    # The newest recordings come last, and stay longest.
+    size = 0
+    for row in reversed(present):
+        size += len(DELETED.text([row]))
         if size > _MOST_DELETED_BYTES // 2:
             break
-        rows.append(known[name])
+        rows.append(row)
     DELETED.replace(bag_dir, rows)
 
 
 @until_changed(DELETED_FILE)
 def _deleted_by_recording(bag_dir: Path) -> Mapping[str, Deleted]:
-    files: dict[str, dict[str, None]] = {}
-    spans: dict[str, list[Span]] = {}
+    files: defaultdict[str, dict[str, None]] = defaultdict(dict)
+    spans: defaultdict[str, list[Span]] = defaultdict(list)
     for row in DELETED.rows(bag_dir):
-        files.setdefault(row.recording, {}).update(dict.fromkeys(row.files))
-        spans.setdefault(row.recording, []).extend(row.spans)
-    return {
-        name: Deleted(
-            name, (*names_of_files,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),)
-        )
-        for name, names_of_files in files.items()
-    }
+        files[row.recording] |= dict.fromkeys(row.files)
+        spans[row.recording] += row.spans
+    by_recording: dict[str, Deleted] = {}
+    for name, names_of_files in files.items():
+        joined = united(spans[name], _APART_NS if name else _TOUCHING_NS)
+        by_recording[name] = Deleted(name, tuple(names_of_files), tuple(joined))
+    return by_recording
 
 
 def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
-    """Returns what was deleted, by recording; nothing where the file cannot be read."""
+    """Returns the deleted splits, by recording; none if the file cannot be read."""
     return _deleted_by_recording(bag_dir) or {}
 
 
 def deleted_spans(bag_dir: Path) -> Sequence[Span]:
-    """Returns the log times (half-open) of all that was deleted, sorted and apart."""
+    """Returns the log times (half-open) of all deleted splits, sorted and apart."""
     spans = (span for row in read_deleted(bag_dir).values() for span in row.spans)
     return tuple(united(spans, _TOUCHING_NS))
 
@@ -286,14 +300,14 @@ def deleted_spans(bag_dir: Path) -> Sequence[Span]:
 
 @dataclass(frozen=True, slots=True)
 class Superseded:
-    """Bags that no longer count, since thinned days have what stays of them.
+    """Bags that no longer count, since thinned days have the messages that stay of them.
 
-    A kill may leave them there. One does count until its day is as it is listed.
+    A kill may leave such a bag. It counts until its day has the listed size and time.
 
     Attributes:
-        days: size (bytes) and mtime (ns) of the file of each day, by its path below the bag
+        days: the size (bytes) and mtime (ns) of each day's file, by its path below the bag
             directory.
-        bags: the day that each is in, by its path below the bag directory.
+        bags: the path of its day for each bag, by the bag's path; both below the bag directory.
     """
 
     days: dict[str, tuple[Count, Int64]] = field(default_factory=dict)
@@ -304,7 +318,7 @@ SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded, most_bytes=MOST_BY
 
 
 def read_superseded(bag_dir: Path) -> Superseded:
-    """Returns the bags that no longer count; none where the file cannot be read."""
+    """Returns the bags that no longer count; none if the file cannot be read."""
     return SUPERSEDED.current(bag_dir) or Superseded()
 
 
@@ -313,15 +327,16 @@ def read_superseded(bag_dir: Path) -> Superseded:
 
 @dataclass(frozen=True, slots=True)
 class Thinned:
-    """What bags showed that days have in place of them, and that is in no message of a day.
+    """What deleted bags showed that no message of a day shows. Times are log times (ns).
 
     Attributes:
-        since: log time from which on it is known; None: of no bag.
-        silences: of each the topic, its first and last log time, for how long (ns) the robot was
-            on in it, and whether it went on.
-        pauses: in which the clock may have been set forward; log times of the messages around.
+        since: the time from which on this is known; None before the first bag.
+        silences: the topic, the first and the last time, for how long the robot was on (ns), and
+            whether the silence went on.
+        pauses: the times of the messages around each pause in which the clock may have been set
+            forward.
         set_back: when the clock was set back, and by how much (ns).
-        left_open: the last log time of each bag that a crash left open.
+        left_open: the last time of each bag that a crash left open.
     """
 
     since: Int64 | None = None
@@ -331,23 +346,24 @@ class Thinned:
     left_open: tuple[Int64, ...] = ()
 
     def from_day(self, day: str) -> Thinned:
-        """Returns what does not end before a day (UTC), as names have it.
+        """Returns what ended on a day or later, and silences that go on and began then.
 
-        Of silences that go on, what does not begin before it.
+        The day is a date in UTC, as `20261120`.
         """
 
-        def stays(last: Ns) -> bool:
-            return utc_day(last) >= day
+        def stays(time: Ns) -> bool:
+            return utc_day(time) >= day
 
+        silences = tuple(
+            (topic, first, last, length, goes_on)
+            for topic, first, last, length, goes_on in self.silences
+            if stays(first if goes_on else last)
+        )
         return Thinned(
             self.since,
-            tuple(
-                silence
-                for silence in self.silences
-                if stays(silence[1] if silence[4] else silence[2])
-            ),
-            tuple(pause for pause in self.pauses if stays(pause[1])),
-            tuple(step for step in self.set_back if stays(step[0])),
+            silences,
+            tuple((start, end) for start, end in self.pauses if stays(end)),
+            tuple((time, by) for time, by in self.set_back if stays(time)),
             tuple(filter(stays, self.left_open)),
         )
 
@@ -356,7 +372,7 @@ THINNED: Final = JsonDocument(THINNED_FILE, Thinned, most_bytes=MOST_BYTES)
 
 
 def read_thinned(bag_dir: Path) -> Thinned:
-    """Returns what is known of bags that days stand for; nothing where the file cannot be read."""
+    """Returns what deleted bags showed; nothing if the file cannot be read."""
     return THINNED.current(bag_dir) or Thinned()
 
 
@@ -365,7 +381,7 @@ def read_thinned(bag_dir: Path) -> Thinned:
 
 @dataclass(frozen=True, slots=True)
 class Leaving:
-    """The days of `memory/` are deleted once the recorder has run for so much longer (s)."""
+    """For how long (s) the recorder must still run before it deletes the days of `memory/`."""
 
     left_s: _Seconds
 
@@ -374,7 +390,7 @@ LEAVING: Final = JsonDocument(LEAVING_FILE, Leaving)
 
 
 def describe_leaving(bag_dir: Path) -> str | None:
-    """Returns a sentence on when `memory/` is deleted; None where it is not to be."""
+    """Returns a sentence on when `memory/` is deleted; None if it stays."""
     leaving = LEAVING.current(bag_dir)
     if leaving is None:
         return None
@@ -391,11 +407,11 @@ _SPARE_RECEIPTS: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """One bag that is in a lake.
+    """A bag that is in a lake.
 
     Attributes:
         bag: its path below the bag directory.
-        size: of its file when it was shipped (bytes).
+        size: the size of its file when it was shipped (bytes).
         at: when it was committed (ns).
     """
 
@@ -411,7 +427,7 @@ SHIPPED: Final = JsonLog(SHIPPED_FILE, Receipt)
 
 
 def read_receipts(bag_dir: Path) -> dict[str, Receipt]:
-    """Returns the newest receipt of each bag, by its path; none where there is no file.
+    """Returns the newest receipt of each bag, by its path; none if there is no file.
 
     Raises:
         OSError: the file cannot be read.
@@ -423,10 +439,10 @@ def read_receipts(bag_dir: Path) -> dict[str, Receipt]:
 
 
 def append_receipts(bag_dir: Path, receipts: Iterable[Receipt]) -> None:
-    """Appends receipts. Those of bags that are gone are dropped where most lines are.
+    """Appends receipts. Once most lines are of bags that are gone, these are dropped.
 
     Raises:
-        OSError: the file cannot be written, as where the bag directory is mounted read-only.
+        OSError: the file cannot be written, as in a bag directory that is mounted read-only.
     """
     SHIPPED.append(bag_dir, receipts)
     rows = SHIPPED.rows(bag_dir)
@@ -444,16 +460,16 @@ def _shipped_sizes(bag_dir: Path) -> Mapping[str, int]:
 
 
 def unshipped(bag_dir: Path, bags: Iterable[tuple[str, int]]) -> frozenset[str]:
-    """Returns those of some bags, given by path and size (bytes), that are in no lake.
+    """Returns the paths of bags that are in no lake; all of them if receipts cannot be read.
 
-    That is all of them where the receipts cannot be read.
+    `bags` are paths below the bag directory, and sizes in bytes.
     """
     sizes = _shipped_sizes(bag_dir) or {}
     return frozenset(path for path, size in bags if sizes.get(path) != size)
 
 
 def is_shipped(receipts: Mapping[str, Receipt], bag: str, size: int) -> bool:
-    """Returns whether a bag of this path and size is in a lake."""
+    """Whether a bag of this path and size (bytes) is in a lake."""
     receipt = receipts.get(bag)
     return receipt is not None and receipt.size == size
 
@@ -472,7 +488,7 @@ class ForgottenBag:
 
 @dataclass(frozen=True, slots=True)
 class Forgetting:
-    """What was deleted between two log times (half-open): messages of topics, or whole bags."""
+    """A deletion between two log times (half-open): of messages of topics, or of whole bags."""
 
     start: Int64
     stop: Int64
@@ -484,11 +500,11 @@ FORGOTTEN: Final = JsonLog(FORGOTTEN_FILE, Forgetting)
 
 
 def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
-    """Returns what was deleted, the oldest first and each once; no line is ever removed.
+    """Returns the deletions, oldest first and each once. No line is ever removed.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: a line is damaged, or the file too large: what was deleted is unknown.
+        ValueError: a line is damaged, or the file is too large: deletions may be unknown.
     """
     forgettings: dict[Forgetting, None] = {}
     for number, row in FORGOTTEN.all_rows(bag_dir):
@@ -503,7 +519,7 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
 
 @dataclass(frozen=True, slots=True)
 class Erased:
-    """How many messages of a topic go, between two log times (half-open)."""
+    """The number of a topic's messages that go between two log times (half-open)."""
 
     topic: str
     start: Int64
@@ -513,16 +529,17 @@ class Erased:
 
 @dataclass(frozen=True, slots=True)
 class Erasure:
-    """Which messages are taken out of bags.
+    """The messages that are being taken out of bags.
 
-    The file is written before the first bag is changed, and removed after the last trace has gone:
-    an erasure that was interrupted can be finished.
+    The file is written before the first bag is changed, and removed after the last trace has gone.
+    So an interrupted erasure can be finished.
 
     Attributes:
-        windows: of log time, half-open, in order and apart.
-        latched: those of the topics whose messages go also where they were published in a window
-            and received again later, as each recording receives them.
-        files: the bags that hold some, by their paths in the bag directory, with all hard links.
+        windows: log times, half-open, in order and apart.
+        latched: topics whose messages also go if they were published in a window and received again
+            later, as each recording receives them.
+        files: the paths, below the bag directory, of the bags that hold such messages, with all
+            hard links.
     """
 
     topics: tuple[str, ...]
@@ -535,23 +552,25 @@ class Erasure:
     def of(
         cls, topics: Iterable[str], windows: Iterable[TimeWindow], latched: Iterable[str]
     ) -> Erasure:
-        """Returns what is to go, of windows in any order that may overlap."""
+        """Returns an erasure; the windows may overlap, and come in any order."""
         spans = united((window.start, window.stop) for window in windows if not window.empty)
         return cls(tuple(sorted(topics)), tuple(spans), tuple(sorted(latched)))
 
     def window_of(self, topic: str, log_time: Ns, publish_time: Ns) -> Span | None:
-        """Returns the window by which a message goes; None where it stays."""
+        """Returns the window by which a message goes; None if it stays."""
         if topic not in self.topics:
             return None
         times = (log_time, publish_time) if topic in self.latched else (log_time,)
         for time in times:
             begun = bisect_right(self.windows, time, key=itemgetter(0))
-            if begun and time < self.windows[begun - 1][1]:
-                return self.windows[begun - 1]
+            if begun:
+                start, stop = self.windows[begun - 1]
+                if time < stop:
+                    return start, stop
         return None
 
     def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
-        """Returns whether a message is deleted."""
+        """Whether a message goes."""
         return self.window_of(topic, log_time, publish_time) is not None
 
 
@@ -565,8 +584,8 @@ class ConditionInterval:
     """An interval in which a topic's condition kept its value, in one recording.
 
     Attributes:
-        holds: whether the condition held; None: a message could not be read.
-        lasts: the topic is latched: it says nothing while nothing changes.
+        holds: whether the condition held; None if a message could not be read.
+        lasts: whether the topic is latched: it is silent while nothing changes.
     """
 
     first: Int64
@@ -576,9 +595,9 @@ class ConditionInterval:
 
 
 class FileStep(StrEnum):
-    """How far a closed file has come."""
+    """The state of a closed file."""
 
-    READ = "read"  # by the rules, and not served yet
+    READ = "read"  # the rules have read it; it is not served yet
     RELEASED = "released"
     UNREADABLE = "unreadable"  # it stays as it is, and is not served
 
@@ -588,11 +607,11 @@ class RecordingScreen:
     """The state of one recording.
 
     Attributes:
-        done: nothing of it is held back any more.
-        start: log time of its first message; None before one was read.
-        end: log time of its last message that was read; None likewise.
-        heard: for each rule the values of its topic, in the order in which they were written.
-        unclear: spans of log time in which the clock was set back, so that no order is known.
+        done: whether no file of it is held back any more.
+        start: the log time of its first message; None before one was read.
+        end: the log time of its last message that was read; None before one was read.
+        heard: for each rule the values of its topic's condition, in the order of writing.
+        unclear: spans of log time in which the clock was set back, so that the order is unknown.
     """
 
     done: StrictBool = False
@@ -605,9 +624,9 @@ class RecordingScreen:
 
 @dataclass(slots=True)
 class Excluded:
-    """A stretch of log time (half-open) of which nothing stays.
+    """A span of log time (half-open) whose messages were excluded.
 
-    `held`: the condition held; else it was not known.
+    `held`: whether the condition held; otherwise it was not known.
     """
 
     start: Int64
@@ -616,18 +635,18 @@ class Excluded:
 
     @property
     def span(self) -> Span:
-        """Its start and its stop (log time, ns)."""
+        """The start and the stop (log time, ns)."""
         return self.start, self.stop
 
 
 @dataclass(slots=True)
 class ScreenState:
-    """All that is known: recordings in the order in which they began, and what was excluded.
+    """The recordings, in the order in which they began, and the excluded spans.
 
-    The recorder lists a recording before anything of it exists. From then on none of its files is
-    served, nor read by what the recorder does with closed bags, until it is listed as released: by
-    then what is to be excluded has been cut out of it. What the rules know is written before a file
-    is cut: what the cut takes cannot be read again.
+    The recorder lists a recording before anything of it exists. From then on no file of it is
+    served, or read by other tasks of the recorder, until the file is listed as released: by then
+    its excluded messages have been cut out. The state of the rules is written before a file is cut,
+    since the messages cannot be read again.
     """
 
     recordings: dict[str, RecordingScreen] = field(default_factory=dict)
@@ -635,15 +654,15 @@ class ScreenState:
 
 
 class Withheld(NamedTuple):
-    """Which files are not served yet.
+    """The files that are not served yet.
 
-    `state` is None where the file cannot be read: then no file of a recording is.
+    `state` is None if `screened.json` cannot be read: then no file of a recording is served.
     """
 
     state: ScreenState | None
 
     def holds(self, recording: str, file: str) -> bool:
-        """Returns whether a file of a recording is held back; both by their names."""
+        """Whether a file of a recording is held back; both by their names."""
         if not self.holds_some(recording):
             return False
         if self.state is None:
@@ -651,7 +670,7 @@ class Withheld(NamedTuple):
         return self.state.recordings[recording].files.get(file) is not FileStep.RELEASED
 
     def holds_some(self, recording: str) -> bool:
-        """Returns whether files of a recording are held back, or may come to be."""
+        """Whether files of a recording are held back, or new ones would be."""
         if self.state is None:
             return has_own_name(recording)
         screen = self.state.recordings.get(recording)
@@ -659,7 +678,6 @@ class Withheld(NamedTuple):
 
 
 NOTHING_WITHHELD: Final = Withheld(ScreenState())
-"""Holds nothing back."""
 SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState, most_bytes=MOST_BYTES)
 
 
@@ -669,15 +687,15 @@ def _screen_state(bag_dir: Path) -> ScreenState | None:
 
 
 def read_withheld(bag_dir: Path) -> Withheld:
-    """Returns what is held back at this moment. Raises nothing."""
+    """Returns the files that are held back at this moment. Raises nothing."""
     return Withheld(_screen_state(bag_dir))
 
 
 def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:
-    """Returns the stretches that were excluded between two log times."""
+    """Returns the excluded spans that overlap a window of log time."""
     state = read_withheld(bag_dir).state
-    stretches = () if state is None else state.excluded
-    return [stretch for stretch in stretches if stretch.start < stop and start < stretch.stop]
+    spans = () if state is None else state.excluded
+    return [span for span in spans if span.start < stop and start < span.stop]
 
 
 # triggers.json
@@ -689,7 +707,7 @@ _Number: TypeAlias = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 class RunRecord:
     """A match that goes on: the log times of its first and its newest message.
 
-    `fired`: the rule has fired for it. `lasts`: a silence of the topic does not end it.
+    `fired`: whether the rule has fired for it. `lasts`: whether it survives a silence of the topic.
     """
 
     first: Int64
@@ -702,8 +720,10 @@ class RunRecord:
 class RuleMoment:
     """A moment of a rule, which its next match may extend; log times, inclusive.
 
-    `matches` is how often the rule fired in it. `known`: it was stored before, perhaps shorter;
-    `stored`: it is stored as it is here.
+    Attributes:
+        matches: how often the rule fired in it.
+        known: whether it was stored before, perhaps shorter.
+        stored: whether it is stored as it is here.
     """
 
     number: _Number
@@ -720,11 +740,11 @@ class RuleRecord:
 
     Attributes:
         refused: how often it fired and no bag was kept.
-        problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
-        always_since: since when it has matched without an end, where that is long; else None.
-        begun: log times at which its moments of the last hour began.
-        newest: its moments that are not stored yet, and the newest one, in order.
-        runs: its matches that go on, by topic.
+        problem: why it may have missed a match, or keeps nothing; None if it works.
+        always_since: since when it has matched without an end; None unless that is long.
+        begun: the log times at which the moments of the last hour began.
+        newest: the moments that are not stored yet, and the newest one, in order.
+        runs: the matches that go on, by topic.
     """
 
     fired: Count = 0
@@ -740,10 +760,12 @@ class RuleRecord:
 
 @dataclass(slots=True)
 class LatchedMark:
-    """How far a latched topic is known: each recording receives its messages again.
+    """How far a latched topic was read: each recording receives its messages again.
 
-    By recording, `published` is the latest publish time and `begun` the first log time; `payload`
-    is a hash of the last message.
+    Attributes:
+        published: the latest publish time, by recording.
+        begun: the first log time, by recording.
+        payload: a hash of the last message.
     """
 
     published: dict[str, Int64] = field(default_factory=dict)
@@ -753,15 +775,14 @@ class LatchedMark:
 
 @dataclass(slots=True)
 class TriggerState:
-    """All that the rules know, as it is written after each look at closed splits.
+    """The state of all rules, written after each look at closed splits.
 
-    A recorder that was killed goes on from here, so what it had found since is found again.
+    A recorder that was killed continues from here, and finds later matches again.
 
     Attributes:
-        rules: by name; those that are not configured any more are dropped.
-        searched: until which log time (excluded) the newest recordings were searched.
-        before: a recording; it and all that were listed before it were searched, or lie before the
-            rules. None if there is none.
+        rules: by name; rules that are not configured any more are dropped.
+        searched: the log time (excluded) up to which each of the newest recordings was searched.
+        before: the newest recording of those that need no search any more; None if there is none.
     """
 
     rules: dict[str, RuleRecord] = field(default_factory=dict)

@@ -1,9 +1,8 @@
 """Spans of tool calls for OpenTelemetry, sent over OTLP (HTTP).
 
 The MCP library starts a span for every request, `tools/call NAME` for a tool, as a child of the
-client's span if the client sends its trace context. Spans are exported once a provider is set. So
-no other span is started for a call; its outcome is added to the library's. No span holds arguments
-or replies.
+client's span if the client sends its trace context. `Traces` adds the outcome of a call to that
+span. No span holds arguments or replies.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from ros2_memory.core.timebase import ns_from_unix
 
 SERVICE: Final = "ros2-memory-server"
 MAX_CHARS: Final = 256
-"""Of a name or a value, since clients choose some of them."""
+"""The longest name or value: clients choose some of them."""
 
 _SHUTDOWN_S: Final = 1.0
 _UNNAMED: Final = "unknown_service"
@@ -50,7 +49,7 @@ class Traces(Observer):
         attributes = _attributes(call)
         span = trace.get_current_span()
         if span.get_span_context().is_valid:
-            # A span that is not sampled is valid too, and the call gets no other.
+            # A span that is not sampled is valid, too: the call gets no other.
             span.set_attributes(attributes)
             return
         end = time.time_ns()
@@ -73,11 +72,10 @@ class Traces(Observer):
 
 
 class BoundedSpanProcessor(SynchronousMultiSpanProcessor):
-    """Passes spans on with names and descriptions of bounded length, as their attributes are.
+    """Passes spans on with names and descriptions of bounded length.
 
-    The MCP library repeats the names of tools and methods that a client sends, however long, in the
-    name and the status of a span. `arguments`: whether spans may hold texts that a client chose,
-    cut short.
+    The MCP library copies the names of tools and methods that a client sends, however long, into
+    the name and the status of a span. `arguments`: whether spans may hold such texts, cut short.
     """
 
     def __init__(self, *, arguments: bool) -> None:
@@ -85,7 +83,7 @@ class BoundedSpanProcessor(SynchronousMultiSpanProcessor):
         self._arguments = arguments
 
     def on_end(self, span: ReadableSpan) -> None:
-        """Passes on what a span may show."""
+        """Passes on a span, without texts that it must not show."""
         attributes = dict(span.attributes or {})
         name, events = span.name, span.events
         description = (span.status.description or "")[:MAX_CHARS] or None
@@ -115,9 +113,12 @@ class BoundedSpanProcessor(SynchronousMultiSpanProcessor):
 def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerProvider:
     """Returns a provider of spans of bounded size, with the environment's sampler and resource.
 
-    `arguments`: whether spans may hold texts that a client chose, such as a tool's name. The
-    service is `ros2-memory-server` unless `OTEL_SERVICE_NAME` or `OTEL_RESOURCE_ATTRIBUTES` name
-    it.
+    The service is `ros2-memory-server` unless `OTEL_SERVICE_NAME` or `OTEL_RESOURCE_ATTRIBUTES`
+    names it.
+
+    Args:
+        processor: exports the spans.
+        arguments: whether spans may hold texts that a client chose, such as a tool's name.
     """
     resource = Resource.create()
     if str(resource.attributes.get(SERVICE_NAME, _UNNAMED)).startswith(_UNNAMED):
@@ -133,10 +134,10 @@ def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerPr
 
 
 def traces_from_environment(*, arguments: bool) -> Traces:
-    """Sets the provider of this process, which receives the MCP library's spans too.
+    """Sets the provider of this process, which receives the MCP library's spans as well.
 
-    The standard `OTEL_*` variables set where and how spans are sent. `arguments` is as for
-    `provider_to`.
+    The standard `OTEL_*` variables set where and how spans are sent. See `provider_to` for
+    `arguments`.
 
     Raises:
         ConfigError: one of the variables is invalid.

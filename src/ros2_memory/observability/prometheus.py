@@ -1,8 +1,7 @@
 """Metrics for Prometheus, in a registry of their own.
 
-Metrics of the process itself are left to what runs the server, which names them as for every other
-program. Labels are bounded: tools of this server or `unknown`, and the outcomes and reasons of the
-error tree.
+The process itself has no metrics here: whatever runs the server measures all its processes. Labels
+are bounded: tools of this server or `unknown`, and the outcomes and reasons of the error tree.
 """
 
 from __future__ import annotations
@@ -37,15 +36,15 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 TIMEOUT_S: Final = 2.0
-"""How long the gauges of the memory may take; after that the counters are shown without them."""
+"""How long measuring the gauges may take; after that a scrape gets the counters alone."""
 BUCKETS_S: Final = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0)
 
 
 class Metrics(Observer):
     """Counts tool calls, and renders the counts with the gauges of the memory.
 
-    Belongs to one event loop. Gauges are measured in a thread, once at a time, even where a scrape
-    that waited for them has timed out: a disk that hangs must not cost a thread with every scrape.
+    Belongs to one event loop. One thread measures the gauges, also for scrapes that come after one
+    timed out: a disk that hangs must not cost a thread with every scrape.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class Metrics(Observer):
         self._timeout_s = timeout_s
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="metrics")
         self._measuring: asyncio.Future[Sequence[Metric]] | None = None
-        # One more series for each counter, of no use in this format.
+        # They are one more series for each counter, of no use in this format.
         disable_created_metrics()  # type: ignore[no-untyped-call]  # has no types
         self._gauges: Sequence[Metric] = ()
         self._registry = CollectorRegistry(auto_describe=False)
@@ -84,13 +83,13 @@ class Metrics(Observer):
         self._durations.labels(call.tool).observe(call.duration_s)
 
     def stop(self) -> None:
-        """Ends the thread when it is done."""
+        """Ends the thread after the present measurement."""
         self._thread.shutdown(wait=False)
 
     async def exposition(self) -> Exposition:
         """Returns all metrics in Prometheus' text format, version 0.0.4.
 
-        The gauges of the memory are missing where measuring them takes longer than the timeout.
+        The gauges of the memory are missing if measuring them takes longer than the timeout.
         """
         gauges: Sequence[Metric] = ()
         with anyio.move_on_after(self._timeout_s), suppress(RuntimeError):  # it has stopped
@@ -102,7 +101,7 @@ class Metrics(Observer):
         return Exposition(CONTENT_TYPE_PLAIN_0_0_4, generate_latest(self._registry))
 
     def collect(self) -> Iterator[Metric]:
-        """Yields what the registry shows besides the counters."""
+        """Yields the version and the gauges of the memory, for the registry."""
         yield InfoMetricFamily(
             "ros2_memory_build", "The version of this server.", {"version": self._version}
         )
@@ -111,17 +110,16 @@ class Metrics(Observer):
 
 @dataclass
 class MemoryGauges:
-    """Measures a memory, and what its recorder writes about itself; for one thread at a time."""
+    """Measures a memory and its recorder. Not for several threads at once."""
 
     _memory: Memory
     _pid: int | None = None
     _restarts: int = 0
 
     def __call__(self) -> list[Metric]:
-        """Returns the metric families of this moment.
+        """Returns the metric families of the last scan and of the heartbeat.
 
-        They are those of the last scan and of the heartbeat: the bag directory is not scanned, and
-        no bag is read. What is not known is left out.
+        The bag directory is not scanned, and no bag is read. Unknown metrics are left out.
         """
         memory = self._memory
         now, snapshot, heartbeat = memory.clock.now(), memory.index.published, memory.heartbeat()

@@ -173,7 +173,7 @@ class Housekeeping:
         if self._limits.keeps_foreign:
             for directory in filter(is_folder, self._bag_dir.iterdir()):
                 # A kill came before its directory was listed: nothing shows whose it is.
-                if self._own.began(directory):
+                if self._own.is_announced(directory):
                     remove_if_empty(directory)
         # A kill may have come between the deletion of a last bag and of its directory.
         directories = (self._bag_dir / name for name in self._own.names())

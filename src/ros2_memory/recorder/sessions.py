@@ -547,7 +547,7 @@ class RecordingSessions:
             # If the directory is missing, another disk may lie there.
             if session.is_listed and session.splits.exists:
                 has_ended = session.state is SessionState.ENDED
-                self.orders.own.note(session.name, session.splits.seen, ended=has_ended)
+                self.orders.own.note_splits(session.name, session.splits.seen, ended=has_ended)
 
     def _observe_session(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
         self._report_output(session)

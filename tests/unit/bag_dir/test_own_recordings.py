@@ -182,7 +182,7 @@ class TestWhatAKillLeaves:
         own.begin(B)
         named_in_heartbeat(tmp_path, A, B)
         for splits in range(10):
-            own.note(A, {f"{A}_{number}.mcap" for number in range(splits)})
+            own.note_splits(A, {f"{A}_{number}.mcap" for number in range(splits)})
         (tmp_path / B).mkdir()  # by the child; then the power goes
         assert claimed(tmp_path).owns(tmp_path / B)
 
@@ -246,7 +246,7 @@ class TestBags:
         files = [embedding(tmp_path / A / f"{A}_{n}.mcap") for n in range(4)]
         files[3].write_bytes(files[3].read_bytes()[:-300])
         own.complete(A)
-        own.note(A, {files[0].name})
+        own.note_splits(A, {files[0].name})
         foreign = embedding(tmp_path / A / f"{A}_9.mcap")
         own = claimed(tmp_path)
         assert all(map(own.owns_bag, files))
