@@ -45,7 +45,7 @@ class Background:
             job()
         except (EpisodicError, OSError) as error:
             self.failed(task, str(error))
-        except Exception as error:  # noqa: BLE001 - or its thread ends silently, and the disk fills
+        except Exception as error:  # noqa: BLE001 - or the thread would end silently
             _log.exception("housekeeping_faulty", task=task)
             self.failed(task, f"a fault in this program ({type(error).__name__}); see its log")
         else:

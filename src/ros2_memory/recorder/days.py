@@ -173,7 +173,6 @@ class MemoryDays:
         self._limits = self.limits or MemoryLimits()
         words = [_words_in(name) for name in self._limits.people]
         self._people = [name for name in words if name.strip()]
-        self._static_topics = frozenset(self.static_topics)
         self._checked_for_minutes: set[Path] = set()
         self._failing = FailingFiles(self.monotonic)
         self._counted_at_s: float | None = None
@@ -267,7 +266,7 @@ class MemoryDays:
         if not days:
             THINNED.remove(self.bag_dir)
             return
-        left = thinned.from_day(days[0].name[: len(utc_day(0))])
+        left = thinned.from_day(days[0].name[:8])  # as `utc_day` returns it
         if left != thinned:
             THINNED.write(self.bag_dir, left)
 
@@ -393,7 +392,7 @@ class MemoryDays:
     def _is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether all messages of a topic stay, since each is valid until the next one."""
         timeline = snapshot.timeline
-        return topic in self._static_topics or (
+        return topic in self.static_topics or (
             timeline.is_transient_state(topic)
             and all(timeline.pace(topic, path).is_rare for path in timeline.recordings(topic))
         )

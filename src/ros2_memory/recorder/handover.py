@@ -43,7 +43,7 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
-from ros2_memory.bag_dir.state_files import NOTHING_WITHHELD, read_withheld
+from ros2_memory.bag_dir.state_files import read_withheld
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
@@ -54,7 +54,7 @@ from ros2_memory.recorder.policies import ClockReading, set_back
 from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
@@ -363,9 +363,10 @@ def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
     if after.state is not Counting.VOID:
         newest = _newest_times(old, reader)
         if newest is not None:
-            cut = newest.published + 1
+            published, logged = newest
+            cut = published + 1
             begun = replace(after, previous=old.name, counts_from=cut)
-            write_handover(new, _with_begin(begun, new, newest.logged, reader))
+            write_handover(new, _with_begin(begun, new, logged, reader))
             write_handover(old, replace(before, counts_until=cut, end=Overlap(None, None, ())))
             return
         counts = replace(after, state=Counting.COUNTS, previous=old.name, compared=True)
@@ -399,13 +400,8 @@ def _with_begin(begun: Handover, new: Path, logged: Ns, reader: BagReader) -> Ha
     )
 
 
-class _Times(NamedTuple):
-    published: Ns
-    logged: Ns
-
-
-def _newest_times(recording: Path, reader: BagReader) -> _Times | None:
-    """Returns the newest times in the last bag of a recording; None if it has no message."""
+def _newest_times(recording: Path, reader: BagReader) -> tuple[Ns, Ns] | None:
+    """Returns the newest publish time and log time in the last bag; None without a message."""
     bags = readable_bags(recording, reader)
     if not bags:
         return None
@@ -415,7 +411,7 @@ def _newest_times(recording: Path, reader: BagReader) -> _Times | None:
         # A publish time of 0 means that there is none.
         published = max(published, record.publish_time or record.log_time)
         logged = max(logged, record.log_time)
-    return None if logged == MIN_NS else _Times(published, logged)
+    return None if logged == MIN_NS else (published, logged)
 
 
 def cut_clock(bag: Path, reader: BagReader) -> CutClock:
@@ -618,23 +614,25 @@ def _weight(copies: Counter[_Copy]) -> tuple[int, int]:
 
 def _with_listed(handover: Handover, corrections: Sequence[_Correction]) -> Handover:
     """Returns a sidecar that lists these messages as well."""
-    counting = [correction for correction in corrections if correction.counts]
-    hidden = [correction for correction in corrections if not correction.counts]
     return replace(
         handover,
-        also_counts=_merged(handover.also_counts, counting),
-        counts_elsewhere=_merged(handover.counts_elsewhere, hidden),
+        also_counts=_merged(handover.also_counts, corrections, counts=True),
+        counts_elsewhere=_merged(handover.counts_elsewhere, corrections, counts=False),
     )
 
 
-def _merged(listed: MessageList, corrections: Iterable[_Correction]) -> MessageList:
-    """Returns the list with these messages added, sorted."""
+def _merged(
+    listed: MessageList, corrections: Sequence[_Correction], *, counts: bool
+) -> MessageList:
+    """Returns the list with those messages added that count, or those that do not, sorted."""
     messages: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
     for file, topics in listed.items():
         for topic, message_ids in topics.items():
             messages[file, topic].update(message_ids)
-    for file, message, _ in corrections:
-        messages[file, message.topic].add(message.message_id)
+    for correction in corrections:
+        if correction.counts is counts:
+            topic, identity = correction.message
+            messages[correction.file, topic].add(identity)
     merged: MessageList = {}
     for file, topic in sorted(messages):
         merged.setdefault(file, {})[topic] = tuple(sorted(messages[file, topic]))
@@ -666,7 +664,7 @@ def readable_bags(
         BagUnreachableError: the disk fails.
     """
     summaries: dict[str, BagSummary] = {}
-    withheld = read_withheld(recording.parent) if only_closed else NOTHING_WITHHELD
+    withheld = read_withheld(recording.parent)
     for path in _bag_files(recording, reader):
         try:
             if only_closed and (

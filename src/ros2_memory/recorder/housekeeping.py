@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
@@ -69,6 +69,7 @@ class HouseStatus(NamedTuple):
     failing_rules: tuple[str, ...] = ()
 
 
+@dataclass(eq=False, repr=False)
 class Housekeeping:
     """Repairs, saves and deletes in one bag directory, which its caller has locked.
 
@@ -89,64 +90,57 @@ class Housekeeping:
         cutter: cuts topics with a shorter life out of bags; None if no topic has one.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        reader: BagReader,
-        writer: BagWriter,
-        clock: Clock,
-        limits: RetentionLimits,
-        *,
-        is_synchronised: Callable[[], bool],
-        split_duration_s: float,
-        own: OwnRecordings,
-        moments_bytes: int = 0,
-        rule_bytes: Mapping[str, int] = MappingProxyType({}),
-        watch: Callable[[MomentKeeper], Triggers] | None = None,
-        screening: Screening | None = None,
-        static_topics: Collection[str] = (),
-        grace_s: float = 0.0,
-        measure_free: Callable[[Path], int] = free_bytes,
-        monotonic: Callable[[], float] = time.monotonic,
-        memory: MemoryDays | None = None,
-        cutter: TopicCutter | None = None,
-        background: Background,
-    ) -> None:
-        self._bag_dir = bag_dir
-        self._background = background
+    bag_dir: Path
+    reader: BagReader
+    writer: BagWriter
+    clock: Clock
+    limits: RetentionLimits
+    _: KW_ONLY
+    is_synchronised: Callable[[], bool]
+    split_duration_s: float
+    own: OwnRecordings
+    moments_bytes: int = 0
+    rule_bytes: Mapping[str, int] = field(default_factory=dict)
+    watch: Callable[[MomentKeeper], Triggers] | None = None
+    screening: Screening | None = None
+    static_topics: Collection[str] = ()
+    grace_s: float = 0.0
+    measure_free: Callable[[Path], int] = free_bytes
+    monotonic: Callable[[], float] = time.monotonic
+    memory: MemoryDays | None = None
+    cutter: TopicCutter | None = None
+    background: Background
+
+    def __post_init__(self) -> None:
+        bag_dir, reader, writer, own = self.bag_dir, self.reader, self.writer, self.own
+        static_topics, monotonic = self.static_topics, self.monotonic
         self._recorded = RecordedTime(bag_dir)
-        self._own = own
-        self._limits = limits
         self._collector = GarbageCollector(
             bag_dir,
-            limits,
-            Carrier(bag_dir, reader, writer, static_topics, self._own, monotonic=monotonic),
-            self._own,
+            self.limits,
+            Carrier(bag_dir, reader, writer, static_topics, own, monotonic=monotonic),
+            own,
             recorded=self._recorded,
-            is_synchronised=is_synchronised,
+            is_synchronised=self.is_synchronised,
             static_topics=static_topics,
-            grace_s=grace_s,
-            measure_free=measure_free,
+            grace_s=self.grace_s,
+            measure_free=self.measure_free,
             monotonic=monotonic,
-            memory=memory if memory is not None and memory.keeps else None,
-            cutter=cutter,
+            memory=self.memory if self.memory is not None and self.memory.keeps else None,
+            cutter=self.cutter,
         )
-        self._memory = memory
         self._index = IndexManager(
             bag_dir,
             reader,
-            clock,
+            self.clock,
             refresh_s=REFRESH_S,
-            split_duration_s=split_duration_s,
+            split_duration_s=self.split_duration_s,
         )
-        self._moments = MomentKeeper(bag_dir, moments_bytes, clock, self._own, rule_bytes)
-        self._triggers = None if watch is None else watch(self._moments)
-        self._screening = screening
+        self._moments = MomentKeeper(bag_dir, self.moments_bytes, self.clock, own, self.rule_bytes)
+        self._triggers = None if self.watch is None else self.watch(self._moments)
         self._repairer = Repairer(reader, writer, bag_dir)
         self._links = HardLinks(bag_dir)
-        self._measure_free = measure_free
-        self._clock = clock
-        self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
+        self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * self.split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
         self._out_of_reach = False
         self._collected = Collected()
@@ -161,7 +155,7 @@ class Housekeeping:
         Raises:
             OSError: the bag directory or the list of own recordings cannot be read.
         """
-        heartbeat, now = read_heartbeat(self._bag_dir).heartbeat, self._clock.now()
+        heartbeat, now = read_heartbeat(self.bag_dir).heartbeat, self.clock.now()
         if heartbeat is not None and heartbeat.state is not RecorderState.STOPPED:
             last_alive = min(heartbeat.updated, now)
             if self._triggers is not None:
@@ -170,20 +164,20 @@ class Housekeeping:
                 self._note_interruption(last_alive, now, "unclean")
             elif heartbeat.state is RecorderState.PAUSED:
                 self._note_interruption(min(heartbeat.since, now), now, "paused")
-        if self._limits.keeps_foreign:
-            for directory in filter(is_folder, self._bag_dir.iterdir()):
+        if self.limits.keeps_foreign:
+            for directory in filter(is_folder, self.bag_dir.iterdir()):
                 # A kill came before its directory was listed: nothing shows whose it is.
-                if self._own.is_announced(directory):
+                if self.own.is_announced(directory):
                     remove_if_empty(directory)
         # A kill may have come between the deletion of a last bag and of its directory.
-        directories = (self._bag_dir / name for name in self._own.names())
-        self._collector.emptied.update(filter(self._own.owns, directories))
+        directories = (self.bag_dir / name for name in self.own.names())
+        self._collector.emptied.update(filter(self.own.owns, directories))
         self._clear_memory()
 
     def _clear_memory(self) -> None:
         try:
-            if self._memory is not None:
-                self._memory.clear()
+            if self.memory is not None:
+                self.memory.clear()
         except OSError as error:
             _log.error("memory_not_limited", reason=error.strerror or str(error))
 
@@ -193,7 +187,7 @@ class Housekeeping:
 
     def is_making_room(self) -> bool:
         """Whether room is being made."""
-        return self._background.is_under_way("make_room")
+        return self.background.is_under_way("make_room")
 
     def apply(self) -> None:
         """Begins to delete bags that exceed the limits, and to repair unfinished files."""
@@ -205,11 +199,11 @@ class Housekeeping:
 
     def wait(self) -> None:
         """Waits until nothing is under way."""
-        self._background.wait(None)
+        self.background.wait(None)
 
     def _add_unless_under_way(self, task: str, job: Callable[[], None]) -> None:
-        if not self._background.is_under_way(task):
-            self._background.add(task, job)
+        if not self.background.is_under_way(task):
+            self.background.add(task, job)
 
     def _delete_for_room(self, free_bytes_wanted: int) -> None:
         most_free = self._collect_and_report(free_bytes_wanted).most_free
@@ -256,7 +250,7 @@ class Housekeeping:
             first: when the recording last grew (wall time).
             how: a key of `INTERRUPTIONS`.
         """
-        now = self._clock.now()
+        now = self.clock.now()
         if self._triggers is not None and how != "paused":
             self._triggers.note_restart(now, now)
         self._note_interruption(min(first, now), now, how)
@@ -271,7 +265,7 @@ class Housekeeping:
         with self._lock:
             try:
                 if self._unwritten:
-                    append_losses(self._bag_dir, self._unwritten)
+                    append_losses(self.bag_dir, self._unwritten)
             except OSError as error:
                 _log.warning("losses_not_written", reason=error.strerror or str(error))
             else:
@@ -283,44 +277,44 @@ class Housekeeping:
         Raises:
             RecorderError: the recording cannot be held back.
         """
-        if self._screening is not None:
-            self._screening.announce(recording)
+        if self.screening is not None:
+            self.screening.announce(recording)
 
     def screen(self, live: Collection[str]) -> None:
         """Begins to screen closed splits. Call it from the thread that begins recordings.
 
         `live` names the recordings that are being written.
         """
-        if self._screening is None or self._background.is_under_way("screen"):
+        if self.screening is None or self.background.is_under_way("screen"):
             return
         # Planned now: `live` may be out of date when the thread begins.
         try:
-            self._background.add("screen", self._screening.plan(live))
+            self.background.add("screen", self.screening.plan(live))
         except (EpisodicError, OSError) as error:
-            self._background.failed("screen", str(error))
+            self.background.failed("screen", str(error))
 
     def finish(self) -> None:
         """Screens some more splits of each recording, and waits for all work that is under way."""
         for _ in range(_LAST_STEPS):
-            self._background.add("screen", self._screen_rest)
-        self._background.wait()
+            self.background.add("screen", self._screen_rest)
+        self.background.wait()
 
     def _screen_rest(self) -> None:
-        if self._screening is not None:
-            self._screening.plan(())()
+        if self.screening is not None:
+            self.screening.plan(())()
 
     def status(self) -> HouseStatus:
         """Returns the results of the last pass, and what is held back at this moment."""
-        if self._screening is None:
+        if self.screening is None:
             return self._status
         return self._status._replace(
-            held_back=self._screening.problem(),
-            failing_rules=self._screening.failing_rules(),
+            held_back=self.screening.problem(),
+            failing_rules=self.screening.failing_rules(),
         )
 
     def excluded_latched(self) -> frozenset[str]:
         """Returns the latched topics whose newest message is excluded."""
-        return frozenset() if self._screening is None else self._screening.excluded_latched()
+        return frozenset() if self.screening is None else self.screening.excluded_latched()
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
@@ -329,7 +323,7 @@ class Housekeeping:
 
         Call it several times a second, with no recordings while nothing is recorded.
         """
-        self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
+        self._recorded.note(recordings, bytes_written, monotonic_s, self.clock.now())
 
     def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
@@ -369,7 +363,7 @@ class Housekeeping:
     def _describe_held(self, bags: int) -> str | None:
         if not bags:
             return None
-        limit = f"{self._limits.max_age_ns / (3600 * NS_PER_S):g} h"
+        limit = f"{self.limits.max_age_ns / (3600 * NS_PER_S):g} h"
         return (
             f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
             "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
@@ -380,7 +374,7 @@ class Housekeeping:
     def _collect(self, free_bytes_wanted: int | None) -> Collected:
         with self._index.undisturbed(patrolling=True) as snapshot:
             heartbeat = self._index.heartbeat()
-            live = heartbeat.recordings if heartbeat else self._own.in_order()[-_WRITTEN_AT_ONCE:]
+            live = heartbeat.recordings if heartbeat else self.own.in_order()[-_WRITTEN_AT_ONCE:]
             known = self._index.known_bags(live, snapshot)
             needed = frozenset[str]()
             try:
@@ -410,7 +404,7 @@ class Housekeeping:
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
-        total, most = collected.total_bytes, self._limits.max_total_bytes
+        total, most = collected.total_bytes, self.limits.max_total_bytes
         if before.total_bytes <= most < total:
             state, saved = collected.state_bytes, collected.saved_bytes
             _log.error(
@@ -442,7 +436,7 @@ class Housekeeping:
         for path, status in files:
             size = status.st_size
             is_small = size <= MOST_REPAIRED_BYTES
-            if is_small and self._measure_free(self._bag_dir) < size:
+            if is_small and self.measure_free(self.bag_dir) < size:
                 continue  # until there is room for the new file beside it
             if (status.st_dev, status.st_ino) in opened:
                 continue
@@ -463,7 +457,7 @@ class Housekeeping:
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
         paths += [aside.path for aside in snapshot.active if aside.reason == HELD_BACK]
-        named = {self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings}
+        named = {self.bag_dir / name for name in read_heartbeat(self.bag_dir).recordings}
         for path in paths:
             try:
                 status = path.lstat()
@@ -481,9 +475,9 @@ class Housekeeping:
 
         The heartbeat does not name what other programs write.
         """
-        if self._limits.keeps_foreign:
-            return self._own.owns_bag(path)
-        unchanged_for = abs(self._clock.now() - status.st_mtime_ns)
+        if self.limits.keeps_foreign:
+            return self.own.owns_bag(path)
+        unchanged_for = abs(self.clock.now() - status.st_mtime_ns)
         return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)
 
     def _repair_file(self, path: Path) -> bool:
@@ -501,7 +495,7 @@ class Housekeeping:
         if repaired.rewritten is None:
             _log.warning("empty_split_removed", path=str(path))
             # In case all splits of the recording were empty.
-            remove_emptied(self._bag_dir, path.parent)
+            remove_emptied(self.bag_dir, path.parent)
             return True
         _log.warning(
             "bag_repaired",

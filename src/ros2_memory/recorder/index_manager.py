@@ -12,7 +12,7 @@ import threading
 import time
 from contextlib import contextmanager, nullcontext
 from copy import copy
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import read_handover
@@ -39,6 +39,7 @@ SPLITS_OF_PATIENCE: Final = 3
 _log = get_logger(__name__)
 
 
+@dataclass(eq=False, repr=False)
 class IndexManager:
     """Keeps the snapshot of one bag directory. Thread-safe.
 
@@ -58,32 +59,24 @@ class IndexManager:
         published: the newest snapshot, however old; None before the first scan has ended.
     """
 
-    def __init__(
-        self,
-        bag_dir: Path,
-        reader: BagReader,
-        clock: Clock,
-        *,
-        refresh_s: float,
-        split_duration_s: float,
-        known: Callable[[], Iterable[BagRows]] = list,
-        include_active: bool = False,
-        trusts_mtime: bool = True,
-        only: str | None = None,
-        setting: str = BAG_DIR_SETTING,
-        large: LargeReads | None = None,
-    ) -> None:
-        self._large = large or LargeReads()
-        self._trusts_mtime = trusts_mtime
-        self.bag_dir = bag_dir
-        self._reader = reader
-        self._known = known
-        self._setting = setting
-        self._only = () if only is None else (only,)
-        self._include_active = include_active
-        self._clock = clock
-        self._refresh: Ns = ns_from_unix(refresh_s)
-        self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
+    bag_dir: Path
+    reader: BagReader
+    clock: Clock
+    _: KW_ONLY
+    refresh_s: float
+    split_duration_s: float
+    known: Callable[[], Iterable[BagRows]] = list
+    include_active: bool = False
+    trusts_mtime: bool = True
+    only: str | None = None
+    setting: str = BAG_DIR_SETTING
+    large: LargeReads | None = None
+
+    def __post_init__(self) -> None:
+        self._large = self.large or LargeReads()
+        self._only = () if self.only is None else (self.only,)
+        self._refresh: Ns = ns_from_unix(self.refresh_s)
+        self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * self.split_duration_s)
         self._lock = threading.Lock()
         self.published: Snapshot | None = None
         self._table = self._new_table()
@@ -91,9 +84,9 @@ class IndexManager:
     def _new_table(self) -> BagTable:
         return BagTable(
             self.bag_dir,
-            self._reader,
-            known=self._known,
-            setting=self._setting,
+            self.reader,
+            known=self.known,
+            setting=self.setting,
             only=self._only,
         )
 
@@ -107,7 +100,7 @@ class IndexManager:
         current = self.published
         if (
             current is not None
-            and 0 <= self._clock.now() - current.scanned_at < self._refresh
+            and 0 <= self.clock.now() - current.scanned_at < self._refresh
             and (reach is None or (current.latest is not None and reach <= current.latest))
         ):
             return current
@@ -136,7 +129,7 @@ class IndexManager:
         """Returns an index of one recording, which reads no bag that this index has read."""
         alone = copy(self)
         alone._lock, alone.published = threading.Lock(), None
-        alone._known = lambda: [part.bags for part in self.snapshot().timeline.recorded_segments]
+        alone.known = lambda: [part.bags for part in self.snapshot().timeline.recorded_segments]
         alone._only = (*self._only, recording)
         alone._table = alone._new_table()
         return alone
@@ -180,7 +173,7 @@ class IndexManager:
         return self.published
 
     def _context(self) -> ScanContext:
-        now, heartbeat = self._clock.now(), self.heartbeat()
+        now, heartbeat = self.clock.now(), self.heartbeat()
         open_recordings = None
         if heartbeat is not None and heartbeat.is_live(now):
             open_recordings = frozenset(heartbeat.recordings)
@@ -189,8 +182,8 @@ class IndexManager:
             now,
             self._three_splits,
             open_recordings,
-            self._include_active,
-            self._trusts_mtime,
+            self.include_active,
+            self.trusts_mtime,
         )
 
     def _report(

@@ -439,9 +439,9 @@ class SplitMeasure(NamedTuple):
         arrivals: all topics that have a message.
     """
 
-    flows: Mapping[str, TopicFlow]
-    progress: Mapping[str, Progress]
-    arrivals: Mapping[str, Arrival]
+    flows: dict[str, TopicFlow]
+    progress: dict[str, Progress]
+    arrivals: dict[str, Arrival]
 
     @property
     def start(self) -> Ns:
@@ -503,20 +503,19 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         window = TimeWindow.before(summary.end, TAIL_NS)
     for record in reader.records(path, [*topics], window):
         topics[record.channel.topic].add(record)
-    flows: dict[str, TopicFlow] = {}
-    progress: dict[str, Progress] = {}
-    arrivals: dict[str, Arrival] = {}
+    split = SplitMeasure({}, {}, {})
     for topic, messages in topics.items():
         if messages.arrival is None:
             continue
-        arrivals[topic] = messages.arrival
+        split.arrivals[topic] = messages.arrival
         offered = offered_by_all(messages.offered_texts)
         if offered is None:
             continue
-        flows[topic] = TopicFlow(offered, largest_burst(messages.published), messages.largest)
+        burst = largest_burst(messages.published)
+        split.flows[topic] = TopicFlow(offered, burst, messages.largest)
         if is_whole and messages.value_reader is not None and offered.publishers == 1:
-            progress[topic] = Progress(messages.value_reader.kind, messages.positions)
-    return SplitMeasure(flows, progress, arrivals)
+            split.progress[topic] = Progress(messages.value_reader.kind, messages.positions)
+    return split
 
 
 def largest_burst(published: Sequence[Ns]) -> int:

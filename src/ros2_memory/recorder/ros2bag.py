@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import write_durably
@@ -44,6 +45,7 @@ LOGS_KEPT: Final = 20
 _log = get_logger(__name__)
 
 
+@dataclass(eq=False, repr=False)
 class Ros2BagRecorder(Recorder):
     """Records with `ros2 bag record`, and keeps it recording while `tick` is called.
 
@@ -55,71 +57,65 @@ class Ros2BagRecorder(Recorder):
         excluding: the topics that rules of `recording.exclude_when` read, each with its rule.
     """
 
-    def __init__(
-        self,
-        reader: BagReader,
-        *,
-        bag_dir: Path,
-        topics_file: Path,
-        split_duration_s: int,
-        session_duration_s: float,
-        use_sim_time: bool,
-        queue_mb: int,
-        min_free_gb: float,
-        setup_files: Sequence[Path],
-        latched_topics: Sequence[str],
-        repeat_latched: Sequence[str],
-        required: Sequence[Required],
-        chunk_bytes: int,
-        housekeeper: Housekeeping,
-        own: OwnRecordings,
-        keep_open: Collection[int],
-        excluding: Mapping[str, str],
-        background: Background,
-    ) -> None:
-        self._bag_dir = bag_dir.absolute()
-        self._split_duration_s = split_duration_s
-        self._setup_files = tuple(setup_files)
-        self._repeat_latched = tuple(repeat_latched)
-        self._chunk_bytes = chunk_bytes
-        self._keep_open = tuple(keep_open)
+    reader: BagReader
+    _: KW_ONLY
+    bag_dir: Path
+    topics_file: Path
+    split_duration_s: int
+    session_duration_s: float
+    use_sim_time: bool
+    queue_mb: int
+    min_free_gb: float
+    setup_files: Sequence[Path]
+    latched_topics: Sequence[str]
+    repeat_latched: Sequence[str]
+    required: Sequence[Required]
+    chunk_bytes: int
+    housekeeper: Housekeeping
+    own: OwnRecordings
+    keep_open: Collection[int]
+    excluding: Mapping[str, str]
+    background: Background
+
+    def __post_init__(self) -> None:
+        self._bag_dir = self.bag_dir.absolute()
         self._checked = False
-        topics = (entry.topic for entry in required if "*" not in entry.topic)
+        topics = (entry.topic for entry in self.required if "*" not in entry.topic)
         by_setting = dict.fromkeys(topics, "recording.required")
-        self._topics = TopicsFile(topics_file, {**by_setting, **excluding})
+        self._topics = TopicsFile(self.topics_file, {**by_setting, **self.excluding})
         self._ros = Installation("ros2", {}, frozenset())
-        self._queue_bytes = queue_mb * 2**20
+        self._queue_bytes = self.queue_mb * 2**20
         self._reception = Reception(
-            reader,
+            self.reader,
             self._queue_bytes,
             bag_dir=self._bag_dir,
-            latched=latched_topics,
+            latched=self.latched_topics,
             # Each new recording would receive the latched log of an excluded time again.
-            volatile={ROSOUT} - excluding.keys() if excluding else (),
-            background=background,
+            volatile={ROSOUT} - self.excluding.keys() if self.excluding else (),
+            background=self.background,
         )
-        self._orders = Orders(
+        orders = Orders(
             bag_dir=self._bag_dir,
-            split_duration_s=split_duration_s,
-            session_duration_s=session_duration_s,
-            min_free_bytes=round(min_free_gb * GB),
+            split_duration_s=self.split_duration_s,
+            session_duration_s=self.session_duration_s,
+            min_free_bytes=round(self.min_free_gb * GB),
             start_child=self._start_child,
-            reader=reader,
+            reader=self.reader,
             clock=WallClock(),
             topics=self._topics,
-            own=own,
+            own=self.own,
             reception=self._reception,
-            background=background,
-            required=required,
-            simulated=use_sim_time,
+            background=self.background,
+            required=self.required,
+            simulated=self.use_sim_time,
             advice=lambda: advice_on_silence(self._ros.env),
         )
-        self._supervisor = Supervisor(self._orders, housekeeper)
+        self._supervisor = Supervisor(orders, self.housekeeper)
 
     def check(self) -> None:
         """Reads the list of topics, and finds `ros2`, its environment and its options."""
         self._topics.load()
-        self._ros = find_installation(self._setup_files, self._bag_dir / ROS_LOG_DIR)
+        self._ros = find_installation(self.setup_files, self._bag_dir / ROS_LOG_DIR)
         services = self._topics.selection.services
         if services and SERVICES not in self._ros.options:
             _log.warning(
@@ -155,7 +151,7 @@ class Ros2BagRecorder(Recorder):
         qos_file, storage_file = self._bag_dir / QOS_FILE, self._bag_dir / STORAGE_FILE
         try:
             write_durably(qos_file, self._reception.overrides(name))
-            write_durably(storage_file, storage_config(self._chunk_bytes))
+            write_durably(storage_file, storage_config(self.chunk_bytes))
         except OSError as error:
             raise RecorderError(
                 f"{error.filename} cannot be written: {error.strerror}; the recorder must be able "
@@ -166,16 +162,16 @@ class Ros2BagRecorder(Recorder):
             ros2=self._ros.ros2,
             directory=directory,
             topics=self._topics.selection,
-            split_duration_s=self._split_duration_s,
+            split_duration_s=self.split_duration_s,
             qos_file=qos_file,
             storage_file=storage_file,
             node_name=node_name(name),
             cache_bytes=self._queue_bytes,
-            use_sim_time=self._orders.simulated,
-            repeat_latched=self._repeat_latched,
+            use_sim_time=self.use_sim_time,
+            repeat_latched=self.repeat_latched,
             known_options=self._ros.options,
         )
-        return Child.start(argv, self._ros.env, keep_open=self._keep_open)
+        return Child.start(argv, self._ros.env, keep_open=self.keep_open)
 
 
 def _delete_old_logs(log_dir: Path) -> None:

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
-    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
@@ -67,10 +66,10 @@ class SplitChanges(NamedTuple):
         faults: sentences on what cannot be read.
     """
 
-    closed: tuple[str, ...] = ()
-    empty: tuple[str, ...] = ()
+    closed: Sequence[str] = ()
+    empty: Sequence[str] = ()
     gone: bool = False
-    faults: tuple[str, ...] = ()
+    faults: Sequence[str] = ()
 
 
 @dataclass(slots=True)
@@ -112,8 +111,7 @@ class Splits:
             split = self._files.setdefault(name, _Split(now_s))
             split.size = max(split.size, size)
         closed, faults = self._find_closed(sizes)
-        empty = self._find_empty(sizes, now_s)
-        return SplitChanges(tuple(closed), tuple(empty), faults=tuple(faults))
+        return SplitChanges(closed, self._find_empty(sizes, now_s), faults=faults)
 
     @property
     def bytes_written(self) -> int:
@@ -133,7 +131,7 @@ class Splits:
     def names(self) -> frozenset[str]:
         """Returns the names of all splits, those observed and those present now."""
         with suppress(OSError):
-            return frozenset(self._files) | frozenset(self._sizes())
+            return frozenset(self._files).union(self._sizes())
         return frozenset(self._files)
 
     def _sizes(self) -> dict[str, int]:
@@ -156,7 +154,10 @@ class Splits:
                 if self.reader.closing(path) is Closing.CLOSED:
                     split.closed = True
                     closed.append(name)
-                    self._add_content(split, self.reader.summarize(path))
+                    summary = self.reader.summarize(path)
+                    split.start = MAX_NS if summary.empty else summary.start
+                    self.received.update(topic.topic for topic in summary.topics)
+                    self.messages += summary.count
             except BagError as error:
                 if split.closed:  # an open file need not be readable yet
                     faults.append(str(error))
@@ -164,12 +165,6 @@ class Splits:
                 faults.append(f"{path}: {error.strerror or error}")
         closed.sort(key=lambda name: (self._files[name].start, name))
         return closed, faults
-
-    def _add_content(self, split: _Split, summary: BagSummary) -> None:
-        if not summary.empty:
-            split.start = summary.start
-        self.received.update(topic.topic for topic in summary.topics)
-        self.messages += summary.count
 
     def _find_empty(self, sizes: Mapping[str, int], now_s: float) -> list[str]:
         """Returns the splits that are newly known to stay empty."""
@@ -592,7 +587,7 @@ class RecordingSessions:
                 reception.never_received(session.name, line.topic)
 
     def _flush_later(
-        self, session: RecordingSession, directory: Path, names: tuple[str, ...]
+        self, session: RecordingSession, directory: Path, names: Sequence[str]
     ) -> None:
         def flush() -> None:
             for fault in flush_bags(directory, names):

@@ -179,7 +179,7 @@ class TopicWatch:
         written_until_s = sessions.closed_s if current.splits.bytes_written else now_s - split_s
         idle_s = max(0.0, now_s - sessions.grew_s - IDLE_SPLITS * split_s)
         silent, rates_hz = self._orders.reception.arrivals(ns_from_unix(idle_s))
-        return Shortfall(
+        shortfall = Shortfall(
             unknown_types=tuple(sorted(unknown)),
             unheard=tuple(
                 topic
@@ -188,24 +188,23 @@ class TopicWatch:
                 if "/_" not in topic and written_until_s - self._offered_since_s[topic] >= UNHEARD_S
             ),
             fell_silent=tuple(sorted(silent & offered)),
-            required_missing=(
-                tuple(self._unmet_requirements(now_s, sessions.heard, unknown, silent, rates_hz))
-                if now_s - self._began_s >= UNHEARD_S
-                else ()
-            ),
         )
+        if now_s - self._began_s < UNHEARD_S:
+            return shortfall
+        unmet = self._unmet_requirements(shortfall, now_s, sessions.heard, rates_hz)
+        return shortfall._replace(required_missing=tuple(unmet))
 
     def _unmet_requirements(
         self,
+        shortfall: Shortfall,
         now_s: float,
         heard: Collection[str],
-        unknown: Collection[str],
-        silent: Collection[str],
         rates_hz: Mapping[str, float],
     ) -> Iterator[str]:
         """Yields a sentence for each topic that is not recorded as `recording.required` asks."""
         for required in self._orders.required:
             entry = TopicSelection((required.topic,))
+            unknown = shortfall.unknown_types
             matching = filter(entry.matches, {*self._offered_since_s, *heard, *unknown})
             for topic in sorted({*matching, *entry.exact}) or [required.topic]:
                 rate = rates_hz.get(topic, 0.0)
@@ -215,7 +214,7 @@ class TopicWatch:
                     yield f"{topic}: no publisher offers it"
                 elif topic not in heard:
                     yield f"{topic}: it is offered, and nothing has come"
-                elif topic in silent:
+                elif topic in shortfall.fell_silent:
                     yield f"{topic}: it came regularly, and is silent"
                 elif now_s - self._offered_since_s[topic] >= UNHEARD_S and rate < required.min_hz:
                     yield f"{topic}: {rate:.3g} Hz, and {required.min_hz:g} are required"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
@@ -72,6 +72,7 @@ class _Task(NamedTuple):
     needs_disk: bool = False
 
 
+@dataclass(eq=False, repr=False)
 class Supervisor:
     """Keeps one recording going, two during a handover.
 
@@ -85,24 +86,20 @@ class Supervisor:
         stopped: whether `start` was not called yet, or `stop` was.
     """
 
-    def __init__(
-        self,
-        orders: Orders,
-        housekeeper: Housekeeping,
-        *,
-        monotonic: Callable[[], float] = time.monotonic,
-        free_bytes_of: Callable[[Path], int] = free_bytes,
-        device: Callable[[Path], int] = device_of,
-        keep_alive: Callable[[], None] | None = None,
-    ) -> None:
-        self._orders = orders
+    orders: Orders
+    housekeeper: Housekeeping
+    _: KW_ONLY
+    monotonic: Callable[[], float] = time.monotonic
+    free_bytes_of: Callable[[Path], int] = free_bytes
+    device: Callable[[Path], int] = device_of
+    keep_alive: Callable[[], None] | None = None
+
+    def __post_init__(self) -> None:
+        orders, housekeeper = self.orders, self.housekeeper
         self._bag_dir = orders.bag_dir
         self._reception = orders.reception
-        self._monotonic = monotonic
-        self._free_bytes_of = free_bytes_of
-        self._keep_alive = keep_alive or Watchdog().keep_alive
-        self._disk = HomeDisk(orders.bag_dir, device)
-        self._housekeeper = housekeeper
+        self._keep_alive = self.keep_alive or Watchdog().keep_alive
+        self._disk = HomeDisk(orders.bag_dir, self.device)
         self._events = EventLog(orders.clock)
         self._sessions = RecordingSessions(
             orders, self._announce, self._add_interruption, self._events
@@ -195,12 +192,12 @@ class Supervisor:
         self._paused = False
         if not self._disk.away:
             if self._paused_at is not None:
-                self._housekeeper.note_restart(self._paused_at, "paused")
+                self.housekeeper.note_restart(self._paused_at, "paused")
                 self._paused_at = None
-            self._housekeeper.finish()
+            self.housekeeper.finish()
             # Splits that were held back are compared only now.
             self._sessions.settle_handovers()
-        self._orders.background.wait()
+        self.orders.background.wait()
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:
@@ -256,7 +253,7 @@ class Supervisor:
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes bags, pauses or resumes recording, by the free space on the disk."""
-        least, free = self._orders.min_free_bytes, self._free_bytes()
+        least, free = self.orders.min_free_bytes, self._free_bytes()
         enough = round(least * RESUME_FACTOR)
         if free is None:
             return
@@ -267,16 +264,16 @@ class Supervisor:
                 self._events.info("recording_resumed", free_bytes=free)
             elif self._is_due("room", QUIET_RETENTION_S, now):
                 # Bags that were being written when recording was paused may be deleted by now.
-                self._housekeeper.make_room(enough)
+                self.housekeeper.make_room(enough)
             return
         if free < least and not self._room_requested:
-            self._housekeeper.make_room(enough)
+            self.housekeeper.make_room(enough)
             free = self._free_bytes()
             if free is None:
                 return
         self._room_requested = free < least
         # Recording waits for room that is being made while half of it is free.
-        is_waiting = self._housekeeper.is_making_room() and free >= least // 2
+        is_waiting = self.housekeeper.is_making_room() and free >= least // 2
         if free < least and not is_waiting:
             self._paused = True
             self._end_for_now(now)
@@ -311,7 +308,7 @@ class Supervisor:
         )
         # Every split repeats the list of all splits before it, so a recording that is never
         # rotated grows with the square of its age.
-        is_over = current.age_s(now) >= self._orders.session_duration_s
+        is_over = current.age_s(now) >= self.orders.session_duration_s
         resubscribe = self._reception.rotation_due(current.name, now.monotonic_s)
         is_wanted = self._rotate_now or is_silent or is_over or resubscribe is not None
         is_alone = self._sessions.handover is None
@@ -326,7 +323,7 @@ class Supervisor:
             self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = is_silent and not is_over
         # A recorder that receives nothing may have missed the newest latched messages.
-        self._reception.skip_latched(() if is_silent else self._housekeeper.excluded_latched())
+        self._reception.skip_latched(() if is_silent else self.housekeeper.excluded_latched())
         try:
             self._sessions.begin_handover(now)
         except RecorderError as error:
@@ -346,7 +343,7 @@ class Supervisor:
 
     def _check_list(self, _: ClockReading) -> None:
         """Requests a rotation if the list of topics was changed."""
-        topics = self._orders.topics
+        topics = self.orders.topics
         before = {*topics.selection.listed}
         if topics.look():
             after = {*topics.selection.listed}
@@ -380,19 +377,19 @@ class Supervisor:
 
     def _note_recorded(self, now: ClockReading) -> None:
         names = [session.name for session in self._sessions.running if session.has_recorded]
-        self._housekeeper.note_recorded(
+        self.housekeeper.note_recorded(
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
 
     def _screen(self, _: ClockReading) -> None:
-        self._housekeeper.screen(self._names())
+        self.housekeeper.screen(self._names())
 
     def _apply_retention(self, now: ClockReading) -> None:
         every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S
         if now.monotonic_s - self._applied_s >= every_s:
             self._applied_s = now.monotonic_s
             self._splits_closed = False
-            self._housekeeper.apply()
+            self.housekeeper.apply()
 
     def _announce(self, name: str) -> None:
         """Writes down the name of a recording before anything of it exists.
@@ -400,7 +397,7 @@ class Supervisor:
         Raises:
             RecorderError: the name cannot be written, so the recording must not begin.
         """
-        self._housekeeper.announce(name)
+        self.housekeeper.announce(name)
         self._write_heartbeat(announced=name)
 
     def _add_interruption(self, first: Ns, how: Interruption) -> None:
@@ -410,7 +407,7 @@ class Supervisor:
 
     def _report_interruptions(self, _: ClockReading) -> None:
         while self._interruptions:
-            self._housekeeper.note_restart(*self._interruptions.pop(0))
+            self.housekeeper.note_restart(*self._interruptions.pop(0))
 
     def _write_heartbeat(
         self,
@@ -429,7 +426,7 @@ class Supervisor:
         # The disk below an unmounted one must stay empty.
         if self._disk.away:
             return
-        last, now, state = self._beat, self._orders.clock.now(), state or self._state
+        last, now, state = self._beat, self.orders.clock.now(), state or self._state
         since = last.since if last is not None and last.state is state else now
         beat = self._make_heartbeat(now, state, since, announced)
         if only_changes and last is not None and _without_amounts(beat) == _without_amounts(last):
@@ -464,11 +461,11 @@ class Supervisor:
             lost=self._reception.lost_in_last_hour(now),
             waiting_for=watch.waiting_for if state is RecorderState.WAITING else None,
             cut_short=tuple(sorted(self._reception.cut_short)),
-            listed=self._orders.topics.selection.listed,
-            list_refused=self._orders.topics.refused,
+            listed=self.orders.topics.selection.listed,
+            list_refused=self.orders.topics.refused,
             process=process_of(os.getpid()),
-            advice=self._orders.advice() if watch.shortfall.unheard else None,
-            **self._housekeeper.status()._asdict(),
+            advice=self.orders.advice() if watch.shortfall.unheard else None,
+            **self.housekeeper.status()._asdict(),
             **watch.shortfall._asdict(),
         )
 
@@ -484,7 +481,7 @@ class Supervisor:
     def _free_bytes(self) -> int | None:
         fault = None
         try:
-            return self._free_bytes_of(self._bag_dir)
+            return self.free_bytes_of(self._bag_dir)
         except OSError as error:
             fault = f"{self._bag_dir}: {error.strerror or error}"
             return None
@@ -506,7 +503,7 @@ class Supervisor:
         return [session.name for session in self._sessions.running]
 
     def _now(self) -> ClockReading:
-        return ClockReading(self._monotonic(), self._orders.clock.now())
+        return ClockReading(self.monotonic(), self.orders.clock.now())
 
 
 def _without_amounts(beat: Heartbeat) -> Heartbeat:

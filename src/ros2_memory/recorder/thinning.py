@@ -34,7 +34,7 @@ from ros2_memory.bag_dir.state_files import Thinned
 from ros2_memory.columns.plan import fields_at, is_time
 from ros2_memory.columns.steps import Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
-from ros2_memory.core.arrays import numbered
+from ros2_memory.core.arrays import numbered, run_starts
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import NAMES_IN_MESSAGES, looks_like_json
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span
@@ -266,7 +266,7 @@ class TopicThinning:
     ) -> None:
         """Adds at least one message of each slot, and as many as show all labels and frames."""
         slots = times // slot_ns
-        starts = np.flatnonzero(np.diff(slots, prepend=-1)).tolist()
+        starts = run_starts(slots).tolist()
         for start, stop in zip(starts, [*starts[1:], times.size], strict=True):
             is_new = slots[start] != self._slot
             if is_new:
