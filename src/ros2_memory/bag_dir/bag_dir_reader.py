@@ -178,6 +178,7 @@ class BagDirReader(BagReader):
         """
         if self.bag_dir is None:
             return path
+        # Texts, since every read comes here, and paths are slow.
         text, folder = str(path), f"{str(self.bag_dir).rstrip(os.sep)}{os.sep}"
         names = text[len(folder) :].split("/")[:-1]
         if not text.startswith(folder) or os.pardir in names:

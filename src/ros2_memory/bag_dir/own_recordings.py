@@ -375,7 +375,7 @@ class OwnRecordings:
         row = ListRow(name, *identity)
         return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
 
-    def hold(self, directory: Path, bags: Iterable[str]) -> None:
+    def add_bags(self, directory: Path, bags: Iterable[str]) -> None:
         """Lists bags that the recorder puts into a folder of moments, days or carried messages.
 
         If the list cannot be written, the bags count all the same; the next recording writes them.
@@ -432,7 +432,7 @@ class OwnRecordings:
         """Returns the recordings that are not in the bag directory any more."""
         gone: list[str] = []
         for name in names:
-            with suppress(OSError):  # a disk that fails hides what is there
+            with suppress(OSError):  # on a failing disk the recording may still exist
                 if not mode_of(self._bag_dir / name):
                     gone.append(name)
         return gone

@@ -213,7 +213,7 @@ class Deleted:
     """Splits that were deleted.
 
     Attributes:
-        recording: their recording's path below the bag directory; "" for those of many recordings.
+        recording: the path of the recording below the bag directory; "" for many recordings.
         files: their names, without the suffix of compression.
         spans: their log times (half-open), joined.
     """
@@ -782,7 +782,7 @@ class TriggerState:
     Attributes:
         rules: by name; rules that are not configured any more are dropped.
         searched: the log time (excluded) up to which each of the newest recordings was searched.
-        before: the newest recording of those that need no search any more; None if there is none.
+        before: the newest recording that needs no search any more; None if there is none.
     """
 
     rules: dict[str, RuleRecord] = field(default_factory=dict)

@@ -143,6 +143,7 @@ class MemoryGauges:
 
 
 def _index_families(snapshot: Snapshot, now: Ns) -> Iterator[Metric]:
+    kept_bytes, _ = snapshot.timeline.disk_use
     yield GaugeMetricFamily("ros2_memory_bags", "Bags that answer questions.", len(snapshot.bags))
     yield _by_state(
         "ros2_memory_files_set_aside",
@@ -154,7 +155,7 @@ def _index_families(snapshot: Snapshot, now: Ns) -> Iterator[Metric]:
     yield GaugeMetricFamily(
         "ros2_memory_kept_bytes",
         "Size of the bags that answer questions.",
-        snapshot.timeline.disk_use[0],
+        kept_bytes,
     )
     yield GaugeMetricFamily(
         "ros2_memory_index_age_seconds",

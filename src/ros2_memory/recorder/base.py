@@ -20,7 +20,7 @@ class Recorder(ABC):
         """Checks that recording can begin. Touches no bag and starts no recording.
 
         Raises:
-            ConfigError: the configuration of what is recorded is refused.
+            ConfigError: the list of topics is refused.
             RecorderError: nothing on this machine can record.
         """
 
@@ -32,7 +32,7 @@ class Recorder(ABC):
         running changes nothing. After `stop` it may be started again, into a new recording.
 
         Raises:
-            ConfigError: the configuration of what is recorded is refused.
+            ConfigError: the list of topics is refused.
             RecorderError: recording cannot begin; nothing is left running.
         """
 

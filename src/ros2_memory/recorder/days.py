@@ -513,7 +513,7 @@ class MemoryDays:
             raise BagError(str(self._folder), "a symbolic link, which is not followed: remove it")
         self._folder.mkdir(exist_ok=True)
         path = self._writable_file(day)
-        self.own.hold(self._folder, [path.name])
+        self.own.add_bags(self._folder, [path.name])
         self._replace_day(path, self._merged_by_hour(path, records), bags)
 
     def _replace_day(self, path: Path, records: Iterator[Record], bags: Sequence[BagFile]) -> None:

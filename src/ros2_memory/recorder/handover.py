@@ -1,25 +1,24 @@
 """One recording takes over from another without losing or doubling a message.
 
-The new recorder is started beside the old one, and waits until it has subscribed to all topics of
-the old one, but not for ever, since a publisher may be gone. Then both run for `BOTH_S`, since who
-has subscribed receives nothing before the publishers discovered that. The cut lies in the middle of
-those: messages published around it are in both recordings, so that a message in transit, or a clock
-that is off by less than a second, loses and doubles nothing.
+The new recorder is started beside the old one. It waits, but not for ever, until it has subscribed
+to all topics of the old one. Then both run for `BOTH_S`, since a new subscriber receives nothing
+before the publishers have discovered it. The cut lies in the middle of that time. Messages
+published around it are in both recordings, so a message in transit, or a clock that is off by less
+than a second, loses and doubles nothing.
 
-Each sidecar (`handover.json`) is written before it can matter: the old recording names the new one
-before that is started, the new one is marked as not counting as soon as it exists, and the cut is
-written to the new one first. So a crash leaves a pair of sidecars that can be settled: the old
+Each sidecar (`handover.json`) is written before it matters. The old recording names the new one
+before that is started, the new one is marked as pending as soon as it exists, and the cut is
+written to the new one first. So after a crash the pair of sidecars can be settled: the old
 recording counts up to its end, and the new one from there.
 
-A recorder that stalled meanwhile lost what was published: where the recording that a message
-belongs to had stalled, the message is in the other alone, and the cut hides it. So the files on
-both sides are compared once they are closed: a message is the same by topic, publish time and
-payload, and counts as often as in the recording that holds it most often. The sidecars then list
-the messages for which the cut is not the answer; mostly there are none.
+If a recorder stalled, messages may be in the other recording alone, where the cut hides them. So
+the files on both sides are compared once they are closed. Topic, publish time and payload identify
+a message. It counts as often as in the recording that holds it most often. The sidecars then list
+the messages that the cut gets wrong, which are few or none.
 
-What `recording.exclude_when` holds back counts as still being written: what is excluded of it must
-not be listed. The cut alone decides where messages have no publish time of their own (it is 0, or
-the log time), and not at all on latched channels, whose repeats are recognised in queries.
+Files that `recording.exclude_when` holds back count as open: their excluded messages must not be
+listed. The cut alone decides on messages without a publish time of their own (it is 0, or equal to
+the log time). It does not apply to latched channels, whose repeats queries recognise.
 """
 
 from __future__ import annotations
@@ -66,19 +65,19 @@ READY_TIMEOUT_S: Final = 120.0
 BOTH_S: Final = 5.0
 """Longer than the 3 s after which Fast DDS sends discovery again that was lost on the way."""
 LATE_MESSAGES_NS: Final[Ns] = 30 * NS_PER_S
-"""How long the old recorder may still receive messages after it was asked to end."""
+"""The old recorder may still receive messages for so long after it was asked to end."""
 JITTER_NS: Final[Ns] = 100 * NS_PER_MS
-"""Two recorders differ by less than this in when they received one message."""
+"""The log times of one message in two recordings differ by less."""
 LONGEST_NS: Final[Ns] = 60 * NS_PER_S
-"""Two recorders never run side by side for longer, whatever a clock that was set shows."""
+"""Two recorders never run side by side for longer, even if a clock that was set says so."""
 STALL_NS: Final[Ns] = 5 * NS_PER_S
-"""How much later than the other one a recorder may log a message."""
+"""A recorder may log a message so much later than the other one."""
 FRESH_NS: Final[Ns] = NS_PER_S
-"""A latched message logged later than this after it was published was received before."""
+"""A latched message that is logged later after its publication is a repeat."""
 SAMPLE: Final = 2000
-"""Messages read to find out whether publish times differ from log times."""
+"""So many messages show whether publish times differ from log times."""
 MOST_LISTED: Final = 10_000
-"""More messages are not listed in a sidecar: then all count, and queries leave out duplicates."""
+"""A sidecar lists no more: then all messages count, and queries leave out duplicates."""
 
 _log = get_logger(__name__)
 
@@ -155,12 +154,12 @@ def _notes_on(clock: CutClock) -> tuple[str, ...]:
 
 
 class Step(Enum):
-    """What a handover needs next."""
+    """The next step of a handover."""
 
     WAIT = auto()
     COMPLETE = auto()
-    # The new recorder does not begin, or the clock was set back: then no single cut separates the
-    # messages published before it from those published after it.
+    # The new recorder does not begin; or the clock was set back, so that no single cut separates
+    # earlier messages from later ones.
     ABANDON = auto()
 
 
@@ -219,8 +218,8 @@ class HandoverTransfer:
         is_ready = self._marked and self.new.is_recording
         age_s = now.monotonic_s - self.began.monotonic_s
         if self.missing and age_s < SUBSCRIBE_TIMEOUT_S:
-            # Also if a publisher appears while both run: what it sends before the new recorder has
-            # subscribed is in the old recording alone, and must not lie after the cut.
+            # A publisher may appear while both run. Until the new recorder has subscribed, its
+            # messages are in the old recording alone, and must not lie after the cut.
             self._both_since = None
         elif self._both_since is None and is_ready:
             self._both_since = now
@@ -347,8 +346,7 @@ def give_up(old: Path, new: Path) -> None:
 def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
     """Writes the cut of a handover that was interrupted, after the old recording has ended.
 
-    The new recording may itself have handed over since: what its sidecar states about its own end
-    stays.
+    The new recording may itself have handed over since: its own end in the sidecar stays.
     """
     before = handover_to_change(old)
     after = handover_to_change(new) if is_folder(new) else void_sidecar(old.name)

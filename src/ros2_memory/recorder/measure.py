@@ -110,7 +110,7 @@ class Hole(NamedTuple):
 class _Series:
     """The messages of a topic since the newest settled one, by value.
 
-    `heard` is how many splits had been measured when the topic last came.
+    `heard` is the number of splits that had been measured when the topic last came.
     """
 
     kind: Kind
@@ -149,7 +149,7 @@ class LossCounter:
         self._measured += 1
         _, reached = self._recordings.get(recording, (0, 0))
         ends = [progress.positions[-1].log_time for progress in split.values()]
-        self._recordings[recording] = _Reached(self._measured, max(reached, *ends, 0))
+        self._recordings[recording] = _Reached(self._measured, max(reached, *ends))
         for topic, progress in split.items():
             self._add(topic, progress)
         self._recordings = {

@@ -68,12 +68,11 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
         depths = {topic: max(DEFAULT_DEPTH, factor * flow.burst) for topic, flow in flows.items()}
         if sum(depth * sizes[topic] for topic, depth in depths.items()) <= queue_bytes:
             return QueuePlan(depths)
-    wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
     left, depths = max(0, queue_bytes - sum(sizes.values())), {}
-    by_size = sorted(wanted, key=lambda topic: wanted[topic] * sizes[topic])
+    by_size = sorted(flows, key=lambda topic: flows[topic].burst * sizes[topic])
     for nth, topic in enumerate(by_size):
         share = left // (len(by_size) - nth)
-        more = min(wanted[topic] - 1, share // sizes[topic])
+        more = min(flows[topic].burst - 1, share // sizes[topic])
         depths[topic] = 1 + more
         left -= more * sizes[topic]
     short = frozenset(topic for topic, depth in depths.items() if depth < flows[topic].burst)

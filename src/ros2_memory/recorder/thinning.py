@@ -336,12 +336,12 @@ class TopicThinning:
 
         `codes` differ where `values` do.
         """
-        last, at = self._values.get(path, (values[0], int(times[0])))
+        last_value, last_time = self._values.get(path, (values[0], int(times[0])))
         self._values[path] = values[-1], int(times[-1])
-        later = np.flatnonzero(codes[1:] != codes[:-1])
-        before, after = times[later], times[later + 1]
-        if last != values[0]:
-            return np.append(before, at), np.append(after, times[0])
+        rows = np.flatnonzero(codes[1:] != codes[:-1])
+        before, after = times[rows], times[rows + 1]
+        if last_value != values[0]:
+            return np.append(before, last_time), np.append(after, times[0])
         return before, after
 
     def _add_integers(self, path: str, column: Numbers, times: IntArray) -> None:

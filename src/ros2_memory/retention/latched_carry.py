@@ -375,7 +375,7 @@ class Carrier:
             with beside(self.path) as new:
                 self.writer.write(new, records)
                 # Listed first: after a kill it would be foreign.
-                self.own.hold(folder, [CARRY_FILE])
+                self.own.add_bags(folder, [CARRY_FILE])
                 new.replace(self.path)
         except BaseException:
             with suppress(OSError):

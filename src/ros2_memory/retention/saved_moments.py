@@ -369,7 +369,7 @@ class MomentKeeper:
             free = (
                 path.name for path, file in sources if _file_of(parent / path.name) in {None, file}
             )
-            self.own.hold(parent, free)
+            self.own.add_bags(parent, free)
             for recorded, file in sources:
                 target = parent / recorded.name
                 if _link_bag(recorded, target, file.inode):

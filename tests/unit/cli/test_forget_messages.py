@@ -190,7 +190,7 @@ def test_a_moment_that_is_kept_meanwhile_follows(
         if not link.exists():
             made_moment(link.parents[1])
             link.parent.mkdir()
-            OwnRecordings(bag_dir).hold(link.parent, [link.name])
+            OwnRecordings(bag_dir).add_bags(link.parent, [link.name])
             os.link(source, link)
         return taken
 

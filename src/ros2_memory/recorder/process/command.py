@@ -29,7 +29,7 @@ SERVICES: Final = "--services"
 CACHE: Final = "--max-cache-size"
 STATISTICS: Final = "--stats_max_publishing_rate"
 MESSAGES_LOST: Final = "/events/rosbag2_messages_lost"
-"""Where a distribution with `STATISTICS` publishes what its recorders lose; it is recorded, too."""
+"""The topic of lost messages, of distributions with `STATISTICS`; it is recorded, too."""
 
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
 _STORAGES = re.compile(r"-s \{([^}]*)\}|--storage \{([^}]*)\}")
@@ -54,7 +54,7 @@ def record_argv(
     Args:
         ros2: the program.
         directory: where to record, absolute; it must not exist yet.
-        topics: what is recorded.
+        topics: the topics to record.
         split_duration_s: length of one bag file in whole seconds.
         qos_file: QoS overrides, see `Reception` in `reception.py`.
         storage_file: how MCAP is written, see `storage_config`.

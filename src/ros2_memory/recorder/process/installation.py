@@ -1,4 +1,4 @@
-"""Finds the robot's ROS 2: setup file, environment, and what its `ros2 bag record` can do."""
+"""Finds the robot's ROS 2: its setup file, environment and options of `ros2 bag record`."""
 
 from __future__ import annotations
 
@@ -228,15 +228,18 @@ def find_installation(setup_files: Sequence[Path], log_dir: Path) -> Installatio
     if finished.returncode != 0:
         printed = " ".join(finished.stderr.decode(errors="replace").split())[-300:]
         rmw = rmw_of(env)
-        do = (
-            f"install the package ros-$ROS_DISTRO-{rmw.replace('_', '-')}, or set "
-            "RMW_IMPLEMENTATION to what the robot's nodes use"
-            if rmw in printed
-            else "install the packages ros-$ROS_DISTRO-ros2bag and -rosbag2-storage-mcap, and "
+        advice = (
+            "install the packages ros-$ROS_DISTRO-ros2bag and -rosbag2-storage-mcap, and "
             "correct recorder.setup_files"
         )
+        if rmw in printed:
+            advice = (
+                f"install the package ros-$ROS_DISTRO-{rmw.replace('_', '-')}, or set "
+                "RMW_IMPLEMENTATION to what the robot's nodes use"
+            )
+        status = finished.returncode
         raise RecorderError(
-            f"{ros2} bag record --help fails with status {finished.returncode} ({printed}); {do}"
+            f"{ros2} bag record --help fails with status {status} ({printed}); {advice}"
         )
     return Installation(ros2, env, options_in_help(finished.stdout.decode(errors="replace")))
 

@@ -1,6 +1,6 @@
 """Parses what `ros2 bag record` prints on stderr, line by line.
 
-The texts are those of rosbag2 0.15 (Humble) to 0.33 (Rolling); any other line is classified by its
+It knows the texts of rosbag2 0.15 (Humble) to 0.33 (Rolling), and classifies other lines by their
 log level.
 """
 
