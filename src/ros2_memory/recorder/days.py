@@ -352,7 +352,7 @@ class MemoryDays:
     def _select(
         self, snapshot: Snapshot, bags: Sequence[BagFile], thinned: Thinned
     ) -> _StayingMessages:
-        """Returns which messages of bags stay. Those beside the pauses in `thinned` stay, too."""
+        """Returns which messages of bags stay; messages near a pause in `thinned` do, too."""
         selection = _StayingMessages()
         thinnings: dict[_TopicType, TopicThinning] = {}
         detections = DetectionColumns(self.extractor)
@@ -362,8 +362,9 @@ class MemoryDays:
         pauses = [pause for pause in thinned.pauses if near.overlaps(*pause)]
         for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
             key = topic, _ = table.channel.topic, table.channel.type
-            if why := self._why_left_out(table):
-                selection.left_out[topic] = why
+            reason = self._why_left_out(table)
+            if reason is not None:
+                selection.left_out[topic] = reason
             elif self._is_latched(snapshot, topic):
                 selection.latched.add(topic)
                 selection.times[key].update(table.log_times.tolist())
@@ -410,11 +411,10 @@ class MemoryDays:
                 is_latched = channel.topic in selection.latched
                 if channel.latched and not is_latched:
                     # A thinned message must not look as if it were valid until the next.
-                    metadata = tuple(item for item in channel.metadata if item[0] != _QOS)
-                    record = record._replace(  # noqa: PLW2901 - as it stays
-                        channel=replace(channel, latched=False, metadata=metadata)
-                    )
-                staying = self._without_people(record, rounds=not is_latched)
+                    metadata = tuple((key, value) for key, value in channel.metadata if key != _QOS)
+                    channel = replace(channel, latched=False, metadata=metadata)
+                thinned = record._replace(channel=channel)
+                staying = self._without_people(thinned, rounds=not is_latched)
                 if staying is not None:
                     yield staying
 

@@ -129,13 +129,13 @@ class _Recording:
     Attributes:
         refused: topics with a publisher that the subscription does not fit.
         asked_anew: topics whose subscription fits every publisher.
-        span: the first and the last log time (ns); 0 before the first split.
+        span: the first and the last log time (ns); None before the first split.
     """
 
     plan: QueuePlan
     asked_anew: frozenset[str]
     refused: set[str] = field(default_factory=set)
-    span: Span = (0, 0)
+    span: Span | None = None
 
 
 class _Anew(NamedTuple):
@@ -267,7 +267,8 @@ class Reception:
     def _add_reported(self, recording: str, topic: str, count: int) -> None:
         with self._lock:
             state = self._recordings.get(recording)
-            start, stop = (0, 0) if state is None else state.span
+            span = None if state is None else state.span
+            start, stop = span or (0, 0)
             losses = self._losses.add_reported(topic, start, stop, count)
         self._report_losses(losses)
 
@@ -398,6 +399,7 @@ class Reception:
             short = self._plan_queues().cut_short - before
             self._losses.forget(split.arrivals.keys() - split.progress.keys())
             if state is not None and split.arrivals:
+                # Not `split.start`: only the end of a large split is measured.
                 self._add_refused(state, summary.start, split.end)
             if recording:
                 self._arrivals.add_split(split)
@@ -422,11 +424,14 @@ class Reception:
 
     def _add_refused(self, recording: _Recording, start: Ns, end: Ns) -> None:
         """Adds the time of a split as a loss of each topic with a refused publisher."""
-        first, last = recording.span
-        since = max(first or start, min(last or start, start) - _UNNOTICED_NS)
+        since = first = start
+        if recording.span is not None:
+            # rosbag2 reports a publisher late: the loss begins before the split.
+            first, last = recording.span
+            since = max(first, min(last, start) - _UNNOTICED_NS)
         for topic in sorted(recording.refused):
             self._unwritten.append(Loss(topic, since, end + 1, 0, "refused"))
-        recording.span = first or start, end
+        recording.span = first, end
 
 
 def newest_splits(bag_dir: Path) -> list[Path]:

@@ -66,10 +66,10 @@ class SplitChanges(NamedTuple):
         faults: sentences on what cannot be read.
     """
 
-    closed: Sequence[str] = ()
-    empty: Sequence[str] = ()
+    closed: tuple[str, ...] = ()
+    empty: tuple[str, ...] = ()
     gone: bool = False
-    faults: Sequence[str] = ()
+    faults: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -111,7 +111,8 @@ class Splits:
             split = self._files.setdefault(name, _Split(now_s))
             split.size = max(split.size, size)
         closed, faults = self._find_closed(sizes)
-        return SplitChanges(closed, self._find_empty(sizes, now_s), faults=faults)
+        empty = self._find_empty(sizes, now_s)
+        return SplitChanges(tuple(closed), tuple(empty), faults=tuple(faults))
 
     @property
     def bytes_written(self) -> int:
