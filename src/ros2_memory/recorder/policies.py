@@ -12,6 +12,9 @@ FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 60.0
 SILENT_SPLITS: Final = 3
 """A robot counts as silent after so many splits without growth."""
+SETTLE_S: Final = 5.0
+"""A recording first writes headers, and latched messages that every recording receives again: for
+so long they do not end a silence."""
 WAITING_S: Final = 30.0
 """A recorder that has recorded nothing for so long, and for a split, is waiting."""
 OWN_TOPICS: Final = frozenset(
@@ -92,13 +95,9 @@ class SilenceWatch:
         self._must_grow = False
         self._bytes = 0
 
-    def began(self, now_s: float, settle_s: float) -> None:
-        """Notes that a recording began.
-
-        Within `settle_s` it writes headers, and latched messages that every recording receives
-        again: they do not count as growth.
-        """
-        self._settled_at_s = now_s + settle_s
+    def began(self, now_s: float) -> None:
+        """Notes that a recording began."""
+        self._settled_at_s = now_s + SETTLE_S
         self._grew_at_s = None if self._must_grow else now_s
         self._has_grown = self._must_grow = False
         self._bytes = 0

@@ -29,7 +29,7 @@ from ros2_memory.recorder.handover import (
     settle_handover,
     unsettled_handovers,
 )
-from ros2_memory.recorder.policies import ClockReading, describe_death
+from ros2_memory.recorder.policies import SETTLE_S, ClockReading, describe_death
 from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.command import MESSAGES_LOST
 from ros2_memory.recorder.process.output import Line, LineKind, parse_line
@@ -329,8 +329,6 @@ class Orders:
     advice: Callable[[], str] = str
 
 
-SETTLE_S: Final = 5.0
-"""At first a recording writes its headers and latched messages, which do not end a silence."""
 WHOLE_RECORDING_S: Final = 15.0
 """Of a shorter recording, topics without messages are not reported."""
 
@@ -387,7 +385,7 @@ class RecordingSessions:
             RecorderError: the recording cannot be started.
         """
         self.current = self._launch(self._name(now), now)
-        self.grew_s = max(self.grew_s, now.monotonic_s)
+        self.grew_s = now.monotonic_s
 
     def _name(self, now: ClockReading) -> str:
         return recording_name(now.wall, self._bag_dir, read_deleted(self._bag_dir))

@@ -25,7 +25,7 @@ from ros2_memory.recorder.policies import (
     SilenceWatch,
     set_back,
 )
-from ros2_memory.recorder.sessions import SETTLE_S, Orders, RecordingSessions
+from ros2_memory.recorder.sessions import Orders, RecordingSessions
 from ros2_memory.recorder.shortfall import TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
@@ -249,7 +249,7 @@ class Supervisor:
             self._put_off("restart", now)
         current = self._sessions.current
         if current is not None and current is not before:
-            self._silence.began(now.monotonic_s, SETTLE_S)
+            self._silence.began(now.monotonic_s)
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes bags, pauses or resumes recording, by the free space on the disk."""
@@ -293,7 +293,7 @@ class Supervisor:
         if step is Step.COMPLETE:
             self._backoff["rotate"].succeeded()
             self._silence.rotated(for_silence=self._rotating_for_silence)
-            self._silence.began(now.monotonic_s, SETTLE_S)
+            self._silence.began(now.monotonic_s)
         elif step is Step.ABANDON:
             self._put_off("rotate", now)
 
@@ -373,7 +373,7 @@ class Supervisor:
             self._add_interruption(self._paused_at, "paused")
             self._paused_at = None
         self._topic_watch.began(now)
-        self._silence.began(now.monotonic_s, SETTLE_S)
+        self._silence.began(now.monotonic_s)
 
     def _note_recorded(self, now: ClockReading) -> None:
         names = [session.name for session in self._sessions.running if session.has_recorded]
