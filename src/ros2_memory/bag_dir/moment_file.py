@@ -399,11 +399,11 @@ class RequestQueue:
     def _delete_left_over(self, names: list[str], now: Ns) -> None:
         """Deletes old answers that no server fetched, and unfinished files."""
         for name in names:
-            if _OWN_NAME.fullmatch(name) and name.endswith((".answer", ".tmp")):
-                with suppress(OSError):
-                    path = self._folder / name
-                    if abs(now - path.lstat().st_mtime_ns) > _KEEP_ANSWER_NS:
-                        path.unlink()
+            path = self._folder / name
+            is_left_over = _OWN_NAME.fullmatch(name) and name.endswith((".answer", ".tmp"))
+            with suppress(OSError):
+                if is_left_over and abs(now - path.lstat().st_mtime_ns) > _KEEP_ANSWER_NS:
+                    path.unlink()
 
 
 def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:

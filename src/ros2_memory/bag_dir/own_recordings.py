@@ -478,14 +478,17 @@ class OwnRecordings:
                 if not exists or self._lines > self._max_lines:
                     self._rewrite(rows)
                 else:
-                    with self._locked() as descriptor:
-                        if descriptor is None:
-                            raise FileNotFoundError("the list of recordings is missing")
-                        append_lines(descriptor, LIST.text(rows))
-                    self._add(rows)
+                    self._append_lines(rows)
                 self._unwritten.clear()
         except OSError as error:
             raise self._failure(error) from error
+
+    def _append_lines(self, rows: Sequence[ListRow]) -> None:
+        with self._locked() as descriptor:
+            if descriptor is None:
+                raise FileNotFoundError("the list of recordings is missing")
+            append_lines(descriptor, LIST.text(rows))
+        self._add(rows)
 
     def _rewrite(self, rows: Iterable[ListRow]) -> None:
         """Replaces the list by one with these lines, and without recordings that are gone."""
@@ -502,9 +505,9 @@ class OwnRecordings:
                     for name, row in self._rows.items()
                     if row.identity or name not in before
                 }
-                for name in self._missing_on_disk(merged):
-                    if name != self._begun:  # its child has not made the directory yet
-                        del merged[name]
+                # The child of the newest recording may not have made the directory yet.
+                for name in self._missing_on_disk(merged.keys() - {self._begun}):
+                    del merged[name]
                 merged |= _by_recording(rows)
                 self._write(merged.values())
         except OSError:

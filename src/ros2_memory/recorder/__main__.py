@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.recorder.base import Recorder
+    from ros2_memory.recorder.housekeeping import Housekeeping
 
 PROGRAM: Final = "ros2-memory-recorder"
 FAILED: Final = 1
@@ -106,6 +107,10 @@ def _record(settings: Settings) -> None:
         refuse_homes(bag_dir)
     make_bag_dir(bag_dir)
     lock = BagDirLock.acquire(bag_dir)
+    excluding = {
+        rule.topic: f"the rule {rule.name!r} of recording.exclude_when"
+        for rule in exclusions_of(settings)
+    }
     try:
         recorder = build_recorder(
             settings,
@@ -114,19 +119,13 @@ def _record(settings: Settings) -> None:
             own=own,
             background=background,
             keep_open=(lock.descriptor,),
-            excluding={
-                rule.topic: f"the rule {rule.name!r} of recording.exclude_when"
-                for rule in exclusions_of(settings)
-            },
+            excluding=excluding,
         )
         recorder.check()
         own.claim()
         if recording.clear_on_startup:
             _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
-        try:
-            housekeeper.prepare()
-        except (EpisodicError, OSError) as error:
-            _log.error("not_prepared", task="prepare", reason=str(error))
+        _prepare(housekeeper)
     except BaseException:
         lock.release()
         raise
@@ -149,6 +148,14 @@ def _warn_of_settings(settings: Settings) -> None:
         )
     if settings.retention.max_total_gb < SMALL_BUDGET_GB:
         _log.warning("budget_small", reason=small_budget(settings.retention.max_total_gb))
+
+
+def _prepare(housekeeper: Housekeeping) -> None:
+    try:
+        housekeeper.prepare()
+    except (EpisodicError, OSError) as error:
+        # Only reported: a recorder that can record must not be kept from it.
+        _log.error("not_prepared", task="prepare", reason=str(error))
 
 
 def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:

@@ -149,7 +149,7 @@ class LossCounter:
         self._measured += 1
         _, reached = self._recordings.get(recording, (0, 0))
         ends = [progress.positions[-1].log_time for progress in split.values()]
-        self._recordings[recording] = _Reached(self._measured, max(reached, *ends))
+        self._recordings[recording] = _Reached(self._measured, max([reached, *ends]))
         for topic, progress in split.items():
             self._add(topic, progress)
         self._recordings = {

@@ -95,7 +95,7 @@ class Supervisor:
     keep_alive: Callable[[], None] | None = None
 
     def __post_init__(self) -> None:
-        orders, housekeeper = self.orders, self.housekeeper
+        orders = self.orders
         self._bag_dir = orders.bag_dir
         self._reception = orders.reception
         self._keep_alive = self.keep_alive or Watchdog().keep_alive
@@ -119,7 +119,12 @@ class Supervisor:
         self._due_s: dict[str, float] = {}
         self._last = self._now()
         self._applied_s = -QUIET_RETENTION_S
-        self._tasks = (
+        self._tasks = self._make_tasks()
+
+    def _make_tasks(self) -> tuple[_Task, ...]:
+        """Returns the tasks in the order in which a tick runs them."""
+        housekeeper, background = self.housekeeper, self.orders.background
+        return (
             _Task("disk", self._check_disk),
             _Task("look", self._observe, OBSERVE_S),
             _Task("deaths", self._check_exits),
@@ -132,7 +137,7 @@ class Supervisor:
             _Task("interruptions", self._report_interruptions, needs_disk=True),
             _Task("recorded", self._note_recorded),
             _Task("settle", lambda _: self._sessions.recover(), UNSETTLED_S, needs_disk=True),
-            _Task("faults", lambda _: self._events.report_faults(orders.background.faults())),
+            _Task("faults", lambda _: self._events.report_faults(background.faults())),
             _Task("house", self._apply_retention, needs_disk=True),
             _Task("moments", lambda _: housekeeper.keep_moments(), MOMENTS_S, needs_disk=True),
             _Task("screen", self._screen, SCREENING_S, needs_disk=True),

@@ -298,12 +298,7 @@ class TopicThinning:
             detections = in_table.detections
             rows, scores = detections.rows.tolist(), detections.scores.tolist()
             labels += zip(rows, detections.labels.values(), scores, strict=True)
-        for column in table.columns.values():
-            if isinstance(column, Texts) and looks_like_json(column.words[0]):
-                for row, text in enumerate(column.values()):
-                    for detection in detections_of(text):
-                        score = nan if detection.score is None else detection.score
-                        labels.append((row, detection.label, score))
+        labels += _json_labels(table)
         names: list[dict[Name, Scored]] = [{} for _ in range(len(table))]
         counts = Counter[tuple[int, str]]()
         for row, label, score in labels:
@@ -400,6 +395,15 @@ class TopicThinning:
             rows = np.flatnonzero(column.codes == code)
             of_frame = {path: points[rows] for path, points in poses.items()}
             self._add_poses(frame, times[inner.owners[rows]], of_frame)
+
+
+def _json_labels(table: Table) -> Iterator[tuple[int, str, float]]:
+    """Yields the labels in JSON texts: the row of the message, the label, and the score or NaN."""
+    for column in table.columns.values():
+        if isinstance(column, Texts) and looks_like_json(column.words[0]):
+            for row, text in enumerate(column.values()):
+                for detection in detections_of(text):
+                    yield row, detection.label, nan if detection.score is None else detection.score
 
 
 def has_samples(table: Table) -> bool:
