@@ -378,7 +378,7 @@ class MemoryDays:
     def _why_left_out(self, table: Table) -> str | None:
         """Returns why no message of a topic stays; None if some stay."""
         topic = table.channel.topic
-        if "" in table.left_out:
+        if "" in table.left_out:  # the whole message
             return table.left_out[""]
         if has_samples(table):
             return "it has long arrays of numbers"
@@ -641,7 +641,7 @@ def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> o
             if len(texts) == len(items) and all(isinstance(text, str) for text in texts):
                 rows |= hidden[other]
         if rows and isinstance(items, np.ndarray):
-            changed[name] = np.delete(items, [*rows])
+            changed[name] = np.delete(items, [*rows], axis=0)
         elif rows:
             changed[name] = [item for row, item in enumerate(items) if row not in rows]
     return replace(message, **changed) if changed else message

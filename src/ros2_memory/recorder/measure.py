@@ -421,7 +421,7 @@ class Arrival(NamedTuple):
         return (self.last - self.first) // max(1, self.messages - 1)
 
     def joined(self, later: Arrival) -> Arrival:
-        """Returns both as one."""
+        """Returns the arrival of the messages of both."""
         return Arrival(
             min(self.first, later.first),
             max(self.last, later.last),

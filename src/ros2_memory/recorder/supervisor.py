@@ -207,9 +207,8 @@ class Supervisor:
 
     def _run_tasks(self, now: ClockReading) -> None:
         for task in self._tasks:
-            if (task.needs_disk and self._disk.away) or not self._is_due(
-                task.name, task.every_s, now
-            ):
+            is_blocked = task.needs_disk and self._disk.away
+            if is_blocked or not self._is_due(task.name, task.every_s, now):
                 continue
             self._keep_alive()
             try:

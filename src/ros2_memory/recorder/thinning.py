@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
     Name = tuple[str, int]  # a label or frame, and its number in the message
-    Scored = tuple[float, float]  # the step of a score, and the score
     Points = NDArray[np.float64]
 
 _RELATIVE_BITS: Final = 20
@@ -91,6 +90,7 @@ def fields_in(node: object) -> Iterator[tuple[str, object]]:
 
 
 def _rounded(numbers: Points, step: Step) -> Points:
+    """Returns multiples of a power of two, which is no coarser than the step: they compress."""
     with np.errstate(invalid="ignore", over="ignore"):
         if step.per_unit:
             units = 2.0 ** ceil(log2(step.per_unit))
@@ -120,7 +120,16 @@ _STEPS: Final = 20
 _HIGHEST: Final = 1e6
 _SINGLE: Final = 1e-6
 """By so much a number of 32 bits may be too small."""
-_UNSCORED: Final = (0.0, 0.0)
+
+
+class Scored(NamedTuple):
+    """A score, and the step of scores that it lies in."""
+
+    step: float
+    score: float
+
+
+_UNSCORED: Final = Scored(0.0, 0.0)
 _LONG: Final = 64
 """Messages with longer arrays are samples: scans, maps, sound, features of faces."""
 _DEGREE_M: Final = 111_320.0
@@ -415,10 +424,10 @@ def has_samples(table: Table) -> bool:
     )
 
 
-def _stepped(score: float) -> tuple[float, float]:
-    """Returns the step of a score, and the score; a missing score (NaN) is the lowest."""
+def _stepped(score: float) -> Scored:
+    """Returns a score with its step; a missing score (NaN) is the lowest."""
     score = -_HIGHEST if isnan(score) else max(-_HIGHEST, min(score, _HIGHEST))
-    return (score + _SINGLE) * _STEPS // 1, score
+    return Scored((score + _SINGLE) * _STEPS // 1, score)
 
 
 def _missing(
@@ -428,7 +437,7 @@ def _missing(
     missing: dict[Name, Scored] = {}
     for names in messages:
         for name, score in names.items():
-            if name not in seen or seen[name][0] < score[0]:
+            if name not in seen or seen[name].step < score.step:
                 missing[name] = max(score, missing.get(name, score))
     return missing
 
@@ -438,13 +447,13 @@ def _covering_rows(
 ) -> list[int]:
     """Returns few rows of messages that have all missing names, each with its highest step.
 
-    Greedy: the message with the most names comes first, of equal ones that with higher scores.
+    Greedy: it takes the message with the most names, of several the one with the highest scores.
     """
     uncovered: list[dict[Name, float]] = []
     for names in messages:
         uncovered.append({})
         for name, (step, score) in names.items():
-            if name in missing and missing[name][0] == step:
+            if name in missing and missing[name].step == step:
                 uncovered[-1][name] = score
     rows: list[int] = []
     while any(uncovered):
