@@ -84,10 +84,9 @@ class Ros2BagRecorder(Recorder):
         by_setting = dict.fromkeys(topics, "recording.required")
         self._topics = TopicsFile(self.topics_file, {**by_setting, **self.excluding})
         self._ros = Installation("ros2", {}, frozenset())
-        self._queue_bytes = self.queue_mb * 2**20
         self._reception = Reception(
             self.reader,
-            self._queue_bytes,
+            self.queue_mb * 2**20,
             bag_dir=self._bag_dir,
             latched=self.latched_topics,
             # Each new recording would receive the latched log of an excluded time again.
@@ -166,7 +165,7 @@ class Ros2BagRecorder(Recorder):
             qos_file=qos_file,
             storage_file=storage_file,
             node_name=node_name(name),
-            cache_bytes=self._queue_bytes,
+            cache_bytes=self._reception.queue_bytes,
             use_sim_time=self.use_sim_time,
             repeat_latched=self.repeat_latched,
             known_options=self._ros.options,

@@ -473,30 +473,23 @@ class RecordingSessions:
                 deaths += 1
                 self._report_output(session)
                 sentence = describe_death(status, session.last_output)
-                self._report_interruption(
-                    session, "died", "recorder_died", sentence, lived_s=session.age_s(now)
-                )
+                lived_s = session.age_s(now)
+                self.events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
+                self._note_interruption(session, "died")
                 self._go_on_without(session)
             elif session.has_recorded and status == -signal.SIGKILL:
                 sentence = (
                     f"the ros2 bag record of {session.name} hung: it did not end when it was asked "
                     "to, and was killed (SIGKILL); what it had not written yet is lost"
                 )
-                self._report_interruption(session, "hung", "recorder_hung", sentence)
+                self.events.fail("recorder_hung", sentence, recording=session.name)
+                self._note_interruption(session, "hung")
             self._finalize(session, now)
         if self.running != running:
             self.settle_handovers()
         return deaths
 
-    def _report_interruption(
-        self,
-        session: RecordingSession,
-        how: Interruption,
-        event: str,
-        sentence: str,
-        **values: object,
-    ) -> None:
-        self.events.fail(event, sentence, recording=session.name, **values)
+    def _note_interruption(self, session: RecordingSession, how: Interruption) -> None:
         self.restarts += 1
         self.interrupted(session.grew_at, how)
 
