@@ -44,14 +44,16 @@ class Background:
         try:
             job()
         except (EpisodicError, OSError) as error:
-            self.failed(task, str(error))
+            self.note_failure(task, str(error))
         except Exception as error:  # noqa: BLE001 - or the thread would end silently
             _log.exception("housekeeping_faulty", task=task)
-            self.failed(task, f"a fault in this program ({type(error).__name__}); see its log")
+            self.note_failure(
+                task, f"a fault in this program ({type(error).__name__}); see its log"
+            )
         else:
             self._faults.pop(task, None)
 
-    def failed(self, task: str, reason: str) -> None:
+    def note_failure(self, task: str, reason: str) -> None:
         """Remembers why the newest job of a task failed."""
         self._faults[task] = reason
 

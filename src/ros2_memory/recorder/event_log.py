@@ -88,11 +88,11 @@ class EventLog:
         else:
             self.lasting(event, subject, None)
 
-    def recorded(self) -> None:
+    def note_recording(self) -> None:
         """Notes that recording goes on: the newest fault is over, unless it lasts."""
         self.recovered = self.last_error is not None and self._lasting not in self._unresolved
 
-    def ended(self, recording: str) -> None:
+    def note_end(self, recording: str) -> None:
         """Notes that a recording has ended: its lasting faults are over."""
         self._unresolved = {
             (event, subject)

@@ -291,7 +291,7 @@ class Housekeeping:
         try:
             self.background.add("screen", self.screening.plan(live))
         except (EpisodicError, OSError) as error:
-            self.background.failed("screen", str(error))
+            self.background.note_failure("screen", str(error))
 
     def finish(self) -> None:
         """Screens some more splits of each recording, and waits for all work that is under way."""

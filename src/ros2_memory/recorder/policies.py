@@ -54,20 +54,20 @@ def set_back(earlier: ClockReading, later: ClockReading, by_ns: Ns = STEP_NS) ->
 class Backoff:
     """The wait before the next attempt: it doubles with each failure, up to `MAX_WAIT_S`.
 
-    `succeeded` resets it. A long life of a recorder is no success: it may have written nothing.
+    A recorder that lived for long may have written nothing: its life alone does not reset the wait.
     """
 
     def __init__(self) -> None:
         self._wait_s = FIRST_WAIT_S
 
-    def failed(self) -> float:
-        """Returns the wait in seconds after an attempt that failed."""
+    def next_wait_s(self) -> float:
+        """Returns the wait after a failure, and doubles the next one."""
         wait_s = self._wait_s
         self._wait_s = min(2 * wait_s, MAX_WAIT_S)
         return wait_s
 
-    def succeeded(self) -> None:
-        """Resets the wait."""
+    def reset(self) -> None:
+        """Ends a series of failures: the next wait is the first again."""
         self._wait_s = FIRST_WAIT_S
 
 
@@ -95,7 +95,7 @@ class SilenceWatch:
         self._must_grow = False
         self._bytes = 0
 
-    def began(self, now_s: float) -> None:
+    def note_begin(self, now_s: float) -> None:
         """Notes that a recording began."""
         self._settled_at_s = now_s + SETTLE_S
         self._grew_at_s = None if self._must_grow else now_s
@@ -119,7 +119,7 @@ class SilenceWatch:
         least_s = 0.0 if self._has_grown else WAITING_S
         return now_s - self._grew_at_s >= max(self._patience_s, least_s)
 
-    def rotated(self, *, for_silence: bool) -> None:
+    def note_rotation(self, *, for_silence: bool) -> None:
         """Notes that the recording was rotated."""
         self._must_grow = for_silence or not self._has_grown
         doubled_s = min(2 * self._patience_s, self._cap_s)

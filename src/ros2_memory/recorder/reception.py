@@ -255,7 +255,7 @@ class Reception:
         """Counts the losses that only a further split could disprove: recording has ended."""
         self.background.add(_TASK, self._flush)
 
-    def lost(self, recording: str, topic: str, count: int) -> None:
+    def note_lost(self, recording: str, topic: str, count: int) -> None:
         """Notes that rosbag2 reports lost messages of a topic, up to a recording's last split."""
         self.background.add(_TASK, lambda: self._add_reported(recording, topic, count))
 
@@ -311,7 +311,7 @@ class Reception:
                 raise RecorderError(f"losses cannot be written: {reason}") from error
             self._unwritten.clear()
 
-    def refused(self, recording: str, topic: str, *, best_effort: bool = True) -> None:
+    def note_refused(self, recording: str, topic: str, *, best_effort: bool = True) -> None:
         """Notes that a publisher's QoS does not fit how a recording subscribed to the topic.
 
         The next recordings ask for what fits every publisher. Without `best_effort` they ask for
@@ -321,9 +321,9 @@ class Reception:
             before = self._asked_anew.get(topic)
             was_best_effort = before is not None and before.best_effort
             self._asked_anew[topic] = _Anew(best_effort or was_best_effort)
-        self.never_received(recording, topic)
+        self.note_unreceived(recording, topic)
 
-    def never_received(self, recording: str, topic: str) -> None:
+    def note_unreceived(self, recording: str, topic: str) -> None:
         """Notes that a recording receives no message of some publisher of a topic."""
         with self._lock:
             state = self._recordings.get(recording)
@@ -361,7 +361,7 @@ class Reception:
             sentence = "a new recording starts, to subscribe with deeper queues: "
             return Rotation("queues_deepened", sentence + listed(shallow), frozenset(shallow))
 
-    def rotation_begun(self, rotation: Rotation, now_s: float) -> None:
+    def note_rotation(self, rotation: Rotation, now_s: float) -> None:
         """Notes that a rotation began: the same reason waits before the next one."""
         with self._lock:
             if rotation.is_fault:

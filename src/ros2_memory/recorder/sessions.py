@@ -551,7 +551,7 @@ class RecordingSessions:
         if changes.closed or session.state is SessionState.ENDED:
             # After `learn`: what a split itself shows to be missing is counted first.
             for topic, count in session.take_lost().items():
-                self.orders.reception.lost(session.name, topic, count)
+                self.orders.reception.note_lost(session.name, topic, count)
         if changes.closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s
@@ -574,9 +574,9 @@ class RecordingSessions:
             if line.kind is LineKind.QOS_REFUSED:
                 # The line names one policy that does not fit; another line names the other.
                 best_effort = "DURABILITY" not in line.text
-                reception.refused(session.name, line.topic, best_effort=best_effort)
+                reception.note_refused(session.name, line.topic, best_effort=best_effort)
             elif line.kind is LineKind.SEVERAL_TYPES and line.topic in session.subscribed:
-                reception.never_received(session.name, line.topic)
+                reception.note_unreceived(session.name, line.topic)
 
     def _flush_later(
         self, session: RecordingSession, directory: Path, names: Sequence[str]
@@ -657,7 +657,7 @@ class RecordingSessions:
             with self._reporting_failures(session):
                 handover.add_late_splits()
         self._update_list(session)
-        self.events.ended(session.name)
+        self.events.note_end(session.name)
         splits, lived_s = session.splits, session.age_s(now)
         if remove_if_empty(splits.directory):
             self.events.info("recording_empty", recording=session.name)

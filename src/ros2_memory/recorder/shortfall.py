@@ -53,7 +53,7 @@ class TopicWatch:
         self._began_s: float | None = None
         self._offered_since_s: dict[str, float] = {}
 
-    def began(self, now: ClockReading) -> None:
+    def note_begin(self, now: ClockReading) -> None:
         """Notes that a recording begins, and no other one runs."""
         self._unheard_from_s = now.monotonic_s
 

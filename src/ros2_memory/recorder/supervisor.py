@@ -223,9 +223,9 @@ class Supervisor:
         self._splits_closed |= closed
         current = self._sessions.current
         if current is not None and current.splits.messages:
-            self._backoff["restart"].succeeded()
+            self._backoff["restart"].reset()
             if closed:
-                self._events.recorded()
+                self._events.note_recording()
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk than at the start is mounted at the bag directory."""
@@ -253,7 +253,7 @@ class Supervisor:
             self._put_off("restart", now)
         current = self._sessions.current
         if current is not None and current is not before:
-            self._silence.began(now.monotonic_s)
+            self._silence.note_begin(now.monotonic_s)
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes bags, pauses or resumes recording, by the free space on the disk."""
@@ -295,9 +295,9 @@ class Supervisor:
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
         if step is Step.COMPLETE:
-            self._backoff["rotate"].succeeded()
-            self._silence.rotated(for_silence=self._rotating_for_silence)
-            self._silence.began(now.monotonic_s)
+            self._backoff["rotate"].reset()
+            self._silence.note_rotation(for_silence=self._rotating_for_silence)
+            self._silence.note_begin(now.monotonic_s)
         elif step is Step.ABANDON:
             self._put_off("rotate", now)
 
@@ -339,7 +339,7 @@ class Supervisor:
             self._report_resubscription(resubscribe, current.name, now)
 
     def _report_resubscription(self, rotation: Rotation, recording: str, now: ClockReading) -> None:
-        self._reception.rotation_begun(rotation, now.monotonic_s)
+        self._reception.note_rotation(rotation, now.monotonic_s)
         if rotation.is_fault:
             self._events.warn(rotation.event, rotation.sentence, recording=recording)
         else:
@@ -376,8 +376,8 @@ class Supervisor:
         if self._paused_at is not None:
             self._add_interruption(self._paused_at, "paused")
             self._paused_at = None
-        self._topic_watch.began(now)
-        self._silence.began(now.monotonic_s)
+        self._topic_watch.note_begin(now)
+        self._silence.note_begin(now.monotonic_s)
 
     def _note_recorded(self, now: ClockReading) -> None:
         names = [session.name for session in self._sessions.running if session.has_recorded]
@@ -501,7 +501,7 @@ class Supervisor:
 
     def _put_off(self, task: str, now: ClockReading) -> None:
         """Delays the next attempt of a task that failed."""
-        self._due_s[task] = now.monotonic_s + self._backoff[task].failed()
+        self._due_s[task] = now.monotonic_s + self._backoff[task].next_wait_s()
 
     def _names(self) -> list[str]:
         return [session.name for session in self._sessions.running]

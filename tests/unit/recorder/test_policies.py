@@ -22,10 +22,10 @@ def test_each_rotation_for_silence_doubles_the_patience_up_to_a_session() -> Non
     watch = SilenceWatch(split_duration_s=10, session_duration_s=100)
     moments = []
     for for_silence in (True, True, True, False, True):
-        watch.began(0)
+        watch.note_begin(0)
         # What is written in the first seconds are headers and latched messages.
         moments.append(silent_at(watch, {0: 0, 4.5: 90, 10: 100}, 300))
-        watch.rotated(for_silence=for_silence)
+        watch.note_rotation(for_silence=for_silence)
     assert moments == [40, 70, 110, 110, 40]
 
 

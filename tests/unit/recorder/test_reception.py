@@ -67,7 +67,7 @@ def rotated(of: Reception, recording: str, now_s: float) -> Rotation:
     """The reason for which a recording is rotated then."""
     due = of.rotation_due(recording, now_s)
     assert due is not None
-    of.rotation_begun(due, now_s)
+    of.note_rotation(due, now_s)
     return due
 
 
@@ -91,13 +91,13 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     made = reception(tmp_path)
     made.recall([split(tmp_path / "old.mcap", 50, 4)])
     assert "/odom" in profiles(made, "a")
-    made.refused("a", "/odom")
+    made.note_refused("a", "/odom")
     # The recording that refused it still states what the other publishers offered.
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = rotated(made, "a", 50.0)
     assert (rotation.event, {*rotation.topics}) == ("asking_again", {"/odom"})
     assert qos(made, "b")["/odom"] == ("best_effort", "volatile")
-    made.refused("b", "/odom")
+    made.note_refused("b", "/odom")
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S - 1) is None
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
 
@@ -105,10 +105,10 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
 def test_a_topic_taken_for_latched_whose_publisher_is_volatile_adapts_too(tmp_path: Path) -> None:
     made = reception(tmp_path)
     made.overrides("a")
-    made.refused("a", "/tf_static", best_effort=False)
+    made.note_refused("a", "/tf_static", best_effort=False)
     assert profiles(made, "b") == {}
     made.learn("a", latched_split(tmp_path / "a.mcap", "/map"))
-    made.refused("a", "/map", best_effort=False)
+    made.note_refused("a", "/map", best_effort=False)
     assert qos(made, "b")["/map"] == ("reliable", "volatile")
 
 
@@ -121,8 +121,8 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
     made.overrides("a")
     made.learn("a", latched)
     for topic in topics:
-        made.refused("a", topic)
-        made.refused("a", topic, best_effort=False)  # the other policy of the same publisher
+        made.note_refused("a", topic)
+        made.note_refused("a", topic, best_effort=False)  # the other policy of the same publisher
     rotated(made, "a", 50.0)
     for name in ("b", "c"):
         assert {*qos(made, name).values()} == {("best_effort", "volatile")}
@@ -131,7 +131,7 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
         profiles(made, f"later_{nth}")
     assert {*qos(made, "d").values()} == {("reliable", "transient_local")}
     # This one had not asked for the weakest: it need not wait.
-    made.refused("d", "/map")
+    made.note_refused("d", "/map")
     assert made.rotation_due("d", 51.0) is not None
 
 
@@ -154,7 +154,7 @@ def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_p
     made = reception(tmp_path)
     made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 5, 4))
-    made.refused("a", "/odom")
+    made.note_refused("a", "/odom")
     made.overrides("b")
     made.learn("b", split(tmp_path / "b_0.mcap", 5, 4))
     assert read_losses(tmp_path, MIN_NS, MAX_NS) == []

@@ -524,7 +524,7 @@ def test_a_death_is_told_with_its_time_and_last_words_and_is_past_once_recording
 
 
 def test_an_error_that_lasts_is_not_past(world: World) -> None:
-    world.background.failed("apply", "the list cannot be read")
+    world.background.note_failure("apply", "the list cannot be read")
     world.run(30)
     beat = world.heartbeat()
     assert (beat["last_error"], beat["recovered"]) == ("the list cannot be read", False)

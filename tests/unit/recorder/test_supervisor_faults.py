@@ -322,7 +322,7 @@ class TestUnmounted:
         world.recorders[0].ends_with = -9
         with unmounted(world):
             world.run(0.25)
-            world.orders.reception.lost(world.recorders[0].directory.name, "/door", 3)
+            world.orders.reception.note_lost(world.recorders[0].directory.name, "/door", 3)
             world.run(20)
             assert list(bag_dir.iterdir()) == []
         world.run(20)
@@ -401,7 +401,7 @@ class TestHouse:
         lost = tmp_path / LOST_FILE
         lost.mkdir()
         name = world.recorders[0].directory.name
-        world.orders.reception.lost(name, "/door", 3)
+        world.orders.reception.note_lost(name, "/door", 3)
         [reported] = world.logged(5, "housekeeping_failed")
         assert (reported["task"], "losses" in reported["reason"]) == ("reception", True)
         assert world.heartbeat()["last_error"] == reported["reason"]
