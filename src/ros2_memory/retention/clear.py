@@ -1,10 +1,9 @@
-"""Deletes recordings without a byte, and all bags where that is asked for.
+"""Deletes recordings without a byte, and all bags if `recording.clear_on_startup` is set.
 
-`recording.clear_on_startup` is for simulation and tests, so moments go too. Bags of other programs
-stay, unless retention deletes those as well (`retention.foreign`). Only files that are known by
-name are deleted, and a directory when that leaves it empty. With the last recording goes what is
-known by log times. Links are not followed, and bags of another file system that is mounted below
-are left alone.
+That setting is for simulation and tests, so moments go too. Bags of other programs stay, unless
+retention deletes those as well (`retention.foreign`). Only files with known names are deleted, and
+a directory that becomes empty. State files that refer to log times go with the last recording.
+Links are not followed, and bags of another file system that is mounted below are left alone.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import os
 import pwd
 from contextlib import suppress
 from dataclasses import dataclass, field
-from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -35,8 +33,6 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal, remove_bag, remove_emptied
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
@@ -44,9 +40,9 @@ MOST_FAULTS: Final = 100
 
 @dataclass(slots=True)
 class Cleared:
-    """How many bags were deleted, and a sentence for each of the first that could not be.
+    """How many bags were deleted, their bytes, and a sentence for each that could not be deleted.
 
-    `more` counts the others that could not be.
+    Beyond `MOST_FAULTS` sentences, `more` counts the faults.
     """
 
     files: int = 0
@@ -55,7 +51,7 @@ class Cleared:
     more: int = 0
 
     def delete(self, root: Path, bag: Path, device: int) -> None:
-        """Deletes a bag below the root, if it lies on this device."""
+        """Deletes a bag below the root, unless it lies on another device."""
         try:
             status = bag.lstat()
             if status.st_dev == device:
@@ -65,7 +61,7 @@ class Cleared:
             self.add_fault(bag, error)
 
     def add_fault(self, path: Path | str, error: OSError) -> None:
-        """Reports a file that cannot be deleted; beyond `MOST_FAULTS` only how many there are."""
+        """Adds a file that cannot be deleted; one that has gone is no fault."""
         if isinstance(error, FileNotFoundError):
             return
         if len(self.faults) < MOST_FAULTS:
@@ -84,55 +80,50 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
     root, cleared = bag_dir.resolve(), Cleared()
     try:
         if own is not None:
-            own.names()
+            own.names()  # without this list every bag would count as foreign
         device = root.stat().st_dev
     except OSError as error:
         cleared.add_fault(root, error)
         return cleared
-    touched: list[tuple[Path, bool]] = []
+    had_bags: dict[Path, bool] = {}
     begin = len(str(root)) + 1
 
-    def fail(error: OSError) -> None:
+    def add_fault(error: OSError) -> None:
         if not _is_left_alone(error.filename[begin:]):
             cleared.add_fault(error.filename, error)
 
-    for path, entries in directories.walk(root, fail):
+    for path, entries in directories.walk(root, add_fault):
         if _is_left_alone(path[begin:]):
             continue
         folder = Path(path)
-        holds = own.judge(path[begin:], known_identity(path)) if own else lambda _: True
+        is_own = own.judge(path[begin:], known_identity(path)) if own else lambda _: True
         bags = [
             folder / entry.name
             for entry in entries
-            if bag_kind(entry.name) and entry.is_file(follow_symlinks=False) and holds(entry.name)
+            if bag_kind(entry.name) and entry.is_file(follow_symlinks=False) and is_own(entry.name)
         ]
         for bag in bags:
             cleared.delete(root, bag, device)
-        touched.append((folder, bool(bags)))
-    for folder, had_bags in reversed(touched):  # the deepest first
+        had_bags[folder] = bool(bags)
+    for folder in reversed(had_bags):  # the deepest first
         with suppress(OSError):
-            _remove_emptied(root, folder, had_bags=had_bags)
-    for name in _state_files(cleared, map(itemgetter(0), touched)):
+            _remove_emptied(root, folder, had_bags=had_bags[folder])
+    is_left = any(has_own_name(folder.name) and folder.exists() for folder in had_bags)
+    # The files of times also say which splits of a recording that is left are not screened yet.
+    timed_files = frozenset() if cleared.faults or is_left else TIMED_FILES
+    for name in OWN_FILES | timed_files:
         with suppress(OSError):
             state_path(root, name).unlink()
     return cleared
 
 
-def _state_files(cleared: Cleared, folders: Iterable[Path]) -> frozenset[str]:
-    """Returns the recorder's files that go; what is known by log times, with its last recording."""
-    # Beside one that is left, what is held back of it stays so.
-    is_left = cleared.faults or any(
-        has_own_name(folder.name) and folder.exists() for folder in folders
-    )
-    return OWN_FILES if is_left else OWN_FILES | TIMED_FILES
-
-
 def _is_left_alone(name: str) -> bool:
+    """Whether a path below the bag directory is hidden, or `lost+found`."""
     return "/." in f"/{name}" or name == LOST_AND_FOUND
 
 
 def _remove_emptied(root: Path, folder: Path, *, had_bags: bool) -> None:
-    """Deletes a folder that had bags, or is of moments, if nothing else is left in it."""
+    """Deletes a folder that had bags or belongs to a moment, if nothing else is left in it."""
     moments = root / MOMENTS_FOLDER
     if folder.parent == moments:
         with directories.opened(root, folder) as moment:
@@ -145,7 +136,7 @@ def _remove_emptied(root: Path, folder: Path, *, had_bags: bool) -> None:
 
 
 def refuse_homes(bag_dir: Path) -> None:
-    """Checks that bags may be deleted below a directory, before anything is written there.
+    """Checks that bags may be deleted below a directory.
 
     Raises:
         RecorderError: the directory is `/`, a home directory or above one.
@@ -182,9 +173,11 @@ def remove_if_empty(recording: Path) -> bool:
 
 
 def _is_worthless(entry: os.DirEntry[str]) -> bool:
-    """Whether a file of a recording means nothing where that has no bag with content."""
+    """Whether a file is of no use in a recording whose bags are all empty."""
+    name = entry.name
     if not entry.is_file(follow_symlinks=False):
         return False
-    is_known = bag_kind(entry.name) or is_journal(entry.name) or entry.name == METADATA_FILE
-    is_empty = not entry.stat(follow_symlinks=False).st_size
-    return entry.name == HANDOVER_FILE or bool(is_known and is_empty)
+    if name == HANDOVER_FILE:
+        return True
+    is_known = name == METADATA_FILE or is_journal(name) or bag_kind(name) is not None
+    return is_known and not entry.stat(follow_symlinks=False).st_size

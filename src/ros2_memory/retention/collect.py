@@ -22,11 +22,12 @@ from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import RETRIED_S
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (
+    DeletionPlan,
     DirContents,
     RetentionLimits,
     StoredBag,
+    bags_older_than,
     plan_deletions,
-    too_old,
 )
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
+_FIRST_LOST: Final = 8
+"""One in so many bags is deleted first where what stays of them cannot be written."""
 
 _log = get_logger(__name__)
 
@@ -51,18 +54,20 @@ class Collected:
     """What one pass did.
 
     Attributes:
-        bags: how many were deleted, of so many `bytes`; `failed` could not be.
+        bags: how many bags were deleted; `bytes` is their size. `failed` could not be deleted.
+        recordings: how many directories of recordings were deleted with their last bag.
         carried: how many latched messages are carried, if their bag was rewritten.
         total_bytes: what the budget counts afterwards.
-        saved_bytes: how much of it saved moments take.
+        foreign_bytes: the size of bags of other programs, which no limit counts.
+        state_bytes: how much of the total is no recording: `.episodic` and logs.
+        saved_bytes: how much of the total saved moments take.
         held: how many bags are too old by their dates and stay, since the clock is not known to be
             right.
-        cut: out of how many bags topics were cut.
-        needed: how many of the deleted bags rules may still have needed.
-        unshipped: those of the deleted bags that had to be shipped and were in no lake, relative to
-            the bag directory; without those that are saved in moments.
-        most_free: how much of the disk would be free if all bags were deleted that may be, where
-            that was too little; then none was deleted for it.
+        cut: from how many bags topics were cut.
+        needed: how many deleted bags rules may still have needed.
+        unshipped: the deleted bags that had to be shipped and were in no lake, relative to the bag
+            directory; without bags that are saved in moments.
+        most_free: see `DeletionPlan.most_free`.
     """
 
     bags: int = 0
@@ -83,17 +88,25 @@ class Collected:
 
 @dataclass(slots=True)
 class _Pass:
-    """The state of one pass; bags are paths.
+    """The input and the state of one pass; bags are paths.
 
     Attributes:
+        needed: the bags that rules may still need.
+        needs_disk: whether the pass makes room on the disk.
         urgent: whether it does not wait until carried messages have been known for long enough.
         synchronised: whether the system clock is synchronised; None until asked.
-        waiting: those of the remaining bags that can be deleted some moments later.
-        saved: those of the deleted bags whose files are saved in moments.
-        unshipped: those that had to be shipped, in the order in which they were deleted.
-        gave_up: whether some were deleted though what stays of them could not be written.
+        remaining: bags that this pass does not delete.
+        waiting: the remaining bags that can be deleted some moments later.
+        saved: deleted bags whose files are saved in moments.
+        unshipped: deleted bags that had to be shipped, in the order of deletion.
+        gave_up: whether bags were deleted though what stays of them could not be written.
     """
 
+    known: KnownBags
+    snapshot: Snapshot
+    needed: frozenset[str]
+    limits: RetentionLimits
+    needs_disk: bool
     urgent: bool
     synchronised: bool | None = None
     waiting: set[str] = field(default_factory=set)
@@ -109,11 +122,11 @@ class Outliving(Protocol):
     """What stays of bags that are deleted."""
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
-        """Makes durable what stays of some bags.
+        """Makes durable what stays of the bags.
 
         Raises:
-            EpisodicError: it cannot be written.
-            OSError: likewise.
+            EpisodicError: a bag cannot be read, or what stays of it not be written.
+            OSError: the disk fails.
         """
 
     def limit(self, now: Ns | None) -> None:
@@ -174,7 +187,7 @@ class GarbageCollector:
 
         Args:
             known: the bags that the index knows.
-            snapshot: those of them that answer.
+            snapshot: the bags that answer queries.
             needed: the bags that rules may still need, which no age deletes.
             free_bytes_wanted: how much of the disk must be free; None if that does not count.
 
@@ -182,47 +195,16 @@ class GarbageCollector:
             OSError: the free space cannot be measured, or the list of the recorder's own recordings
                 cannot be read.
         """
-        limits = self.limits
+        limits, needs_disk = self.limits, False
         if free_bytes_wanted is not None:
-            limits = replace(limits, min_free_bytes=free_bytes_wanted)
-        run = _Pass(urgent=free_bytes_wanted is not None)
-        while True:
-            contents = self._contents(known, needed, limits, run)
-            if free_bytes_wanted is not None:
-                contents = replace(contents, free_bytes=self.measure_free(self.bag_dir))
-            # So that what stays of an hour is written once.
-            plan = plan_deletions(contents, limits, whole_hours=self.memory is not None)
-            going = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
-            if going:
-                run.saved |= {
-                    bag.path
-                    for bag in going
-                    if any(file.inode in contents.saved for file in bag.files)
-                }
-                self._carry(going, snapshot, run)
-                left = [bag for bag in going if bag.path not in run.remaining]
-                self._delete_bags(self._keep_memory(left, contents, limits, snapshot, run), run)
-                run.unshipped += sorted(contents.unshipped & run.deleted)
-            elif plan.fits or not run.waiting:
-                break
-            else:
-                run.urgent = True
-                run.remaining -= run.waiting
-                run.waiting.clear()
-        self._remove_emptied(known, run)
+            limits, needs_disk = replace(limits, min_free_bytes=free_bytes_wanted), True
+        run = _Pass(known, snapshot, needed, limits, needs_disk, urgent=needs_disk)
+        contents, plan = self._delete_beyond_limits(run)
+        self._remove_emptied(run)
         if self.memory is not None:
-            # As bags do, days age by the newest that is recorded, and by a clock that is right.
-            newest = snapshot.latest if contents.synchronised else None
-            try:
-                self.memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
-            except (EpisodicError, OSError) as error:
-                _log.error("memory_not_limited", reason=str(error))
-        if self.cutter is not None and free_bytes_wanted is None and plan.fits:
-            left = [bag for bag in contents.bags if bag.path not in run.deleted]
-            try:
-                run.result.cut = self.cutter.cut(replace(contents, bags=left), limits, snapshot)
-            except OSError as error:
-                _log.error("topics_not_cut", reason=error.strerror or str(error))
+            self._limit_memory(self.memory, contents, snapshot)
+        if self.cutter is not None and not needs_disk and plan.fits:
+            self._cut_topics(self.cutter, contents, run)
         return replace(
             run.result,
             total_bytes=plan.total_bytes,
@@ -236,50 +218,92 @@ class GarbageCollector:
             most_free=plan.most_free,
         )
 
-    def _contents(
-        self, known: KnownBags, needed: frozenset[str], limits: RetentionLimits, run: _Pass
-    ) -> DirContents:
+    def _delete_beyond_limits(self, run: _Pass) -> tuple[DirContents, DeletionPlan]:
+        """Deletes bags until the limits are kept; returns what is left, and the last plan."""
+        while True:
+            contents = self._contents(run)
+            # Whole hours, so that what stays of an hour is written once.
+            plan = plan_deletions(contents, run.limits, whole_hours=self.memory is not None)
+            going = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
+            if going:
+                for bag in going:
+                    if any(file.inode in contents.saved for file in bag.files):
+                        run.saved.add(bag.path)
+                self._carry(going, run)
+                left = [bag for bag in going if bag.path not in run.remaining]
+                self._delete_bags(self._bags_with_memory(left, contents, run), run)
+                run.unshipped += sorted(contents.unshipped & run.deleted)
+            elif plan.fits or not run.waiting:
+                return contents, plan
+            else:
+                run.urgent = True
+                run.remaining -= run.waiting
+                run.waiting.clear()
+
+    def _limit_memory(self, memory: Outliving, contents: DirContents, snapshot: Snapshot) -> None:
+        # As bags do, days age by the newest that is recorded, and by a clock that is right.
+        newest = snapshot.latest if contents.synchronised else None
+        try:
+            memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
+        except (EpisodicError, OSError) as error:
+            _log.error("memory_not_limited", reason=str(error))
+
+    def _cut_topics(self, cutter: TopicCutter, contents: DirContents, run: _Pass) -> None:
+        left = [bag for bag in contents.bags if bag.path not in run.deleted]
+        try:
+            run.result.cut = cutter.cut(replace(contents, bags=left), run.limits, run.snapshot)
+        except OSError as error:
+            _log.error("topics_not_cut", reason=error.strerror or str(error))
+
+    def _contents(self, run: _Pass) -> DirContents:
         """Returns what is stored, how long was recorded after it, and where the clock was right."""
-        contents = self._inventory.contents(known, deleted=run.deleted, remaining=run.remaining)
+        contents = self._inventory.contents(run.known, deleted=run.deleted, remaining=run.remaining)
         root = f"{self.bag_dir}{os.sep}"
         names = {bag.recording: self.own.name_of(bag.recording) for bag in contents.bags}
         since = self.recorded.since(names.values())
         doubtful = self.recorded.doubtful(names.values())
         order = {name: place for place, name in enumerate(self.own.in_order())}
         bags = ((bag.path.removeprefix(root), bag.size) for bag in contents.bags)
-        missing = unshipped(self.bag_dir, bags) if limits.require_shipped else ()
+        missing = unshipped(self.bag_dir, bags) if run.limits.require_shipped else ()
         contents = replace(
             contents,
+            free_bytes=self.measure_free(self.bag_dir) if run.needs_disk else None,
             recorded_since={path: since[name] for path, name in names.items()},
             doubtful=frozenset(path for path, name in names.items() if name in doubtful),
             places={path: order[name] for path, name in names.items() if name in order},
-            needed=needed,
+            needed=run.needed,
             unshipped=frozenset(root + path for path in missing),
         )
-        old = too_old(contents, limits, limits.max_age_ns)
-        # Asking starts a program, so only where it matters.
-        asks = self.recorded.asks_for_clock() or self.cutter is not None
-        if run.synchronised is None and (old[True] != old[False] or asks):
+        aged = bags_older_than(contents, run.limits, run.limits.max_age_ns)
+        is_clock_decisive = aged.if_synchronised != aged.if_unsynchronised
+        if is_clock_decisive or self.recorded.asks_for_clock() or self.cutter is not None:
+            self._ask_clock(run)
+        synchronised = bool(run.synchronised)
+        held = aged.if_synchronised - aged.by_clock(synchronised=synchronised)
+        run.result.held = len(held)
+        return replace(contents, synchronised=synchronised)
+
+    def _ask_clock(self, run: _Pass) -> None:
+        """Asks once in a pass whether the clock is synchronised, as that starts a program."""
+        if run.synchronised is None:
             run.synchronised = self.is_synchronised()
             if run.synchronised:
                 self.recorded.confirm_clock()
-        synchronised = bool(run.synchronised)
-        run.result.held = 0 if synchronised else len(old[True] - old[False])
-        return replace(contents, synchronised=synchronised)
 
-    def _carry(self, to_delete: Sequence[StoredBag], snapshot: Snapshot, run: _Pass) -> None:
-        """Carries latched messages on; bags remain of which that failed, or was just done."""
+    def _carry(self, to_delete: Sequence[StoredBag], run: _Pass) -> None:
+        """Carries latched messages on. A bag remains if that failed, or was done just now."""
         paths = {Path(path) for path in (*run.deleted, *(bag.path for bag in to_delete))}
-        files = {bag.file for bag in self.carrier.with_latched(snapshot, paths)}
+        files = {bag.file for bag in self.carrier.with_latched(run.snapshot, paths)}
         latched = [bag for bag in to_delete if bag.path in files]
         try:
-            carried = self.carrier.carry(snapshot, paths, {*map(Path, run.saved)})
+            carried = self.carrier.carry(run.snapshot, paths, {*map(Path, run.saved)})
         except (EpisodicError, OSError) as error:
             # Bags without latched messages can still be deleted, and may free enough space.
             for bag in latched:
                 self._keep_failed(bag, f"its latched messages cannot be carried on: {error}", run)
             return
-        run.result.carried = run.result.carried if carried is None else carried
+        if carried is not None:
+            run.result.carried = carried
         now = self.monotonic()
         for bag in latched:
             # Queries may still look for latched messages there, though they are carried.
@@ -288,90 +312,94 @@ class GarbageCollector:
                 run.remaining.add(bag.path)
                 run.waiting.add(bag.path)
 
-    def _keep_memory(
-        self,
-        going: list[StoredBag],
-        contents: DirContents,
-        limits: RetentionLimits,
-        snapshot: Snapshot,
-        run: _Pass,
+    def _bags_with_memory(
+        self, going: list[StoredBag], contents: DirContents, run: _Pass
     ) -> list[StoredBag]:
-        """Writes what stays of bags; returns those that go now.
-
-        Where that fails, age waits for a day, the limits do not. Then only the bags go that must,
-        and not those that would go with them, in the same hour; few at first, as that makes room to
-        write what stays of the others.
-        """
+        """Writes what stays of bags; returns the bags that may be deleted now."""
         if self.memory is None:
             return going
-        paths = {bag.path for bag in going}
         try:
             # A moment has all messages of its bags.
-            self.memory.keep(snapshot, paths - run.saved)
+            self.memory.keep(run.snapshot, {bag.path for bag in going} - run.saved)
         except (EpisodicError, OSError) as error:
-            now = self.monotonic()
-            since = now if self._memory_fails_since is None else self._memory_fails_since
-            self._memory_fails_since = since
-            if now - since < RETRIED_S:
-                everything = frozenset(bag.path for bag in contents.bags)
-                contents = replace(contents, needed=everything)  # by no age
-            must_go = {bag.path for bag in plan_deletions(contents, limits).to_delete}
-            waiting = paths - must_go
-            run.remaining |= waiting
-            going = [bag for bag in going if bag.path in must_go]
-            if not run.gave_up:
-                run.gave_up, going = True, going[: 1 + len(going) // 8]
-            _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=len(going))
-        else:
-            self._memory_fails_since = None
+            return self._bags_that_must_go(going, contents, run, str(error))
+        self._memory_fails_since = None
         return going
 
-    def _delete_bags(self, going: Sequence[StoredBag], run: _Pass) -> None:
-        self._write_down(going)
-        for bag in going:
-            self._delete_bag(bag, run)
-        # Where the disk was full, there is room now.
-        self._write_down(())
+    def _bags_that_must_go(
+        self, going: list[StoredBag], contents: DirContents, run: _Pass, reason: str
+    ) -> list[StoredBag]:
+        """Returns the bags to delete though what stays of them cannot be written; others remain.
 
-    def _write_down(self, going: Sequence[StoredBag]) -> None:
-        """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""
+        For a day, only the limits delete such bags, not their age. No bag goes only since others of
+        its hour do. The first time in a pass few are returned: without them the disk may have room
+        for what stays of the others.
+        """
+        now = self.monotonic()
+        if self._memory_fails_since is None:
+            self._memory_fails_since = now
+        if now - self._memory_fails_since < RETRIED_S:
+            # No age deletes what is needed.
+            contents = replace(contents, needed=frozenset(bag.path for bag in contents.bags))
+        must_go = {bag.path for bag in plan_deletions(contents, run.limits).to_delete}
+        waiting = {bag.path for bag in going} - must_go
+        run.remaining |= waiting
+        lost = [bag for bag in going if bag.path in must_go]
+        if not run.gave_up:
+            run.gave_up = True
+            lost = lost[: 1 + len(lost) // _FIRST_LOST]
+        _log.error("memory_not_kept", reason=reason, waiting=len(waiting), lost=len(lost))
+        return lost
+
+    def _delete_bags(self, going: Sequence[StoredBag], run: _Pass) -> None:
+        """Writes down what is deleted, and deletes it. A full disk does not stop deletion."""
         splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
         for bag in going:
             name = self.own.name_of(bag.recording)
             splits[name].append((bare_name(bag.path), bag.start, bag.end))
         self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
-        if not self._unwritten:
-            return
+        self._append_unwritten()
+        for bag in going:
+            self._delete_bag(bag, run)
+        # Where the disk was full, there is room now.
+        error = self._append_unwritten()
+        if error is not None:
+            _log.warning("deletions_not_written", reason=error.strerror or str(error))
+            self._unwritten = self._unwritten[-MOST_AT_ONCE:]
+
+    def _append_unwritten(self) -> OSError | None:
+        """Writes down the deletions that are not; returns the error if that fails."""
         try:
-            append_deleted(self.bag_dir, self._unwritten)
+            if self._unwritten:
+                append_deleted(self.bag_dir, self._unwritten)
         except OSError as error:
-            if not going:
-                _log.warning("deletions_not_written", reason=error.strerror or str(error))
-                self._unwritten = self._unwritten[-MOST_AT_ONCE:]
-        else:
-            self._unwritten.clear()
+            return error
+        self._unwritten.clear()
+        return None
 
     def _delete_bag(self, bag: StoredBag, run: _Pass) -> None:
         size = 0
+        # Most bags have one form only.
         for path, file in zip((bag.path, other_form(bag.path)), bag.files, strict=False):
             try:
                 freed = remove_bag(self.bag_dir, Path(path), file.inode)
-                size += 0 if path in run.saved else freed
             except FileNotFoundError:
                 continue
             except OSError as error:
                 self._keep_failed(bag, str(error), run)
                 return
+            if path not in run.saved:
+                size += freed
         self._reported.discard(bag.path)
         self._carried_since.pop(bag.path, None)
         run.deleted.add(bag.path)
         run.result.bags += 1
         run.result.bytes += size
 
-    def _remove_emptied(self, known: KnownBags, run: _Pass) -> None:
+    def _remove_emptied(self, run: _Pass) -> None:
         """Deletes what is left of recordings without a bag, except those being written."""
         self.emptied |= {Path(path).parent for path in run.deleted}
-        for recording in self.emptied - {self.bag_dir / name for name in known.named}:
+        for recording in self.emptied - {self.bag_dir / name for name in run.known.named}:
             try:
                 remove_emptied(self.bag_dir, recording)
             except OSError as error:

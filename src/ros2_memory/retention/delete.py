@@ -33,10 +33,10 @@ def repair_name(name: str) -> str:
 
 @contextmanager
 def beside(path: Path) -> Iterator[Path]:
-    """Yields a name beside a bag for its new content; nothing has that name after the block.
+    """Yields a path beside a bag for its new content. No file has that path after the block.
 
     Raises:
-        OSError: what an interrupted block left under that name cannot be deleted.
+        OSError: the file that an interrupted block left there cannot be deleted.
     """
     new = path.with_name(repair_name(path.name))
     new.unlink(missing_ok=True)
@@ -67,16 +67,17 @@ def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
             reason = "it is not the file that was looked at"
             raise OSError(errno.ESTALE, reason, str(path))
         os.unlink(path.name, dir_fd=directory)
-        for suffix in _JOURNALS if path.suffix.lower() == ".db3" else ():
-            with suppress(FileNotFoundError, IsADirectoryError):
-                os.unlink(path.name + suffix, dir_fd=directory)
+        if path.suffix.lower() == ".db3":
+            for suffix in _JOURNALS:
+                with suppress(FileNotFoundError, IsADirectoryError):
+                    os.unlink(path.name + suffix, dir_fd=directory)
         return status.st_size
 
 
 def remove_emptied(root: Path, recording: Path) -> None:
-    """Deletes a recording of which no bag is left.
+    """Deletes the directory of a recording that has no bag any more.
 
-    A file that is not known by name is kept, and so is the directory then.
+    An unknown file stays, and then the directory does, too.
 
     Raises:
         OSError: a file or the directory cannot be deleted.
@@ -99,7 +100,7 @@ def remove_emptied(root: Path, recording: Path) -> None:
 
 
 def beside_bags(recording: Path) -> int:
-    """Returns the bytes that are deleted with a recording's last bag; 0 for what cannot be read."""
+    """Returns the bytes of the files that are deleted with a recording's last bag."""
     size = 0
     with suppress(OSError), os.scandir(recording) as entries:
         for entry in entries:
@@ -111,18 +112,19 @@ def beside_bags(recording: Path) -> int:
 def _is_sidecar(entry: os.DirEntry[str]) -> bool:
     """Whether an entry of a recording is a file that has no meaning without its bags.
 
-    Those are the recorder's sidecars, and what a crash left of files being written.
+    Those are the recorder's sidecars, and unfinished files that a crash left.
     """
-    left = _LEFTOVER.fullmatch(entry.name)
-    if left is None:
-        goes = entry.name in RECORDING_FILES or is_journal(entry.name)
+    leftover = _LEFTOVER.fullmatch(entry.name)
+    if leftover is None:
+        is_known = entry.name in RECORDING_FILES or is_journal(entry.name)
     else:
-        goes = left["target"] in RECORDING_FILES or bag_kind(left["bag"] or "") is not None
-    return goes and entry.is_file(follow_symlinks=False)
+        is_sidecar = leftover["target"] in RECORDING_FILES
+        is_known = is_sidecar or bag_kind(leftover["bag"] or "") is not None
+    return is_known and entry.is_file(follow_symlinks=False)
 
 
 def size_of(path: Path) -> int:
-    """Returns the bytes of a regular file; 0 for anything else, and for what cannot be read."""
+    """Returns the size of a regular file in bytes, or 0 if it is none or cannot be looked at."""
     with suppress(OSError):
         status = path.lstat()
         return status.st_size if stat.S_ISREG(status.st_mode) else 0

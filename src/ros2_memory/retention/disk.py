@@ -1,4 +1,4 @@
-"""The disk of the bag directory: is it still the one on which recording began, and what fails?
+"""Whether the bag directory still lies on the disk on which recording began, and reads that fail.
 
 When a disk is unmounted under a running recorder, the path of the bag directory names a directory
 of the disk below it, mostly the system disk, which recordings would fill.
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 RETRIED_S: Final = 86_400.0
-"""So long it is tried again what the disk refuses; after that it counts as lost."""
+"""How long an operation that the disk refuses is tried again; then the data counts as lost."""
 _READ_BETWEEN_S: Final = 3600.0
-"""What is tried every minute and has not failed for so long was read, and fails anew."""
+"""A file is tried every minute. One that has not failed for so long was read in between."""
 
 
 def free_bytes(directory: Path) -> int:
@@ -31,10 +31,10 @@ def free_bytes(directory: Path) -> int:
 
 
 def device_of(directory: Path) -> int:
-    """Returns the device that a directory lies on, or would lie on if it were made.
+    """Returns the device of a directory; if it does not exist, that of its nearest parent.
 
     Raises:
-        OSError: it cannot be looked at.
+        OSError: the directory cannot be looked at.
     """
     for existing in (directory, *directory.parents):
         try:
@@ -68,20 +68,21 @@ class HomeDisk:
         self.away = False
 
     def is_away(self, recordings: Collection[str]) -> bool:
-        """Whether another disk lies there now; the answer from before if that cannot be read.
+        """Whether the bag directory lies on another disk now; the last answer if that is unknown.
 
-        A disk may come back under another device number, so one with a recording of this run is
-        taken for the same.
+        A disk may come back under another device number, so a disk with a recording of this run
+        counts as the same.
 
         Args:
-            recordings: those that are being written and exist.
+            recordings: the recordings that are being written and exist.
         """
         if recordings and not self.away:
             self._recordings = frozenset(recordings)
         try:
             device = self._device_of(self._bag_dir)
-            is_other = device != self._device
-            if is_other and any((self._bag_dir / name).is_dir() for name in self._recordings):
+            if device != self._device and any(
+                (self._bag_dir / name).is_dir() for name in self._recordings
+            ):
                 self._device = device
         except OSError:
             return self.away
@@ -90,16 +91,16 @@ class HomeDisk:
 
 
 class FailingFiles:
-    """Since when the disk fails to read files, so that those bad for good are given up."""
+    """Remembers since when the disk fails to read files, to give up the ones that are bad."""
 
     def __init__(self, monotonic: Callable[[], float]) -> None:
         self._monotonic = monotonic
         self._failed: dict[Path, tuple[float, float]] = {}
 
     def may_recover(self, path: Path, error: Exception) -> bool:
-        """Returns whether the disk fails to read a file, and has done so for less than `RETRIED_S`.
+        """Returns whether to try a file again, whose reading has just raised `error`.
 
-        `error` is what reading the file raised now.
+        That is so while the disk has failed to read it for less than `RETRIED_S`.
         """
         if not isinstance(error, BagUnreachableError):
             return False

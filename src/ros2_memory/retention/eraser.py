@@ -53,7 +53,7 @@ from ros2_memory.index.file_state import reason_unread
 from ros2_memory.retention.delete import beside, repair_name
 from ros2_memory.retention.repair import (
     Identity,
-    metadata_corrected,
+    correct_metadata_files,
     open_files,
     opened_folder,
     reason_of,
@@ -75,13 +75,13 @@ _Window = tuple[str, int, int]
 
 @dataclass(slots=True)
 class Holder:
-    """A bag file that holds messages which go.
+    """A bag file with messages that go.
 
     Attributes:
         paths: all its names in the bag directory that may be changed.
-        counts: the messages that go, by topic.
-        windows: likewise, by topic and window.
-        ids: what identifies those of them in sidecars that one may list, by topic.
+        counts: how many messages go, by topic.
+        windows: how many messages go, by topic and window.
+        ids: the ids of the messages in sidecars, by topic; only of topics that a sidecar lists.
     """
 
     paths: tuple[Path, ...]
@@ -92,22 +92,26 @@ class Holder:
 
 
 class Survey(NamedTuple):
-    """Which bags hold messages that go, and a line with the reason for each that is kept."""
+    """The bags with messages that go, and a line with the reason for each bag that is kept."""
 
     holders: tuple[Holder, ...]
     kept: tuple[str, ...]
 
     @property
     def counts(self) -> Counter[str]:
-        """The messages that go, by topic."""
+        """How many messages go, by topic."""
         return sum((holder.counts for holder in self.holders), Counter[str]())
 
 
-class Kept(NamedTuple):
-    """A line for each thing of which something stays, and other lines on what was done."""
+class ErasureResult(NamedTuple):
+    """A line with the reason for each file that keeps messages, and notes on what was done."""
 
     kept: tuple[str, ...]
     notes: tuple[str, ...]
+
+
+class _KeptBagError(Exception):
+    """A bag must not be rewritten; the text is the reason."""
 
 
 @dataclass(eq=False, repr=False)
@@ -117,8 +121,8 @@ class Eraser:
     Args:
         reader: reads files as they are, also what does not count in answers.
         own: the recordings that may be changed; None: all.
-        written: files that are still being written, and what they may hold; None: unknown.
-        recorder: why a recorder holds the directory; None where none does, nor can begin to.
+        written: files that are being written, and the window of their messages; None: unknown.
+        recorder: why only a recorder may change some files; None if none runs or can begin to.
     """
 
     bag_dir: Path
@@ -130,7 +134,7 @@ class Eraser:
     recorder: str | None
 
     def topics(self) -> frozenset[str]:
-        """Returns the topics of all bags that can be read; of those that do not count too."""
+        """Returns the topics of all bags that can be read, also of bags that do not count."""
         topics: set[str] = set()
         for paths in self._paths_by_inode().values():
             with suppress(BagError):
@@ -138,64 +142,61 @@ class Eraser:
         return frozenset(topics)
 
     def survey(self, erasure: Erasure) -> Survey:
-        """Returns which bags hold messages that go; changes nothing."""
+        """Returns which bags have messages that go; changes nothing."""
         holders: list[Holder] = []
         kept: list[str] = []
         for inode, paths in sorted(self._paths_by_inode().items(), key=itemgetter(1)):
             try:
-                judged = self._holder_or_reason(erasure, paths, inode)
+                holder = self._holder_in(erasure, paths, inode)
+            except _KeptBagError as error:
+                kept.append(f"{self._relative(paths[0])}: {error}")
             except (BagError, OSError) as error:
-                if not any(map(self._may_change, paths)):
-                    continue
-                judged = f"its contents are unknown: {reason_of(error)}"
-            if isinstance(judged, str):
-                kept.append(f"{self._relative(paths[0])}: {judged}")
-            elif judged is not None:
-                holders.append(judged)
-                foreign = [path for path in paths if path not in judged.paths]
-                kept.extend(f"{self._relative(path)}: {_FOREIGN}" for path in foreign)
+                if any(map(self._may_change, paths)):
+                    reason = f"its contents are unknown: {reason_of(error)}"
+                    kept.append(f"{self._relative(paths[0])}: {reason}")
+            else:
+                if holder is not None:
+                    holders.append(holder)
+                    foreign = [path for path in paths if path not in holder.paths]
+                    kept += [f"{self._relative(path)}: {_FOREIGN}" for path in foreign]
         return Survey(tuple(holders), tuple(kept))
 
-    def _holder_or_reason(
-        self, erasure: Erasure, paths: Sequence[Path], inode: Identity
-    ) -> Holder | str | None:
-        """Returns what of a file goes; why it is kept; or None where it holds nothing that goes.
+    def _holder_in(self, erasure: Erasure, paths: Sequence[Path], inode: Identity) -> Holder | None:
+        """Returns what of a file goes, or None if it has no message that goes.
 
         Raises:
+            _KeptBagError: it has, or may have, but must not be rewritten.
             BagError: it cannot be read.
             OSError: it has gone.
         """
-        if not self.reader.reads(paths[0]):
-            return reason_unread(paths[0])
-        if paths[0] in self.written:
-            span = self.written[paths[0]]
+        path = paths[0]
+        if not self.reader.reads(path):
+            raise _KeptBagError(reason_unread(path))
+        if path in self.written:
+            span = self.written[path]
             if span is not None and span.start >= erasure.windows[-1][1]:
                 return None
-            return "it is being written; forget again when it is closed"
-        if not paths[0].lstat().st_size:
+            raise _KeptBagError("it is being written; forget again when it is closed")
+        if not path.lstat().st_size:
             return None
-        summary = self.reader.summarize(paths[0])
-        topics = [
-            topic
-            for topic in erasure.topics
-            if any(
-                topic in erasure.latched or (start <= total.last and total.first < stop)
-                for total in summary.of(topic)
-                for start, stop in erasure.windows
-            )
-        ]
+        summary = self.reader.summarize(path)
+        topics = [topic for topic in erasure.topics if _may_have_messages(summary, topic, erasure)]
         holder = self._read_holder(erasure, topics, paths, inode)
         if not holder.counts:
             return None
-        return self._reason_to_keep(paths, inode, summary) or holder
+        if reason := self._reason_to_keep(paths, inode, summary):
+            raise _KeptBagError(reason)
+        return holder
 
-    def erase(self, erasure: Erasure, survey: Survey, forgotten: Callable[[Erasure], None]) -> Kept:
-        """Takes the messages out, durably; returns what of them stays, and why.
+    def erase(
+        self, erasure: Erasure, survey: Survey, forgotten: Callable[[Erasure], None]
+    ) -> ErasureResult:
+        """Takes the messages out, durably; returns where some stay, and why.
 
         Args:
-            erasure: which; where it was interrupted, with its files.
-            survey: what holds them now.
-            forgotten: has everything derived from the files forget them. It may raise an
+            erasure: which messages go; `files` are set if an earlier attempt was interrupted.
+            survey: which bags have such messages now.
+            forgotten: deletes the messages from everything derived from the files. It may raise an
                 `EpisodicError`, and then the erasure counts as not finished.
 
         Raises:
@@ -212,57 +213,69 @@ class Eraser:
         for holder in survey.holders:
             try:
                 if line := self._erase_in(holder, erasure):
-                    again = any(map(self._may_change, self._paths_by_inode().get(holder.inode, ())))
-                    (kept if again else linked).append(line)
+                    # Another attempt takes nothing out of links elsewhere, as a backup has them.
+                    can_retry = any(map(self._may_change, self._paths_of(holder.inode)))
+                    (kept if can_retry else linked).append(line)
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
-        bags = [self.bag_dir / name for name in erasure.files]
-        recordings = {path.parent for path in bags}
-        notes = [*metadata_corrected(self.bag_dir, recordings, self.reader)]
+        recordings = {(self.bag_dir / name).parent for name in erasure.files}
+        notes = correct_metadata_files(self.bag_dir, recordings, self.reader)
         try:
-            for path in bags:  # what an interrupted erasure left beside them
-                with (
-                    suppress(FileNotFoundError, NotADirectoryError),
-                    directories.opened(self.bag_dir, path.parent) as folder,
-                ):
-                    os.unlink(repair_name(path.name), dir_fd=folder)
+            self._delete_leftovers(erasure)
             self._forget_silences(erasure)
             forgotten(erasure)
-            # Answers report them as lost.
-            known = read_losses(self.bag_dir, MIN_NS, MAX_NS)
-            losses = (
-                Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
-                for gone in erasure.counts
-            )
-            append_losses(self.bag_dir, [loss for loss in losses if loss not in known])
-            # Another attempt takes nothing out of links elsewhere, as a backup has them.
+            self._report_losses(erasure)
             if not kept:
                 ERASING.remove(self.bag_dir)
         except (EpisodicError, OSError) as error:
             kept.append(reason_of(error))
-        return Kept((*kept, *linked), tuple(notes))
+        return ErasureResult((*kept, *linked), tuple(notes))
+
+    def _delete_leftovers(self, erasure: Erasure) -> None:
+        """Deletes the new files that an interrupted erasure left beside the bags."""
+        for name in erasure.files:
+            path = self.bag_dir / name
+            with (
+                suppress(FileNotFoundError, NotADirectoryError),
+                directories.opened(self.bag_dir, path.parent) as folder,
+            ):
+                os.unlink(repair_name(path.name), dir_fd=folder)
+
+    def _report_losses(self, erasure: Erasure) -> None:
+        """Has answers report the messages as lost; an earlier attempt may have done so."""
+        known = read_losses(self.bag_dir, MIN_NS, MAX_NS)
+        losses = (
+            Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
+            for gone in erasure.counts
+        )
+        append_losses(self.bag_dir, [loss for loss in losses if loss not in known])
 
     def _forget_silences(self, erasure: Erasure) -> None:
-        """Takes the silences of topics in the windows out of what is known of deleted bags.
+        """Deletes the silences of forgotten topics and windows from what is known of deleted bags.
 
         Raises:
-            BagError: a recorder runs, which alone may write it then.
-            OSError: it cannot be read or written.
+            BagError: the file is damaged, or a recorder runs, which alone may write it.
+            OSError: the file cannot be read or written.
         """
         try:
             thinned = THINNED.read(self.bag_dir) or Thinned()
         except ValueError as error:
             raise BagError(THINNED_FILE, f"it is damaged, delete it: {error}") from error
-        left = tuple(
-            silence
-            for silence in thinned.silences
-            if silence[0] not in erasure.topics
-            or not any(start <= silence[2] and silence[1] < stop for start, stop in erasure.windows)
-        )
-        if left != thinned.silences:
+        left = []
+        for silence in thinned.silences:
+            topic, first, last, *_ = silence
+            is_forgotten = topic in erasure.topics and any(
+                start <= last and first < stop for start, stop in erasure.windows
+            )
+            if not is_forgotten:
+                left.append(silence)
+        if len(left) < len(thinned.silences):
             if self.recorder is not None:
                 raise BagError(THINNED_FILE, _recorder_refuses(self.recorder))
-            THINNED.write(self.bag_dir, replace(thinned, silences=left))
+            THINNED.write(self.bag_dir, replace(thinned, silences=tuple(left)))
+
+    def _paths_of(self, inode: Identity) -> Sequence[Path]:
+        return self._paths_by_inode().get(inode, ())
 
     def _paths_by_inode(self) -> dict[Identity, list[Path]]:
         """Returns the paths of every bag file by device and inode, the recorded one first."""
@@ -287,6 +300,7 @@ class Eraser:
             reason = "it is compressed as a whole; decompress it (zstd -d --rm), and forget again"
         elif self.reader.closing(path) is Closing.OPEN or not summary.complete:
             reason = "a crash left it open; ros2-memory recover closes it"
+        # Nothing in a file of such a format shows whether its writer is done.
         elif path.suffix in UNMARKED_KINDS and inode in open_files():
             reason = "a program has it open; close that, and forget again"
         elif summary.notes:
@@ -303,11 +317,11 @@ class Eraser:
     ) -> Holder:
         """Reads which messages of a file go."""
         holder = Holder(tuple(path for path in paths if self._may_change(path)), inode)
-        listed = set[str]()  # the topics of which a sidecar lists messages
+        listed_topics = set[str]()  # topics with messages in a sidecar
         for path in holder.paths:
             handover = read_handover(path.parent).handover
             for message_list in (handover.also_counts, handover.counts_elsewhere):
-                listed.update(message_list.get(path.name, ()))
+                listed_topics.update(message_list.get(path.name, ()))
         all_windows = TimeWindow(erasure.windows[0][0], erasure.windows[-1][1])
         for topic in topics:
             span = TimeWindow.everything() if topic in erasure.latched else all_windows
@@ -316,17 +330,17 @@ class Eraser:
                 if window is not None:
                     holder.counts[topic] += 1
                     holder.windows[topic, *window] += 1
-                    if topic in listed:
+                    if topic in listed_topics:
                         identity = message_id(record.publish_time, record.payload)
                         holder.ids.setdefault(topic, set()).add(identity)
         return holder
 
     def _erase_in(self, holder: Holder, erasure: Erasure) -> str | None:
-        """Rewrites one file, under all its names; returns a line where other names are left.
+        """Rewrites one file under all its names; returns a line if the old one has names left.
 
         Raises:
-            EpisodicError: it cannot be rewritten.
-            OSError: likewise, or it is another file now.
+            EpisodicError: the file cannot be rewritten, or is another one now.
+            OSError: the file cannot be rewritten.
         """
         for path in holder.paths:
             self._clear_sidecar(path, holder.ids)
@@ -347,7 +361,7 @@ class Eraser:
                     self._replace_link(new, other, holder.inode)
             if os.fstat(old.fileno()).st_nlink:
                 # A recorder may have kept the old file in a moment meanwhile.
-                for late in filter(self._may_change, self._paths_by_inode().get(holder.inode, ())):
+                for late in filter(self._may_change, self._paths_of(holder.inode)):
                     self._replace_link(path, late, holder.inode)
             left = os.fstat(old.fileno()).st_nlink
         if left:
@@ -367,11 +381,11 @@ class Eraser:
     def _clear_sidecar(self, path: Path, ids: Ids) -> None:
         """Takes messages of a file out of the sidecar in its folder.
 
-        Its time stays: what counts of the other files stays, too.
+        The sidecar's mtime stays, since what counts of the recording's other files does, too.
 
         Raises:
-            EpisodicError: it cannot be changed.
-            OSError: likewise.
+            EpisodicError: the sidecar's recorder still writes it, or it is damaged.
+            OSError: the sidecar cannot be read or written.
         """
         folder = path.parent
         target = folder / HANDOVER_FILE
@@ -394,15 +408,26 @@ class Eraser:
         return os.path.relpath(path, self.bag_dir)
 
 
-def _without_messages(listed: MessageList, file: str, ids: Ids) -> MessageList:
-    """Returns lists of a sidecar without messages of a file."""
-    topics = {
-        topic: tuple(message for message in messages if message not in ids.get(topic, ()))
-        for topic, messages in listed.get(file, {}).items()
-    }
-    left = {topic: messages for topic, messages in topics.items() if messages}
-    others = {name: by_topic for name, by_topic in listed.items() if name != file}
-    return {**others, file: left} if left else others
+def _may_have_messages(summary: BagSummary, topic: str, erasure: Erasure) -> bool:
+    """Whether a bag may have messages of a topic that go; latched ones go at any log time."""
+    totals = summary.of(topic)
+    if topic in erasure.latched:
+        return bool(totals)
+    return any(
+        start <= total.last and total.first < stop
+        for total in totals
+        for start, stop in erasure.windows
+    )
+
+
+def _without_messages(message_list: MessageList, file: str, ids: Ids) -> MessageList:
+    """Returns a list of a sidecar without the messages of a file that have the ids."""
+    left = {}
+    for topic, messages in message_list.get(file, {}).items():
+        if others := tuple(id_ for id_ in messages if id_ not in ids.get(topic, ())):
+            left[topic] = others
+    without_file = {name: topics for name, topics in message_list.items() if name != file}
+    return {**without_file, file: left} if left else without_file
 
 
 def _recorder_refuses(reason: str) -> str:

@@ -1,8 +1,8 @@
 """Lists what this program put into the bag directory, and which of it may be deleted.
 
-The index knows the bags. Retention also needs to know which recordings are the recorder's own, what
-goes with the last bag of a recording, what must not be deleted, and which files are two names of
-one. Only what changed is worked out again, since a week has 60,000 bags.
+The index knows the bags. Retention also needs to know which recordings are the recorder's own,
+which files go with the last bag of a recording, which must not be deleted, and which are hard links
+of one another. What did not change is not looked at again, since a week has 60,000 bags.
 """
 
 from __future__ import annotations
@@ -41,13 +41,15 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_table import KnownBags
+    from ros2_memory.index.scan import Stamp
     from ros2_memory.index.snapshot import Snapshot
 
 
 class Foreign(NamedTuple):
     """The bags that the recorder did not make, which retention neither counts nor deletes.
 
-    `files` are those that answer queries and `bag_bytes` their size; `total_bytes` is that of all.
+    `files` are the bags that answer queries, and `bag_bytes` is their size. `total_bytes` also has
+    the bags that cannot be read.
     """
 
     files: frozenset[str]
@@ -58,7 +60,7 @@ class Foreign(NamedTuple):
 class ForeignBags:
     """Measures the foreign bags of one bag directory. Thread-safe.
 
-    The last result is returned again while neither the index nor the list changed.
+    It measures again only if the index or the list of the recorder's recordings changed.
     """
 
     def __init__(self, bag_dir: Path) -> None:
@@ -66,7 +68,7 @@ class ForeignBags:
         self._measured: tuple[tuple[object, ...], Foreign | None] = ((), None)
 
     def measured(self, snapshot: Snapshot, recording: Collection[str]) -> Foreign | None:
-        """Measures them; returns None if no recorder has listed yet which recordings are its own.
+        """Returns the foreign bags, or None if no recorder has listed its own recordings yet.
 
         `recording` are the recordings that the recorder's heartbeat names.
         """
@@ -96,15 +98,14 @@ class ForeignBags:
             for bag in segment.bags
             if is_foreign(bag.file)
         }
-        asides = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
-        beside = [aside for aside in asides if not aside.answers and is_foreign(str(aside.path))]
-        bag_bytes = sum(bags.values())
-        return Foreign(
-            frozenset(bags), bag_bytes, bag_bytes + sum(size_of(aside.path) for aside in beside)
-        )
+        bag_bytes = total_bytes = sum(bags.values())
+        for aside in (*snapshot.active, *snapshot.damaged, *snapshot.unread):
+            if not aside.answers and is_foreign(str(aside.path)):
+                total_bytes += size_of(aside.path)
+        return Foreign(frozenset(bags), bag_bytes, total_bytes)
 
     def _judge(self, folder: str, recording: frozenset[str]) -> Callable[[str], bool]:
-        """Returns what decides by its name whether a bag in a directory counts in the budget."""
+        """Returns a function that says whether a bag file of a directory counts in the budget."""
         name, identity = self._own.name_of(folder), known_identity(folder)
         is_new = name in recording and not self._own.lists(name, identity)
         if is_new or name.partition("/")[0] == MOMENTS_FOLDER:
@@ -117,17 +118,15 @@ OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
 COMPLETE_AFTER_NS: Final[Ns] = 120 * NS_PER_S
 """A directory that has not changed for so long is complete."""
 _UNDATED: Final = (MAX_NS, MIN_NS)
-
-
 _CLOSED: Final = frozenset({FileState.CLOSED, FileState.EMPTY})
-"""May be deleted."""
+"""States of bags that may be deleted."""
 _LEFT_OPEN: Final = frozenset({FileState.INCOMPLETE, FileState.HELD_BACK})
-"""May be deleted unless the recorder names the recording in the heartbeat; held back ones, too,
-else a disk too full for their cuts would stay full."""
+"""States of bags that may be deleted unless the heartbeat names their recording. Bags that are held
+back may, too, else a disk too full to cut them would stay full."""
 
 
 class _Folder(NamedTuple):
-    """A recording's directory: its device, and the size of what goes with its last bag."""
+    """A recording's directory: its device, and the bytes that go with its last bag."""
 
     mtime_ns: Ns
     device: int
@@ -153,7 +152,7 @@ class Inventory:
         self._own = own
         self._static_topics = frozenset(static_topics)
         self._device: int | None = None
-        self._unchanged: dict[str, StoredBag] = {}
+        self._settled_bags: dict[str, StoredBag] = {}
         self._folders: dict[str, _Folder] = {}
 
     def contents(
@@ -169,7 +168,7 @@ class Inventory:
         """
         device = self._root.stat().st_dev
         if device != self._device:  # a disk may come back under another number
-            self._device, self._unchanged, self._folders = device, {}, {}
+            self._device, self._settled_bags, self._folders = device, {}, {}
         bags: list[StoredBag] = []
         other_bytes = state_bytes = state_bytes_in(self._root)
         foreign_bytes = 0
@@ -183,17 +182,18 @@ class Inventory:
             if path in deleted:
                 continue
             name, is_named = path[len(recording) + 1 :], recording in named
-            is_own, is_saved = judge is None or judge(recording)(name), path in known.saved
-            # One is listed moments after it appears.
+            is_own = judge is None or judge(recording)(name)
+            is_saved = path in known.saved
+            # A split is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
             if not (is_own or is_saved or is_new):
                 foreign_bytes += sum(file.size for file in bag.files)
                 continue
             recordings.add(recording)
             if is_saved:
-                continue
-            may_go = _may_be_deleted(state, path, is_named=is_named)
-            if is_own and may_go and path not in remaining:
+                continue  # moments are counted by themselves
+            may_go = is_own and _may_be_deleted(state, path, is_named=is_named)
+            if may_go and path not in remaining:
                 bags.append(bag)
             elif self._counts(state, bag):
                 other_bytes += sum(file.size for file in bag.files)
@@ -210,49 +210,42 @@ class Inventory:
         )
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
-        """Yields the bags that the index has notes on: few, which may still change."""
+        """Yields the few bags that may still change: the index has a note on each."""
         for path, classification in known.counted.items():
-            stamp, other = known.files[path].stamp, other_form(path)
-            file = (stamp.inode, stamp.size)
-            bag = self._stored(path, classification.bag, stamp.mtime_ns, file, known.now)
+            bag = self._stored(path, classification.bag, known.files[path].stamp, known.now)
+            other = other_form(path)
             if other in known.hidden:
                 stamp = known.files[other].stamp
                 bag = bag._replace(second=StoredFile((bag.device, stamp.inode), stamp.size))
             yield classification.state, bag
 
     def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
-        """Yields the bags that the index has no notes on."""
-        before, self._unchanged, new = self._unchanged, {}, {}
+        """Yields the closed bags that change no more; most are known from the last call."""
+        before, self._settled_bags = self._settled_bags, {}
+        new: dict[str, Stamp] = {}
         for path, stamp in known.tree.stamps:
             if path in known.files:
                 continue
             stored = before.get(path)
-            if stored and (stored.inode, stored.size, stored.written) == (
-                stamp.inode,
-                stamp.size,
-                stamp.mtime_ns,
-            ):
-                self._unchanged[path] = stored
+            of_file = (stamp.inode, stamp.size, stamp.mtime_ns)
+            if stored and (stored.inode, stored.size, stored.written) == of_file:
+                self._settled_bags[path] = stored
             else:
                 new[path] = stamp
         for bag in known.timeline.named(new):
-            file = (new[bag.file].inode, bag.size)
-            stored = self._stored(bag.file, bag, bag.mtime_ns, file, known.now)
-            self._unchanged[bag.file] = stored
-        if before.keys() - self._unchanged.keys():
-            left = {bag.recording for bag in self._unchanged.values()}
+            stamp = new[bag.file]._replace(size=bag.size, mtime_ns=bag.mtime_ns)
+            self._settled_bags[bag.file] = self._stored(bag.file, bag, stamp, known.now)
+        if before.keys() - self._settled_bags.keys():
+            left = {bag.recording for bag in self._settled_bags.values()}
             self._folders = {path: self._folders[path] for path in self._folders.keys() & left}
-        for stored in self._unchanged.values():
+        for stored in self._settled_bags.values():
             yield FileState.CLOSED, stored
 
-    def _stored(
-        self, path: str, bag: BagFile | None, written: Ns, file: tuple[int, int], now: Ns
-    ) -> StoredBag:
-        """Returns a bag; `file` is its inode and size."""
+    def _stored(self, path: str, bag: BagFile | None, stamp: Stamp, now: Ns) -> StoredBag:
         recording = sys.intern(path.rpartition("/")[0])
         span = _UNDATED if bag is None else self._dating_span(bag)
         device = self._folder_at(recording, now).device
-        return StoredBag(path, recording, *span, written, device, *file)
+        return StoredBag(path, recording, *span, stamp.mtime_ns, device, stamp.inode, stamp.size)
 
     def _counts(self, state: FileState, bag: StoredBag) -> bool:
         """Whether a bag that is kept counts among the other bytes."""
@@ -267,11 +260,11 @@ class Inventory:
         if not dating:
             return _UNDATED
         start, end = min(topic.first for topic in dating), max(topic.last for topic in dating)
-        # The bag's own numbers where they are equal, which take no memory.
+        # Where equal, the bag's own objects, which take no more memory.
         return bag.start if start == bag.start else start, bag.end if end == bag.end else end
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
-        """Whether all messages of a topic in a bag may be repeated by each recording."""
+        """Whether each recording may receive all of a topic's messages in a bag again."""
         if topic.topic in self._static_topics:
             return True
         totals = TopicTotals(topic.first, topic.last, topic.count)
@@ -303,7 +296,7 @@ def state_bytes_in(bag_dir: Path) -> int:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Returns what lies in a folder; nothing behind a link, or where it cannot be listed."""
+    """Returns the entries of a folder; none if it is a link or cannot be listed."""
     with suppress(OSError):
         return [] if folder.is_symlink() else [*folder.iterdir()]
     return []

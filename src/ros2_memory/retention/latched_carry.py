@@ -6,12 +6,12 @@ still needed are therefore copied into one small bag, `latched/carried.mcap`, be
 deleted. Nothing of a message changes but its file, so that answers stay the same to the nanosecond;
 its channel records from which recordings it came (see `Origin`).
 
-These messages are needed, of those that would otherwise be gone:
+Of the messages that would be gone, these are needed:
 
-- The newest message of a topic; and of transforms the newest of each child frame, since every
-  broadcaster publishes only its own.
-- A message that was valid while something was recorded that is kept. Bags are deleted by age, so
-  mostly that is the newest only; but clocks step.
+- The newest message of a topic, and the newest transform of each child frame, since every
+  broadcaster publishes only its own frames.
+- A message that was valid while a kept bag was recorded. Bags are deleted by age, so mostly that is
+  the newest message only; but clocks step.
 - A message that a kept bag repeats because its recording received it again: only the earliest copy
   shows when it was first received.
 
@@ -67,9 +67,10 @@ class Origin(NamedTuple):
     """Where a carried message came from.
 
     Attributes:
-        recordings: folders, relative to the bag directory, of the recordings that received it: the
-            first one, and those that still had bags when their own copy was deleted.
-        often: whether the first one had messages of the topic often, so that it is not latched.
+        recordings: the folders, relative to the bag directory, of the recordings that received it:
+            the first one, then each that still had bags when its own copy was deleted.
+        often: whether the first recording had frequent messages of the topic, so that the message
+            counts as not latched.
     """
 
     recordings: tuple[str, ...]
@@ -77,7 +78,7 @@ class Origin(NamedTuple):
 
 
 def with_origin(record: Record, origin: Origin) -> Record:
-    """Returns the message with its origin in place of any that its channel names."""
+    """Returns the message with an origin, in place of the one that its channel names."""
     channel = record.channel
     rest = tuple(entry for entry in channel.metadata if entry[0] not in {_RECORDINGS, _OFTEN})
     new = ((_RECORDINGS, json.dumps(origin.recordings)), (_OFTEN, json.dumps(origin.often)))
@@ -105,7 +106,7 @@ class MessageIdentity(NamedTuple):
 
 
 _LateMessages: TypeAlias = "dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]]"
-"""By bag, its mtime and topic: the late messages that it begins with, and their log times."""
+"""By bag, its mtime and topic: the late messages at its beginning, and their log times."""
 
 
 class Latched(NamedTuple):
@@ -138,20 +139,21 @@ def worth_carrying(
     kept: Spans,
     repeated: Mapping[MessageIdentity, Ns],
 ) -> set[Latched]:
-    """Returns those of the messages that are still needed when their bags are deleted.
+    """Returns the messages that are still needed when their bags are deleted.
 
     Args:
-        messages: all that would be gone, including those carried before, in any order.
-        kept: when what is kept was recorded.
+        messages: all messages that would be gone, also carried ones, in any order.
+        kept: the times of the bags that are kept.
         repeated: late messages in kept bags, and their earliest log time there.
     """
-    # Of the copies of a message the earliest comes last, and remains.
-    earliest = {message.identity: message for message in sorted(messages, reverse=True)}
-    missing = sorted(
+    earliest: dict[MessageIdentity, Latched] = {}
+    for message in sorted(messages):
+        earliest.setdefault(message.identity, message)
+    missing = [
         message
         for identity, message in earliest.items()
         if repeated.get(identity, MAX_NS) > message.log_time
-    )
+    ]
     needed = {message for message in missing if message.identity in repeated}
     by_subject: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
     for message in missing:
@@ -192,7 +194,7 @@ class Carrier:
         self._late: _LateMessages = {}
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
-        """Returns those of the bags that contain messages of a latched topic."""
+        """Returns the bags of `paths` with messages of a latched topic."""
         wanted = {str(path) for path in paths}
         topics = self.topics(snapshot)
         return tuple(
@@ -204,14 +206,14 @@ class Carrier:
     def carry(
         self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path]
     ) -> int | None:
-        """Writes the messages that must outlive these bags, durably.
+        """Writes the messages that must outlive the bags to delete, durably.
 
-        Returns how many messages are carried then, or None if nothing had to be written. Bags that
-        are also `saved` under another name count as kept.
+        Returns how many messages are carried then, or None if nothing had to be written. A bag that
+        is also `saved` under another name counts as kept.
 
         Raises:
-            BagError: it cannot be written; what was carried before still is.
-            OSError: likewise.
+            BagError: a bag cannot be read or written; the messages carried before still are.
+            OSError: the disk fails; the messages carried before still are.
         """
         with_messages = self.with_latched(snapshot, to_delete)
         if not with_messages:
@@ -223,8 +225,8 @@ class Carrier:
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
         }
-        origins = dict(carried)
         remaining = {self._folder(recording) for recording in {bag.recording for bag in kept}}
+        origins = dict(carried)
         for bag in with_messages:
             origins.update(self._latched_in(snapshot, bag, topics))
         wanted = worth_carrying(
@@ -243,7 +245,7 @@ class Carrier:
         return len(wanted)
 
     def topics(self, snapshot: Snapshot) -> tuple[str, ...]:
-        """Returns the latched topics, also frequent ones: their last message may still be valid."""
+        """Returns the latched topics. The last message of a frequent one may still be valid."""
         return tuple(
             topic
             for topic in snapshot.timeline.topics()
@@ -253,10 +255,7 @@ class Carrier:
     def _latched_in(
         self, snapshot: Snapshot, bag: BagFile, topics: Collection[str]
     ) -> Iterator[tuple[Latched, Origin]]:
-        """Yields the messages of these topics; of a damaged bag, those that can be read.
-
-        Of a frequent topic only the newest: the earlier ones are superseded.
-        """
+        """Yields the readable messages of the topics, but only the newest of a frequent topic."""
         folder = self._folder(bag.recording)
         here = [topic for topic in topics if bag.summary.of(topic)]
         frequent = {topic for topic in here if self._is_frequent(snapshot, topic, bag.recording)}
@@ -283,7 +282,7 @@ class Carrier:
         return os.path.relpath(recorded, self.bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
-        """Yields the messages of these topics; of a damaged bag, those that can be read.
+        """Yields the readable messages of the topics.
 
         Raises:
             BagError: the bag of carried messages cannot be read. Its messages are nowhere else, so
@@ -335,24 +334,25 @@ class Carrier:
     ) -> dict[MessageIdentity, Ns]:
         """Returns the late messages of kept bags, and their earliest log time.
 
-        They come first in a recording, when its recorder has just subscribed.
+        Late messages come first in a recording, when its recorder has just subscribed. So only the
+        first kept bag of each recording is read.
         """
-        repeated: dict[MessageIdentity, Ns] = {}
         late: _LateMessages = {}
         for topic in topics:
-            seen: set[Path] = set()
+            first_bags: dict[Path, BagFile] = {}
             for bag in snapshot.bags:
-                if topic not in bag.summary.schema.positions or bag.recording in seen:
-                    continue
-                if bag.path in to_delete or is_derived(bag.file):
-                    continue
-                seen.add(bag.recording)
+                is_kept = bag.path not in to_delete and not is_derived(bag.file)
+                if is_kept and topic in bag.summary.schema.positions:
+                    first_bags.setdefault(bag.recording, bag)
+            for bag in first_bags.values():
                 key = (bag.path, bag.mtime_ns, topic)
                 known = self._late.get(key)
                 late[key] = self._late_in(bag.path, topic) if known is None else known
-                for identity, logged in late[key].items():
-                    repeated[identity] = min(logged, repeated.get(identity, logged))
         self._late = late
+        repeated: dict[MessageIdentity, Ns] = {}
+        for log_times in late.values():
+            for identity, log_time in log_times.items():
+                repeated[identity] = min(log_time, repeated.get(identity, log_time))
         return repeated
 
     def _late_in(self, path: Path, topic: str) -> dict[MessageIdentity, Ns]:
@@ -392,7 +392,7 @@ def _is_tf(type_name: str) -> bool:
 def _merged_origin(
     wanted: Latched, origins: Mapping[Latched, Origin | None], remaining: Collection[str]
 ) -> Origin | None:
-    """Merges the origins of a message and its copies, of recordings that still have bags."""
+    """Returns the origin of a message, with the recordings of its copies that still have bags."""
     origin_of_wanted = origins[wanted]
     if origin_of_wanted is None:
         return None

@@ -165,9 +165,9 @@ class DeletionPlan(NamedTuple):
     """The deletions that the limits require.
 
     `to_delete` has the oldest bag first. `total_bytes` is what the budget counted, each file once.
-    `fits`: whether the limits are kept once those bags are deleted. `most_free`: how much of the
-    disk would be free if all bags were deleted that may be, where that is too little; then none is
-    deleted for it.
+    `fits`: whether the limits are kept once those bags are deleted. `most_free` is set where even
+    deleting all bags would not free enough of the disk: the bytes that would be free then. No bag
+    is deleted for the disk in that case.
     """
 
     to_delete: tuple[StoredBag, ...]
@@ -176,16 +176,21 @@ class DeletionPlan(NamedTuple):
     most_free: int | None = None
 
 
-def too_old(
-    contents: DirContents, limits: RetentionLimits, max_age_ns: Ns
-) -> dict[bool, frozenset[str]]:
-    """Returns the bags older than `max_age_ns`.
+class AgedBags(NamedTuple):
+    """The paths of the bags that are too old, if the system clock is synchronised and if not."""
 
-    Under True are those that count as older if the clock is synchronised, under False if it is not.
-    What a pause and a wrong date are is judged by `limits`.
-    """
+    if_synchronised: frozenset[str]
+    if_unsynchronised: frozenset[str]
+
+    def by_clock(self, *, synchronised: bool) -> frozenset[str]:
+        """Returns the bags that are too old by the clock as it is."""
+        return self.if_synchronised if synchronised else self.if_unsynchronised
+
+
+def bags_older_than(contents: DirContents, limits: RetentionLimits, max_age_ns: Ns) -> AgedBags:
+    """Returns the bags older than `max_age_ns`; `limits` say which pauses and dates are wrong."""
     contents = _with_consistent_dates(contents, limits)
-    return _too_old(contents, _periods(contents, limits), max_age_ns)
+    return _aged_bags(contents, _periods(contents, limits), max_age_ns)
 
 
 def plan_deletions(
@@ -193,31 +198,36 @@ def plan_deletions(
 ) -> DeletionPlan:
     """Plans which bags to delete: all that are too old, then no more than the limits need.
 
-    Where deleting everything that may go would not free enough of the disk, nothing is deleted for
-    that: it would cost all history, and recording would still have to pause.
+    Where deleting all bags would not free enough of the disk, none is deleted for the disk: that
+    would cost all history, and recording would still have to pause.
 
     With `whole_hours`, age waits until all bags of an hour are too old, and to make room the rest
     of an hour goes, too, but for the hour of the newest bag. Bags that no age deletes neither go
     with an hour nor keep it. Where the clock is set back, another hour begins.
     """
-    left, dated = _Remaining(contents), _with_consistent_dates(contents, limits)
-    total, periods, most_free = left.total, _periods(dated, limits), None
-    aged = _too_old(dated, periods, limits.max_age_ns)[contents.synchronised]
+    dated = _with_consistent_dates(contents, limits)
+    periods = _periods(dated, limits)
+    by_age = _aged_bags(dated, periods, limits.max_age_ns)
+    aged = by_age.by_clock(synchronised=contents.synchronised)
+    left = _Remaining(contents)
+    total = left.total
     if not aged and left.fits(limits):
         return DeletionPlan((), total, fits=True)
     order = _oldest_first(contents, dated, limits, periods[-1] if periods else [])
-    newest = _newest(order, contents, periods)
-    hours = _hours(order)
+    newest = _newest_path(order, contents, periods)
+    hours = _split_by_hour(order)
     order = [bag for bag in order if bag.path != newest]
     if whole_hours:
-        aged = _of_whole_hours(aged, hours, contents, newest)
-    going = left.delete_until_fits(order, aged, limits)
+        aged = _aged_in_whole_hours(aged, hours, contents, newest)
+    left.delete_until_fits(order, aged, limits)
+    most_free = None
     if left.free is not None and left.free < limits.min_free_bytes:
         most_free = left.free
         left = _Remaining(replace(contents, free_bytes=None))
-        going = left.delete_until_fits(order, aged, limits)
+        left.delete_until_fits(order, aged, limits)
+    going = left.deleted
     if whole_hours:
-        going |= _rest_of_hours(going - aged, hours, contents, newest)
+        going = going | _rest_of_hours(going - aged, hours, contents, newest)
     return DeletionPlan(
         tuple(bag for bag in order if bag.path in going),
         total,
@@ -226,119 +236,166 @@ def plan_deletions(
     )
 
 
-def _newest(order: Sequence[StoredBag], contents: DirContents, periods: Sequence[_Period]) -> str:
-    """Returns the bag that stays: the last recorded, else dated, else written, with messages."""
+def _newest_path(
+    order: Sequence[StoredBag], contents: DirContents, periods: Sequence[_Period]
+) -> str:
+    """Returns the path of the bag that always stays, or "" if there is none.
+
+    It is the last one with messages: of the recorder's own, else of the present period, else by
+    `order`. If no bag has messages, it is the last of `order`.
+    """
     with_messages = [bag for bag in order if bag.has_dates]
-    listed = [bag.path for bag in with_messages if bag.recording in contents.places]
-    if periods and not listed:
+    own = [bag for bag in with_messages if bag.recording in contents.places]
+    if own:
+        return own[-1].path
+    if periods:
         return max(periods[-1], key=attrgetter("end", "path")).path
-    return next(reversed(listed or [bag.path for bag in with_messages or order]), "")
+    candidates = with_messages or order
+    return candidates[-1].path if candidates else ""
 
 
-def _hours(order: Sequence[StoredBag]) -> list[_Period]:
-    """Splits the bags in order where another hour begins, or a clock that was set back."""
+def _split_by_hour(order: Sequence[StoredBag]) -> list[_Period]:
+    """Splits the bags where another hour begins, and where the clock was set back."""
     hours: list[_Period] = []
+    before: StoredBag | None = None
     for bag in order:
-        before = hours[-1][-1] if hours else None
         if before is None or bag.hour != before.hour or bag.date < before.date:
             hours.append([])
         hours[-1].append(bag)
+        before = bag
     return hours
 
 
-def _of_whole_hours(
+def _aged_in_whole_hours(
     aged: frozenset[str], hours: Sequence[_Period], contents: DirContents, newest: str
 ) -> frozenset[str]:
-    """Returns the bags that are too old in hours of which all are, but for those that stay."""
-    stays = aged | contents.needed | contents.unshipped | {newest}
-    old = (hour for hour in hours if all(bag.path in stays for bag in hour))
-    return frozenset(bag.path for hour in old for bag in hour) & aged
+    """Returns the aged bags of hours in which every bag is aged, or stays at any age."""
+    ignored = contents.needed | contents.unshipped | {newest}
+    whole: set[str] = set()
+    for hour in hours:
+        paths = {bag.path for bag in hour}
+        if paths <= aged | ignored:
+            whole |= paths & aged
+    return frozenset(whole)
 
 
 def _rest_of_hours(
     going: set[str], hours: Sequence[_Period], contents: DirContents, newest: str
 ) -> set[str]:
-    """Returns the bags of the hours in which some go to make room, but for those that stay."""
-    paths = ({bag.path for bag in hour} for hour in hours)
-    rest = [hour for hour in paths if newest not in hour and not going.isdisjoint(hour)]
-    return set().union(*rest) - contents.needed - contents.unshipped
+    """Returns all bags of the hours from which bags go to make room, but not those that stay."""
+    rest: set[str] = set()
+    for hour in hours:
+        paths = {bag.path for bag in hour}
+        if newest not in paths and not going.isdisjoint(paths):
+            rest |= paths
+    return rest - contents.needed - contents.unshipped
 
 
 class _Remaining:
-    """Counts what is left when some bags are deleted."""
+    """Counts the bytes that are left and free while bags are deleted.
+
+    Attributes:
+        total: the bytes that the budget counts.
+        free: the free bytes of the disk; None if they do not count.
+        deleted: the paths of the deleted bags.
+    """
 
     def __init__(self, contents: DirContents) -> None:
         # A file of a moment counts once, and stays when its other name is deleted.
         self._saved = contents.saved
-        bags = sum(map(self.freed_by, contents.bags))
+        bags = sum(map(self._freed_by, contents.bags))
         self.total = contents.other_bytes + sum(contents.saved.values()) + bags
         self.free = contents.free_bytes
-
-    def freed_by(self, bag: StoredBag) -> int:
-        """Returns how many bytes deleting a bag frees."""
-        return sum(file.size for file in bag.files if file.inode not in self._saved)
+        self.deleted: set[str] = set()
 
     def delete_until_fits(
         self, order: Sequence[StoredBag], aged: Collection[str], limits: RetentionLimits
-    ) -> set[str]:
-        """Takes away the bags that are too old, then others in this order; returns their paths."""
-        going = {bag.path for bag in order if bag.path in aged}
+    ) -> None:
+        """Deletes the bags that are too old, then others in `order` until the limits are kept."""
         for bag in order:
-            if bag.path in going:
+            if bag.path in aged:
                 self._delete(bag)
         for bag in order:
             if self.fits(limits):
                 break
-            if bag.path not in going and self.freed_by(bag):
+            if bag.path not in self.deleted and self._freed_by(bag):
                 self._delete(bag)
-                going.add(bag.path)
-        return going
-
-    def _delete(self, bag: StoredBag) -> None:
-        freed = self.freed_by(bag)
-        self.total -= freed
-        self.free = None if self.free is None else self.free + freed
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""
         enough = self.free is None or self.free >= limits.min_free_bytes
         return enough and self.total <= limits.max_total_bytes
 
+    def _freed_by(self, bag: StoredBag) -> int:
+        return sum(file.size for file in bag.files if file.inode not in self._saved)
+
+    def _delete(self, bag: StoredBag) -> None:
+        freed = self._freed_by(bag)
+        self.total -= freed
+        if self.free is not None:
+            self.free += freed
+        self.deleted.add(bag.path)
+
 
 def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> DirContents:
-    """Returns the contents without ages that contradict the order of the recordings.
+    """Returns the contents with dates and ages that agree with the order of the recordings.
 
-    A bag whose date does, by its messages or else by its file, gets the newest date of the next
-    recording that has a right one; of the newest of all, if there is none. If no bag has a right
-    one, all get those of their files first.
+    If no bag has a credible date, each one gets that of its file first. Then a bag dated before the
+    newest message of an earlier recording gets another date, see `_replacement_dates`.
     """
-    believed = _credibly_dated(contents, limits)
-    if not believed:
+    credible = _credibly_dated(contents, limits)
+    if not credible:
         contents = replace(contents, bags=[bag.dated(bag.written) for bag in contents.bags])
-        believed = _credibly_dated(contents, limits)
+        credible = _credibly_dated(contents, limits)
     if not contents.places:
         return contents
-    newest: dict[str, Ns] = {}
-    for bag in believed:
-        newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
     names = sorted(contents.places, key=contents.places.__getitem__)
-    since, least = {**contents.recorded_since}, MAX_NS
-    reached, latest = dict[str, Ns](), MIN_NS
+    newest: dict[str, Ns] = {}
+    for bag in credible:
+        if bag.recording in contents.places:
+            newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
+    earliest: dict[str, Ns] = {}
+    latest = MIN_NS
     for name in names:
-        reached[name] = latest  # by the recordings before it
+        earliest[name] = latest
         latest = max(latest, newest.get(name, MIN_NS))
-        if name in since:
-            least = since[name] = min(least, since[name])
-    instead: dict[str, Ns] = {}
-    for name in reversed(names):
-        if reached[name] <= newest.get(name, MIN_NS):
-            latest = newest.get(name, latest)
-        instead[name] = latest
+    replacements = _replacement_dates(names, newest, earliest)
     bags = [
-        bag.dated(instead[bag.recording]) if bag.date < reached.get(bag.recording, MIN_NS) else bag
+        bag.dated(replacements[bag.recording])
+        if bag.date < earliest.get(bag.recording, MIN_NS)
+        else bag
         for bag in contents.bags
     ]
-    return replace(contents, bags=bags, recorded_since=since)
+    return replace(
+        contents, bags=bags, recorded_since=_never_rising(contents.recorded_since, names)
+    )
+
+
+def _replacement_dates(
+    names: Sequence[str], newest: Mapping[str, Ns], earliest: Mapping[str, Ns]
+) -> dict[str, Ns]:
+    """Returns the date for the wrongly dated bags of each recording.
+
+    It is the newest date of this recording, or of the next one that is not dated before `earliest`;
+    if there is none, the newest date of all.
+    """
+    dates: dict[str, Ns] = {}
+    date = max(newest.values(), default=MIN_NS)
+    for name in reversed(names):
+        if name in newest and newest[name] >= earliest[name]:
+            date = newest[name]
+        dates[name] = date
+    return dates
+
+
+def _never_rising(recorded_since: Mapping[str, Ns], names: Sequence[str]) -> dict[str, Ns]:
+    """Returns how long was recorded after each recording: never more than after an earlier one."""
+    since = dict(recorded_since)
+    least = MAX_NS
+    for name in names:
+        if name in since:
+            least = since[name] = min(least, since[name])
+    return since
 
 
 _Period: TypeAlias = "list[StoredBag]"
@@ -368,21 +425,31 @@ def _credibly_dated(contents: DirContents, limits: RetentionLimits) -> list[Stor
     ]
 
 
-def _too_old(
-    contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns
-) -> dict[bool, frozenset[str]]:
-    old = {name for name, since in contents.recorded_since.items() if since > max_age_ns}
-    by_recording = frozenset(bag.path for bag in contents.bags if bag.recording in old)
-    doubtful = {bag.path for bag in contents.bags if bag.recording in contents.doubtful}
-    by_dates = frozenset(_too_old_by_dates(contents, periods, max_age_ns)) - doubtful
+def _aged_bags(contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns) -> AgedBags:
+    """Returns the bags that are too old. Doubtful dates never make a bag old, recorded time does.
+
+    Without a synchronised clock recorded time alone decides.
+    """
+    old_recordings = {name for name, since in contents.recorded_since.items() if since > max_age_ns}
+    by_dates = _aged_by_dates(contents, periods, max_age_ns)
     stays = contents.needed | contents.unshipped
-    return {True: (by_dates | by_recording & doubtful) - stays, False: by_recording - stays}
+    if_synchronised: set[str] = set()
+    if_unsynchronised: set[str] = set()
+    for bag in contents.bags:
+        if bag.path in stays:
+            continue
+        by_recorded_time = bag.recording in old_recordings
+        if by_recorded_time:
+            if_unsynchronised.add(bag.path)
+        is_doubtful = bag.recording in contents.doubtful
+        is_old = by_recorded_time if is_doubtful else bag.path in by_dates
+        if is_old:
+            if_synchronised.add(bag.path)
+    return AgedBags(frozenset(if_synchronised), frozenset(if_unsynchronised))
 
 
-def _too_old_by_dates(
-    contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns
-) -> set[str]:
-    """Returns the bags that are too old compared with the newest of their period, by their dates.
+def _aged_by_dates(contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns) -> set[str]:
+    """Returns the bags that end more than `max_age_ns` before the newest of their period.
 
     Dates in the future, of a clock that was ahead for a while, make no other bag older.
     An undated bag belongs to the present period if it was written in it, else to none.
@@ -401,20 +468,32 @@ def _too_old_by_dates(
 def _oldest_first(
     contents: DirContents, dated: DirContents, limits: RetentionLimits, present: _Period
 ) -> list[StoredBag]:
-    """Sorts all bags, oldest first; `dated` has them with consistent dates."""
-    odd = _outside_periods(dated.bags, present)
-    keys = {bag.path: _file_time_key(bag, contents.now, limits) for bag in odd}
+    """Returns all bags with their own dates, oldest first; `dated` has them with consistent ones.
+
+    Adopted bags take their places by date. The recorder's bags fill the places between in the order
+    of their recordings.
+    """
+    places = contents.places
+    undated = _outside_periods(dated.bags, present)
+    keys = {bag.path: _file_time_key(bag, contents.now, limits) for bag in undated}
     by_date = sorted(
         dated.bags, key=lambda bag: (*keys.get(bag.path, (bag.end, bag.end)), bag.path)
     )
-    given, places = {bag.path: bag for bag in contents.bags}, contents.places
-    listed = (bag for bag in contents.bags if bag.recording in places)
-    recorded = iter(sorted(listed, key=lambda bag: (places[bag.recording], bag.date, bag.path)))
-    return [next(recorded) if bag.recording in places else given[bag.path] for bag in by_date]
+    recorded = sorted(
+        (bag for bag in contents.bags if bag.recording in places),
+        key=lambda bag: (places[bag.recording], bag.date, bag.path),
+    )
+    next_recorded = iter(recorded)
+    by_path = {bag.path: bag for bag in contents.bags}
+    order: list[StoredBag] = []
+    for bag in by_date:
+        is_recorded = bag.recording in places
+        order.append(next(next_recorded) if is_recorded else by_path[bag.path])
+    return order
 
 
 def _outside_periods(bags: Sequence[StoredBag], *periods: _Period) -> Sequence[StoredBag]:
-    """Returns the bags that are in none of some periods."""
+    """Returns the bags that are in none of the periods."""
     there = {bag.path for period in periods for bag in period}
     return [bag for bag in bags if bag.path not in there]
 

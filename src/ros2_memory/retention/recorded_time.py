@@ -1,14 +1,14 @@
-"""Measures the time recorded since each recording ended, and which of them have right dates.
+"""Measures the time recorded since each recording ended, and which recordings have right dates.
 
 The monotonic clock starts again at every boot, so recorded time is added up and stored in
 `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
 with the total recorded time when it last grew. The last line of a recording counts. A recording
 without a line counts as recorded when it is first asked about: nothing shows that it is older. A
 damaged line is ignored, and named in the log. While the disk fails to read the file, nothing counts
-as old and nothing is written: lines that count from 0 would make old what they are of.
+as old and nothing is written: a line that counts from 0 would make its recording old.
 
 The dates of a recording are right if the clock was synchronised while it grew, and went along with
-the monotonic clock from its beginning. Those of a recording without a line are doubtful, unless
+the monotonic clock from its beginning. The dates of a recording without a line are doubtful, unless
 there is no file at all, as after a restore: then nothing speaks against any date.
 """
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SAVE_S: Final = 60.0
-"""A crash loses at most so much of the recorded time, and so bags are kept for longer."""
+"""A crash loses at most so much of the recorded time. Bags are then kept for longer."""
 LONGEST_SILENCE_S: Final = 60.0
 """A pause in which nothing reached the disk counts as recorded for at most so long."""
 STEP_NS: Final[Ns] = 60 * NS_PER_S
@@ -54,13 +54,15 @@ class RecordedTime:
         self._loaded = False
         self._total_s = 0.0
         self._last_grew_s: dict[str, float] = {}
-        self._right: set[str] = set()
+        self._right: frozenset[str] = frozenset()
         self._was_set: set[str] = set()
+        # The wall clock minus the monotonic clock when each recording began.
         self._leads: dict[str, Ns] = {}
         self._synchronised = False
         self._has_file = True
         self._unsaved: set[str] = set()
         self._lines = 0
+        # When the recordings last grew, and the bytes written until then.
         self._grew: tuple[float, int] | None = None
         self._recording: frozenset[str] = frozenset()
         self._saved_at_s = -math.inf
@@ -80,14 +82,15 @@ class RecordedTime:
         """
         with self._lock:
             self._load()
-            before, self._recording = self._recording, frozenset(recordings)
+            before = self._recording, self._right
+            self._recording = frozenset(recordings)
             self._count_growth(monotonic_s, bytes_written)
             for name in recordings:
                 self._last_grew_s[name] = self._total_s
             self._unsaved |= self._recording
+            self._judge_dates(now - ns_from_unix(monotonic_s))
+            has_changed = (self._recording, self._right) != before
             # While nothing is recorded the disk may be away.
-            is_judged_anew = self._judge_clock(now - ns_from_unix(monotonic_s))
-            has_changed = is_judged_anew or self._recording != before
             if recordings and (has_changed or monotonic_s - self._saved_at_s >= SAVE_S):
                 self._saved_at_s = monotonic_s
                 self._save()
@@ -112,7 +115,7 @@ class RecordedTime:
             }
 
     def doubtful(self, recordings: Iterable[str]) -> frozenset[str]:
-        """Returns those of some recordings whose dates are not known to be right."""
+        """Returns the recordings whose dates are not known to be right."""
         with self._lock:
             self._load()
             for name in recordings:
@@ -120,42 +123,41 @@ class RecordedTime:
             return frozenset(recordings) - self._right
 
     def asks_for_clock(self) -> bool:
-        """Whether a recording is being written that a synchronised clock would show to be right."""
+        """Whether a synchronised clock would prove the dates of a recording that is written now."""
         with self._lock:
-            return not self._recording <= self._right | self._was_set
+            return bool(self._recording - self._right - self._was_set)
 
     def confirm_clock(self) -> None:
-        """Notes that the clock is synchronised, for what is written at the next call of `note`."""
+        """Tells the next call of `note` that the clock is synchronised."""
         with self._lock:
             self._synchronised = True
 
-    def _judge_clock(self, lead: Ns) -> bool:
-        """Updates whose dates are right, of what is being written; returns whether any changed.
+    def _judge_dates(self, lead: Ns) -> None:
+        """Updates which of the recordings that are written now have right dates.
 
         `lead` is the wall clock minus the monotonic clock, which changes when the clock is set.
         """
         synchronised, self._synchronised = self._synchronised, False
         if not self._recording:
-            return False
-        before = self._right.copy()
-        self._right -= self._recording - self._leads.keys()
+            return
+        begun = self._recording - self._leads.keys()
         self._leads = {name: self._leads.get(name, lead) for name in self._recording}
         self._was_set &= self._recording
-        self._was_set |= {
-            name for name, begun in self._leads.items() if abs(lead - begun) >= STEP_NS
-        }
+        for name, first_lead in self._leads.items():
+            if abs(lead - first_lead) >= STEP_NS:
+                self._was_set.add(name)
+        right = self._right - begun
         if synchronised:
-            self._right |= self._recording
-        self._right -= self._was_set
-        return self._right != before
+            right |= self._recording
+        self._right = right - self._was_set
 
     def _grew_or_grows_now(self, name: str) -> float:
-        """Returns the total when a recording last grew; one without a line counts from now on."""
+        """Returns the total when a recording last grew. A recording without a line gets one."""
         if name not in self._last_grew_s:
             self._last_grew_s[name] = self._total_s
             self._unsaved.add(name)
             if not self._has_file:
-                self._right.add(name)
+                self._right |= {name}
         return self._last_grew_s[name]
 
     def _load(self) -> None:
@@ -175,21 +177,20 @@ class RecordedTime:
             return
         # The greatest is the total: it stays even if its recording is gone.
         newest = max(last.values(), key=attrgetter("recorded_s"))
-        # What grew while the file could not be read comes after all that it has.
-        since = {name: newest.recorded_s + grew for name, grew in self._last_grew_s.items()}
+        # Recordings that grew while the file could not be read come after all of its rows.
+        for name in self._last_grew_s:
+            self._last_grew_s[name] += newest.recorded_s
         self._total_s += newest.recorded_s
-        self._last_grew_s = since | {
-            name: row.recorded_s
-            for name, row in last.items()
-            if row is newest or (self._bag_dir / name).is_dir()
-        }
+        for name, row in last.items():
+            if row is newest or (self._bag_dir / name).is_dir():
+                self._last_grew_s[name] = row.recorded_s
         self._lines = _MOST_LINES  # so that the next save leaves out what is gone
 
     def _read_rows(self) -> list[Recorded]:
-        """Returns the rows of the file.
+        """Returns the rows of the file that are whole.
 
         Raises:
-            OSError: there is one that cannot be read.
+            OSError: the file cannot be read.
         """
         try:
             lines = [*RECORDED.lines(self._bag_dir)]

@@ -1,8 +1,8 @@
-"""Rewrites bags in place: those that a crash left open, and those of which messages go.
+"""Rewrites bags in place: to close what a crash left open, and to take messages out.
 
-A file of 0 bytes is removed: nothing had reached the disk. A truncated file is rewritten beside
-itself from all that can be read of it, read back, compared and flushed. Only then does it take the
-name of the original, which is left as it is in every other case.
+A file of 0 bytes is deleted: nothing had reached the disk. A truncated file is rewritten beside
+itself from all that can be read of it, read back, compared and flushed. Only then does the new file
+take the name of the old one. In every other case the old file is unchanged.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 Identity = tuple[int, int]
+"""A file by its device and inode number."""
 _CONTENT: Final = ("st_ino", "st_size", "st_mtime_ns")
 
 
@@ -61,8 +62,8 @@ class Repairer:
         """Whether the writer of a file finished it, so that there is nothing to repair.
 
         Raises:
-            BagVanishedError: it does not exist.
-            BagError: it cannot be opened, or is no MCAP file.
+            BagVanishedError: the file does not exist.
+            BagError: the file cannot be opened, or is no MCAP file.
         """
         is_closed = self.reader.closing(path) is Closing.CLOSED
         if is_closed:
@@ -74,14 +75,14 @@ class Repairer:
         """Repairs one file; returns None if its writer had finished it.
 
         Raises:
-            BagVanishedError: it does not exist.
-            BagError: it cannot be repaired, and is unchanged.
+            BagVanishedError: the file does not exist.
+            BagError: the file cannot be repaired, and is unchanged.
         """
         try:
             with opened_folder(self.root, path.absolute()) as here:
                 return self._rewrite_if_open(here, path)
         except BagError as error:
-            # With the name of the file in place of that of the open directory.
+            # The error has the path below the open directory in /proc.
             raise type(error)(str(path), error.reason) from error
         except FileNotFoundError as error:
             raise BagVanishedError(str(path), "the file is not there any more") from error
@@ -118,7 +119,7 @@ class Repairer:
 
 @contextmanager
 def opened_folder(root: Path, path: Path) -> Iterator[Path]:
-    """Yields the path of a file in its open folder, even if another takes that one's name.
+    """Yields the path of a file in its open folder, which stays valid if the folder is renamed.
 
     Raises:
         OSError: the folder cannot be opened, or lies behind a link below the root.
@@ -128,7 +129,7 @@ def opened_folder(root: Path, path: Path) -> Iterator[Path]:
 
 
 def _give_attributes(new: Path, before: os.stat_result, mtime_ns: Ns) -> None:
-    """Gives a file the mode and, where that is allowed, the owner of another; and its times."""
+    """Gives a file the mode and access time of another, `mtime_ns`, and if permitted its owner."""
     new.chmod(stat.S_IMODE(before.st_mode))
     with suppress(OSError):
         os.chown(new, before.st_uid, before.st_gid)
@@ -145,20 +146,23 @@ def rewritten(
     takes: Callable[[str, Ns, Ns], bool],
     expected: Counter[str],
 ) -> Iterator[Path]:
-    """Yields the new file, beside the old one; it takes the name of the old one after the block.
+    """Rewrites a bag without some messages; yields the new file beside the old one.
+
+    After the block, the new file takes the name of the old one.
 
     Args:
-        bag_dir: the bag directory, behind no link in which the file must lie.
+        bag_dir: the bag directory; no folder between it and the file may be a link.
         path: the old file.
-        before: its status; the file must still be the same at the end.
-        writer: rewrites it.
+        before: the status of the old file, which must not change meanwhile.
+        writer: rewrites the file.
         takes: whether a message goes, by topic, log time and publish time.
         expected: how many messages go, by topic.
 
     Raises:
-        EpisodicError: it cannot be rewritten, or another program rewrites it; nothing is changed.
-        OSError: likewise, or it is another file now; or the folder of the new one cannot be
-            flushed.
+        EpisodicError: the file cannot be rewritten, or another program rewrites it; it is
+            unchanged.
+        OSError: the file cannot be rewritten, or is another one now; or it was rewritten, and its
+            folder cannot be flushed.
     """
     with opened_folder(bag_dir, path) as here, here.open("rb") as old:
         try:
@@ -175,10 +179,11 @@ def rewritten(
 
 
 def replace_file(new: Path, path: Path, inode: Identity) -> None:
-    """Gives a file the name of another, which must still be the one that was read.
+    """Renames a new file to `path`, where the file with `inode` must still lie.
 
     Raises:
-        OSError: it is not, or has gone; or it has the name, but the folder cannot be flushed.
+        OSError: another file lies there, or none; or it was renamed, and the folder cannot be
+            flushed.
     """
     status = path.lstat()
     if (status.st_dev, status.st_ino) != inode:
@@ -187,34 +192,35 @@ def replace_file(new: Path, path: Path, inode: Identity) -> None:
     flush(path.parent)
 
 
-def metadata_corrected(
+def correct_metadata_files(
     bag_dir: Path, recordings: Collection[Path], reader: BagReader
-) -> Iterator[str]:
-    """Has each recording's metadata.yaml describe the bags that are left; yields a line for each.
-
-    Where a recorder is still to write it, that counts what has gone, too.
-    """
+) -> list[str]:
+    """Corrects each recording's metadata.yaml to the bags that are left; returns notes on it."""
+    notes: list[str] = []
     for recording in sorted(recordings):
         folder = os.path.relpath(recording, bag_dir)
         name = f"{folder}/{METADATA_FILE}"
         if not (recording / METADATA_FILE).exists():
             if folder in read_heartbeat(bag_dir).recordings:
-                yield f"{name} will count what was deleted, too: the recorder writes it at the end"
+                notes.append(
+                    f"{name} will count what was deleted, too: the recorder writes it at the end"
+                )
             continue
         try:
             with directories.opened(bag_dir, recording):
                 if correct(recording, reader):
-                    yield f"{name} describes what is left"
+                    notes.append(f"{name} describes what is left")
         except (BagError, OSError, ValueError) as error:
-            yield (
+            notes.append(
                 f"{name} still describes what was deleted ({error}); rosbag2 opens the folder "
                 f"after `ros2 bag reindex {recording}`"
             )
+    return notes
 
 
-def open_files() -> frozenset[tuple[int, int]]:
+def open_files() -> frozenset[Identity]:
     """Returns device and inode of every open file that /proc shows."""
-    inodes: set[tuple[int, int]] = set()
+    inodes: set[Identity] = set()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError), os.scandir(process / "fd") as descriptors:
             for descriptor in descriptors:
@@ -228,4 +234,6 @@ def reason_of(error: Exception) -> str:
     """Returns the reason of an error, without its path."""
     if isinstance(error, BagError):
         return error.reason
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error)

@@ -1,7 +1,7 @@
 """Saves moments: hard links in `moments/`, which retention never deletes.
 
-Somebody asked for a moment, or a rule fired (see `triggers`). What each rule may take is set aside,
-so that none takes what belongs to another, or to those who ask.
+Somebody asked for a moment, or a rule fired (see `triggers`). Each rule has a share of the bytes of
+its own, so that no rule uses up the share of another, or of those who ask.
 
 The recorder alone does this, while nothing is deleted. A crash between two steps does no harm: a
 moment's file marks it as pending before its first link is made, and a request stays in the
@@ -50,11 +50,10 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 REPAIRED_WITHIN_NS: Final[Ns] = 600 * NS_PER_S
-"""For so long a moment waits for a bag that a crash left open: its repair makes another file."""
+"""How long a moment waits for a bag that a crash left open: its repair makes another file."""
 LONGEST_WAIT_NS: Final[Ns] = 2 * 3600 * NS_PER_S
-"""No split stays open for longer, unless another program writes it, or clocks differ. For so long
-a link is tried again that the disk refuses."""
-
+"""How long a moment waits for open splits, and for links that the disk refuses. No split is open
+for longer, unless another program writes it, or clocks differ."""
 SHORTEST_HOLE_NS: Final[Ns] = 2 * NS_PER_S
 """A shorter time without a bag is not worth a sentence."""
 
@@ -64,18 +63,26 @@ _log = get_logger(__name__)
 
 
 class NeededBags(NamedTuple):
-    """The bags of a moment that can be kept now, in order of time; `waits`: more may come."""
+    """The bags of a moment that can be kept now, in order of time; `waits`: more may come.
+
+    `open_files` may belong to the moment, too, once they are closed.
+    """
 
     window: TimeWindow
     bags: tuple[BagFile, ...]
     waits: bool
+    open_files: tuple[Path, ...]
 
 
 def needed_bags(moment: SaveRequest, snapshot: Snapshot, now: Ns) -> NeededBags:
     """Chooses the bags that a moment needs, whose window includes both of its ends."""
     window = TimeWindow(moment.start, min(moment.end + 1, MAX_NS))
-    open_files = (snapshot.unread_spans[aside] for aside in snapshot.active)
-    waits = now < window.stop or any(_may_overlap(recorded, window) for recorded in open_files)
+    open_files = tuple(
+        aside.path
+        for aside in snapshot.active
+        if _may_overlap(snapshot.unread_spans[aside], window)
+    )
+    waits = now < window.stop or bool(open_files)
     ready = []
     for bag in snapshot.timeline.overlapping(window):
         if not bag.reaches_into(window) or is_derived(bag.file):
@@ -85,17 +92,18 @@ def needed_bags(moment: SaveRequest, snapshot: Snapshot, now: Ns) -> NeededBags:
             waits = True
         else:
             ready.append(bag)
-    return NeededBags(window, tuple(ready), waits and abs(now - moment.asked) < LONGEST_WAIT_NS)
+    waits = waits and abs(now - moment.asked) < LONGEST_WAIT_NS
+    return NeededBags(window, tuple(ready), waits, open_files if waits else ())
 
 
 @dataclass(slots=True)
 class Share:
-    """What some moments may store together.
+    """The bytes that the moments of one rule, or those that were asked for, may take together.
 
     Attributes:
-        most: how much, in bytes.
-        key: the setting that says so.
-        stored: what they store, by inode, in bytes.
+        most: how many bytes.
+        key: the setting that limits them.
+        stored: the sizes of the files that they have, by inode.
     """
 
     most: int
@@ -126,19 +134,23 @@ class Share:
 
     @property
     def exhausted(self) -> str:
-        """What is said of a moment of which only part had room."""
+        """The sentence for a moment that had room only in part."""
         what = f"the share of moments ({_SHARE})" if self.key == _SHARE else self.key
         return f"{what} was used up: only part of the moment is saved"
 
 
 def unrecorded(window: TimeWindow, bags: Iterable[BagFile]) -> tuple[str, ...]:
-    """Returns a sentence on each part of a window that no bag reaches into."""
+    """Returns a sentence for each part of a window in which no bag has messages."""
     recorded = united((bag.start, bag.end) for bag in bags)
     return tuple(
         f"nothing is recorded from {iso_local(start)} to {iso_local(stop)}"
         for start, stop in without([(window.start, window.stop)], recorded)
         if stop - start > SHORTEST_HOLE_NS
     )
+
+
+class _MomentRefusedError(Exception):
+    """A moment cannot be saved; the text is the reason."""
 
 
 @dataclass(eq=False, repr=False)
@@ -189,20 +201,23 @@ class MomentKeeper:
     def _answer_to(
         self, request: SaveRequest, stored: dict[str, StoredMoment], snapshot: Snapshot
     ) -> Outcome:
-        """Returns the outcome of a request, whose moment begins unless it has one already."""
-        begun: StoredMoment | str | None = _moment_of(request, stored)
-        if begun is None:
-            try:
-                begun = self._begin_moment(SavedMoment(request), stored, snapshot)
-            except OSError as error:
-                begun = (
-                    f"the bags cannot be saved in {self.bag_dir / MOMENTS_FOLDER} by hard "
-                    f"links: {error.strerror or error}"
-                )
-        if isinstance(begun, str):
-            _log.warning("moment_refused", label=request.label, reason=begun)
-            return Outcome(refused=begun)
-        return Outcome(begun.folder.name, len(begun.files), begun.moment.pending)
+        """Returns the outcome of a request. A new moment begins, and is added to `stored`."""
+        try:
+            moment = _moment_of(request, stored)
+            if moment is None:
+                moment = self._begin_moment(SavedMoment(request), stored, snapshot)
+                stored[moment.folder.name] = moment
+        except _MomentRefusedError as error:
+            refused = str(error)
+        except OSError as error:
+            refused = (
+                f"the bags cannot be saved in {self.bag_dir / MOMENTS_FOLDER} by hard "
+                f"links: {error.strerror or error}"
+            )
+        else:
+            return Outcome(moment.folder.name, len(moment.files), moment.moment.pending)
+        _log.warning("moment_refused", label=request.label, reason=refused)
+        return Outcome(refused=refused)
 
     def keep_for_rule(
         self, request: SaveRequest, rule: str, matches: int, snapshot: Snapshot
@@ -218,9 +233,10 @@ class MomentKeeper:
         wanted = SavedMoment(request, rule=rule, matches=matches)
         known = _moment_of(request, stored)
         if known is None:
-            begun = self._begin_moment(wanted, stored, snapshot)
-            if isinstance(begun, str):
-                return begun
+            try:
+                self._begin_moment(wanted, stored, snapshot)
+            except _MomentRefusedError as error:
+                return str(error)
             self._waiting = True
         elif known.moment.matches < matches or known.moment.request.end < request.end:
             extended = known._replace(moment=replace(wanted, missing=known.moment.missing))
@@ -230,9 +246,10 @@ class MomentKeeper:
         return None
 
     def relink_sidecars(self) -> None:
-        """Links the sidecars of recordings again that were rewritten; a fault is reported.
+        """Links sidecars that were rewritten into the moments again; a fault is reported.
 
-        Which messages of a bag count is decided when its recording is over, which may be later.
+        Which messages of a bag count is decided when its recording is over. That may be after the
+        moment was saved.
         """
         moments = self.bag_dir / MOMENTS_FOLDER
         if moments.is_symlink():
@@ -250,59 +267,73 @@ class MomentKeeper:
         return {moment.folder.name: moment for moment in stored_moments_in(self.bag_dir)}
 
     def _begin_moment(
-        self, begun: SavedMoment, stored: dict[str, StoredMoment], snapshot: Snapshot
-    ) -> StoredMoment | str:
-        """Begins a moment and adds it to `stored`, or returns why it is refused."""
-        need = needed_bags(begun.request, snapshot, self.clock.now())
-        group = self._group(begun, stored)
+        self, wanted: SavedMoment, stored: Mapping[str, StoredMoment], snapshot: Snapshot
+    ) -> StoredMoment:
+        """Begins a moment beside the `stored` ones.
+
+        Raises:
+            _MomentRefusedError: it cannot be saved.
+            OSError: it cannot be written; nothing of it is left.
+        """
+        need = needed_bags(wanted.request, snapshot, self.clock.now())
+        share = self._share_to_begin(wanted, need, stored, snapshot)
+        folder = make_moment_folder(self.bag_dir, wanted.request)
+        try:
+            write_saved_moment(folder, wanted)
+            links = self._link_bags(folder, need.bags, share)
+            moment = _with_links(StoredMoment(folder, wanted, {}), need, links)
+            if moment.moment != wanted:
+                write_saved_moment(folder, moment.moment)
+        except OSError:
+            directories.remove(folder)
+            raise
+        flush(folder.parent)
+        rule = {} if wanted.rule is None else {"rule": wanted.rule}
+        _log.info("moment_kept", folder=folder.name, bags=len(moment.files), **rule)
+        return moment
+
+    def _share_to_begin(
+        self,
+        wanted: SavedMoment,
+        need: NeededBags,
+        stored: Mapping[str, StoredMoment],
+        snapshot: Snapshot,
+    ) -> Share:
+        """Returns the share that a new moment belongs to.
+
+        Raises:
+            _MomentRefusedError: there are too many moments, no bags, or too few bytes for it.
+        """
+        group = self._group(wanted, stored)
         if len(group) >= MAX_MOMENTS // (1 + len(self.rule_bytes)):
-            return (
+            raise _MomentRefusedError(
                 f"there are {len(group)} moments, the maximum; delete folders in "
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
             thinned = snapshot.timeline.thinned_times
             if overlaps_any(thinned, need.window.start, need.window.stop - 1):
-                return "the bags of that time were deleted, and memory/ has what stayed of them"
-            return "nothing was recorded then: ask for a time at which something was"
-        # Those that may belong to the moment, as large as they are now.
-        growing = [
-            size_of(aside.path)
-            for aside in snapshot.active
-            if need.waits and _may_overlap(snapshot.unread_spans[aside], need.window)
-        ]
-        share = self._share_of(begun, group)
+                reason = "the bags of that time were deleted, and memory/ has what stayed of them"
+            else:
+                reason = "nothing was recorded then: ask for a time at which something was"
+            raise _MomentRefusedError(reason)
+        share = self._share_of(wanted, group)
         files = filter(None, (_file_of(bag.path) for bag in need.bags))
-        refused = share.refusal(files, sum(growing))
-        if refused is not None:
-            return refused
-        folder = make_moment_folder(self.bag_dir, begun.request)
-        try:
-            write_saved_moment(folder, begun)
-            links = self._link_bags(folder, need.bags, share)
-            moment = _with_links(StoredMoment(folder, begun, {}), need, *links)
-            if moment.moment != begun:
-                write_saved_moment(folder, moment.moment)
-        except OSError:
-            directories.remove(folder)
-            raise
-        flush(folder.parent)
-        stored[folder.name] = moment
-        rule = {} if begun.rule is None else {"rule": begun.rule}
-        _log.info("moment_kept", folder=folder.name, bags=len(moment.files), **rule)
-        return moment
+        if refused := share.refusal(files, sum(map(size_of, need.open_files))):
+            raise _MomentRefusedError(refused)
+        return share
 
     def _continue_moment(
         self, before: StoredMoment, stored: Mapping[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment:
         """Continues a pending moment; its file lists what cannot be kept.
 
-        Where the disk refuses a link, as when it is full, the moment waits and it is tried again.
+        If the disk refuses a link, for example because it is full, the moment waits.
         """
         need = needed_bags(before.moment.request, snapshot, self.clock.now())
         share = self._share_of(before.moment, self._group(before.moment, stored))
         try:
-            after = _with_links(before, need, *self._link_bags(before.folder, need.bags, share))
+            links = self._link_bags(before.folder, need.bags, share)
         except OSError as error:
             reason = error.strerror or str(error)
             if abs(self.clock.now() - before.moment.request.asked) < LONGEST_WAIT_NS:
@@ -310,7 +341,8 @@ class MomentKeeper:
                     _log.error("moment_not_followed", path=str(before.folder), reason=reason)
                 self._refused.add(before.folder)
                 return before
-            after = _with_links(before, need, [f"not all can be saved: {reason}"], {})
+            links = _Links([f"not all can be saved: {reason}"])
+        after = _with_links(before, need, links)
         self._refused.discard(before.folder)
         if after.moment != before.moment:
             try:
@@ -324,7 +356,7 @@ class MomentKeeper:
         return after
 
     def _group(self, moment: SavedMoment, stored: Mapping[str, StoredMoment]) -> list[StoredMoment]:
-        """Returns the moments that share a limit with one: of its rule, or of no configured one."""
+        """Returns the moments that share a limit with one: of its rule, or of no known rule."""
         rule = self._rule_of(moment)
         return [other for other in stored.values() if self._rule_of(other.moment) == rule]
 
@@ -332,53 +364,47 @@ class MomentKeeper:
         return moment.rule if moment.rule in self.rule_bytes else None
 
     def _share_of(self, moment: SavedMoment, group: Sequence[StoredMoment]) -> Share:
-        """Returns what such moments, of which there are these, may take together."""
+        """Returns the share of a moment; `group` are the stored moments of this share."""
         stored = {inode: size for other in group for inode, size in other.files.items()}
         rule = self._rule_of(moment)
         if rule is not None:
             return Share(self.rule_bytes[rule], f"max_gb of the rule {rule}", stored)
         return Share(max(self.share_bytes - sum(self.rule_bytes.values()), 0), _SHARE, stored)
 
-    def _link_bags(
-        self, folder: Path, bags: Sequence[BagFile], share: Share
-    ) -> tuple[Iterable[str], dict[int, int]]:
+    def _link_bags(self, folder: Path, bags: Sequence[BagFile], share: Share) -> _Links:
         """Links bags into a moment's folder, as far as the share has room for them.
-
-        Returns why some could not be linked, and the sizes of the links by inode.
 
         Raises:
             OSError: a link cannot be made.
         """
-        missing: dict[str, None] = {}
-        linked: dict[int, int] = {}
-        by_folder: defaultdict[Path, list[tuple[Path, _BagInode]]] = defaultdict(list)
+        links = _Links()
+        by_folder: defaultdict[Path, list[_WantedLink]] = defaultdict(list)
         for bag in bags:
             name = os.path.relpath(self._links.recorded_as(bag.file), self.bag_dir)
             target, file = folder / name, _file_of(bag.path)
             if file is None:
-                # `forget` deletes in another process, since the index was made.
+                # `forget` has deleted it, in another process, since the index was made.
                 if not target.exists():
-                    missing[_missing_sentence(name)] = None
+                    links.missing.append(_missing_sentence(name))
             elif share.take(*file):
-                by_folder[target.parent].append((bag.path, file))
+                by_folder[target.parent].append(_WantedLink(bag.path, name, target, file))
             else:
-                missing[share.exhausted] = None
-        for parent, sources in by_folder.items():
+                links.missing.append(share.exhausted)
+        for parent, wanted in by_folder.items():
             directories.make(self.bag_dir, parent)
             # Listed first, so that `forget`, in another process, knows whose the new links are.
-            free = (
-                path.name for path, file in sources if _file_of(parent / path.name) in {None, file}
-            )
+            free = [
+                link.target.name for link in wanted if _file_of(link.target) in {None, link.file}
+            ]
             self.own.add_bags(parent, free)
-            for recorded, file in sources:
-                target = parent / recorded.name
-                if _link_bag(recorded, target, file.inode):
-                    linked[file.inode] = file.size
-                    _link_sidecar(recorded.parent, parent)
+            for bag_path, name, target, file in wanted:
+                if _link_bag(bag_path, target, file.inode):
+                    links.sizes[file.inode] = file.size
+                    _link_sidecar(bag_path.parent, parent)
                 else:
-                    missing[_missing_sentence(str(target.relative_to(folder)))] = None
+                    links.missing.append(_missing_sentence(name))
             flush(parent)
-        return missing, linked
+        return links
 
 
 def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
@@ -393,8 +419,25 @@ class _BagInode(NamedTuple):
     size: int
 
 
+class _WantedLink(NamedTuple):
+    """A hard link to make: the bag, its path below the bag directory, and the path of the link."""
+
+    bag: Path
+    name: str
+    target: Path
+    file: _BagInode
+
+
+@dataclass(slots=True)
+class _Links:
+    """A sentence for each bag that could not be linked, and the sizes of the links by inode."""
+
+    missing: list[str] = field(default_factory=list)
+    sizes: dict[int, int] = field(default_factory=dict)
+
+
 def _file_of(path: Path) -> _BagInode | None:
-    """Returns inode and size of a file; None where it has gone."""
+    """Returns inode and size of a file; None if it has gone."""
     try:
         status = path.lstat()
     except FileNotFoundError:
@@ -408,21 +451,22 @@ def _missing_sentence(name: str) -> str:
 
 def _moment_of(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
     """Returns the moment that a request has already."""
-    moments = stored.values()
-    return next((kept for kept in moments if kept.moment.request.number == request.number), None)
+    for moment in stored.values():
+        if moment.moment.request.number == request.number:
+            return moment
+    return None
 
 
-def _with_links(
-    before: StoredMoment, need: NeededBags, missing: Iterable[str], linked: Mapping[int, int]
-) -> StoredMoment:
-    """Returns a moment with new links, and what could not be linked."""
-    moment, holes = before.moment, tuple[str, ...]()
-    # Of a rule's moment for which no bag is to come: what was never recorded of it.
+def _with_links(before: StoredMoment, need: NeededBags, links: _Links) -> StoredMoment:
+    """Returns a moment with new links, and with a sentence on each bag or time that it lacks."""
+    moment = before.moment
+    sentences = [*moment.missing, *links.missing]
+    # Complete moments of rules also name the times in which nothing was recorded.
     if moment.rule is not None and not need.waits:
-        holes = unrecorded(need.window, need.bags)
-    missing = dict.fromkeys((*moment.missing, *missing, *holes))
-    after = replace(moment, pending=need.waits, missing=tuple(missing))
-    return StoredMoment(before.folder, after, {**before.files, **linked})
+        sentences += unrecorded(need.window, need.bags)
+    missing = tuple(dict.fromkeys(sentences))
+    after = replace(moment, pending=need.waits, missing=missing)
+    return StoredMoment(before.folder, after, {**before.files, **links.sizes})
 
 
 def _link_bag(bag: Path, target: Path, inode: int) -> bool:
@@ -441,10 +485,10 @@ def _link_bag(bag: Path, target: Path, inode: int) -> bool:
 
 
 def _link_sidecar(recording: Path, folder: Path) -> None:
-    """Links a recording's sidecar, replacing an earlier one.
+    """Links a recording's sidecar into a folder of a moment, in place of an earlier one.
 
     Raises:
-        OSError: it cannot be linked.
+        OSError: the link cannot be made.
     """
     source, target = recording / HANDOVER_FILE, folder / HANDOVER_FILE
     beside = folder / f".{HANDOVER_FILE}.tmp"

@@ -27,7 +27,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
-from ros2_memory.retention.policy import DirContents, RetentionLimits, too_old
+from ros2_memory.retention.policy import DirContents, RetentionLimits, bags_older_than
 from ros2_memory.retention.repair import rewritten
 
 if TYPE_CHECKING:
@@ -69,11 +69,11 @@ def plan_cuts(
 ) -> list[TopicCut]:
     """Returns which topics are too old in which bags, the oldest bag first.
 
-    Whether a bag holds them is not looked at: what counts in another recording goes, too, and no
-    index shows it.
+    A bag may have no message of them. Messages that count in another recording go, too, and the
+    index does not show those.
     """
     timeline = snapshot.timeline
-    alone = {
+    not_saved = {
         bag.path
         for bag in contents.bags
         if contents.saved.keys().isdisjoint(file.inode for file in bag.files)
@@ -86,8 +86,8 @@ def plan_cuts(
             if topic not in static_topics and not timeline.is_transient_state(topic)
         ]
         if topics:
-            old = too_old(contents, limits, topic_age.max_age_ns)[contents.synchronised]
-            for path in alone & old:
+            aged = bags_older_than(contents, limits, topic_age.max_age_ns)
+            for path in not_saved & aged.by_clock(synchronised=contents.synchronised):
                 going[path].update(topics)
     return [
         TopicCut(bag, frozenset(going[bag.file]))
@@ -146,28 +146,29 @@ class TopicCutter:
         begun = time.perf_counter_ns()
         until_s = self.monotonic() + SLICE_S
         receipts = read_receipts(self.bag_dir) if (self.bag_dir / SHIPPED_FILE).exists() else {}
-        gone, bags = Counter[str](), 0
+        gone = list[Counter[str]]()
         for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            bags_before = bags
+            gone_of_recording = list[Counter[str]]()
             for cut in of_recording:
                 free = self.measure_free(self.bag_dir)
                 if self.monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
                     break
-                gone_here = self._cut_if_held(cut, receipts)
-                gone += gone_here
-                bags += bool(gone_here)
+                if gone_of_bag := self._cut_or_report(cut, receipts):
+                    gone_of_recording.append(gone_of_bag)
             # Before the next recording: a kill leaves one metadata.yaml behind its bags at most.
-            if bags > bags_before and (reason := why_not_corrected(recording, self.reader)):
+            if gone_of_recording and (reason := why_not_corrected(recording, self.reader)):
                 _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
+            gone += gone_of_recording
             if self.monotonic() >= until_s:
                 break
-        if bags:
+        if gone:
+            messages = dict(sum(gone, Counter[str]()))
             ms = ms_since(begun)
-            _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)
-        return bags
+            _log.info("topics_cut", bags=len(gone), messages=messages, duration_ms=ms)
+        return len(gone)
 
     def _may_begin(self, waiting: Sequence[TopicCut]) -> bool:
-        """Whether something waits, and the machine is quiet, or has not been since for too long."""
+        """Whether bags wait, and the machine is quiet, or was busy for `PATIENCE_S`."""
         now_s = self.monotonic()
         if not waiting or self.is_quiet():
             self._waits_since_s = None
@@ -178,10 +179,10 @@ class TopicCutter:
             _log.info("topics_wait", reason=reason)
         return now_s - self._waits_since_s >= PATIENCE_S
 
-    def _cut_if_held(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str]:
-        """Cuts a bag that has messages of the topics; returns what went, by topic.
+    def _cut_or_report(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str]:
+        """Cuts a bag, or reports why it cannot be cut; returns how many messages went, by topic.
 
-        Nothing where it has none, or cannot be cut: it is not looked at again until it changes.
+        A bag from which nothing went is not looked at again until it changes.
         """
         gone = Counter[str]()
         try:
@@ -193,36 +194,30 @@ class TopicCutter:
         return gone
 
     def _cut_bag(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str]:
-        """Cuts one bag; returns the messages that went, by topic.
+        """Cuts one bag; returns how many messages went, by topic.
 
         Raises:
-            EpisodicError: it cannot be rewritten; nothing is changed.
-            OSError: likewise; or it was, and its folder cannot be flushed.
+            EpisodicError: the bag cannot be rewritten; nothing is changed.
+            OSError: the same; or the bag was cut, and its folder cannot be flushed.
         """
         path = cut.bag.path
         before = path.lstat()
-        summary = self.reader.summarize(path)
-        going = [topic for topic in summary.topics if topic.topic in cut.topics]
+        losses = [
+            Loss(topic.topic, topic.first, topic.last + 1, topic.count, "expired")
+            for topic in self.reader.summarize(path).topics
+            if topic.topic in cut.topics
+        ]
         gone = Counter[str]()
-        for topic in going:
-            gone[topic.topic] += topic.count
+        for loss in losses:
+            gone[loss.topic] += loss.lost
         if not gone:
             return gone
         bag = os.path.relpath(path, self.bag_dir)
-        try:
-            expired = EXPIRED.read(self.bag_dir) or Expired()
-        except ValueError as error:  # a damaged file is replaced
-            damaged = str(self.bag_dir / EXPIRED_FILE)
-            _log.warning("expired_list_damaged", path=damaged, reason=str(error))
-            expired = Expired()
-        losses = [
-            Loss(topic.topic, topic.first, topic.last + 1, topic.count, "expired")
-            for topic in going
-        ]
+        expired = self._read_expired()
         EXPIRED.write(self.bag_dir, expired.then(bag, losses))
         receipt = receipts.get(bag)
         if receipt is not None and receipt.size != before.st_size:
-            receipt = None
+            receipt = None  # the bag has changed since it was shipped
         try:
             with rewritten(
                 self.bag_dir,
@@ -244,6 +239,15 @@ class TopicCutter:
                         SHIPPED.append(self.bag_dir, [receipt])
             raise
         return gone
+
+    def _read_expired(self) -> Expired:
+        """Returns what expired before; a damaged file counts as empty, and is replaced."""
+        try:
+            return EXPIRED.read(self.bag_dir) or Expired()
+        except ValueError as error:
+            damaged = str(self.bag_dir / EXPIRED_FILE)
+            _log.warning("expired_list_damaged", path=damaged, reason=str(error))
+            return Expired()
 
 
 def is_quiet() -> bool:

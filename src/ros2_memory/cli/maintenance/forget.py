@@ -65,7 +65,7 @@ from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
-from ros2_memory.retention.repair import metadata_corrected
+from ros2_memory.retention.repair import correct_metadata_files
 from ros2_memory.storage.mcap.writer import McapWriter
 
 PLACE_MARGIN_NS: Final[Ns] = NS_PER_S
@@ -412,7 +412,7 @@ class _Forget:
                 self._forget_derived(map(self._name, deleted))
             except BagError as error:
                 kept.append(error.reason)
-            notes = [*metadata_corrected(self._bag_dir, recordings, self._reader)]
+            notes = correct_metadata_files(self._bag_dir, recordings, self._reader)
         also = ""
         if carried is not None:
             messages = counted(carried, "latched message is", "latched messages are")
