@@ -65,8 +65,9 @@ if TYPE_CHECKING:
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.storage.base import BagReader, BagWriter
+    from ros2_memory.triggers.exclusion import ExclusionRule
     from ros2_memory.triggers.rules import Rule
-    from ros2_memory.triggers.screening import ExclusionRule, Screening
+    from ros2_memory.triggers.screening import Screening
     from ros2_memory.triggers.watch import Triggers
 
 log = get_logger(__name__)
@@ -360,7 +361,7 @@ def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
             recordings have too many splits for it.
     """
     from ros2_memory.recorder.process.topics import load_topics
-    from ros2_memory.triggers.screening import ExclusionRule
+    from ros2_memory.triggers.exclusion import ExclusionRule
 
     recording = settings.recording
     path, given = recording.exclude_when, load_exclusions(settings)

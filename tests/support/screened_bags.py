@@ -12,7 +12,8 @@ from ros2_memory.bag_dir.layout import utc_stamp
 from ros2_memory.bag_dir.state_files import read_withheld
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.triggers.screening import ExclusionRule, Screening
+from ros2_memory.triggers.exclusion import ExclusionRule
+from ros2_memory.triggers.screening import Screening
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.memories import shipped_extractor
 

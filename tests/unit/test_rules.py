@@ -9,8 +9,8 @@ from ros2_memory.bootstrap import exclusions_of, places_of, query_settings_of, r
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
+from ros2_memory.triggers.exclusion import ExclusionRule
 from ros2_memory.triggers.rules import Rule
-from ros2_memory.triggers.screening import ExclusionRule
 from tests.support.memories import ROOT
 
 BUMPER: Final = "topic: /bumper, condition_type: equals, value: true"

@@ -1,19 +1,20 @@
-"""Rules over closed splits: what makes one fire, what is then kept, and the search for it.
+"""Rules over closed splits: when a rule fires, what is kept then, and the search for matches.
 
 When a rule fires is a fold over messages in order of time, with its state carried on.
 
-A match begins with a message that meets the condition, and ends as a sighting does: with a message
-of the topic that does not, or where the topic is silent for longer than `SILENCE_NS`; on a latched
-topic, whose publisher sends only when something changes, a silence ends nothing. It ends at a gap,
-where the recorder did not run on. A message that cannot be decoded neither begins nor ends one.
+A match begins with a message that meets the condition. It ends as a sighting does: with a message
+of the topic that does not meet it, or when the topic is silent for longer than `SILENCE_NS`. On a
+latched topic, whose publisher sends only when something changes, a silence ends nothing. A match
+also ends at a gap, where the recorder did not run. A message that cannot be decoded neither begins
+nor ends a match.
 
 A rule fires once in each match: when it begins, or once it has held for as long as the rule asks.
 A silence begins with the last message of a topic that had one since the last gap.
 
 How the stream is cut into calls changes nothing: `reach` says only how far it is known.
 
-Only bags with topics that a rule names are opened, and only messages of these are decoded; a rule
-over silences needs their times alone.
+Only bags with topics that a rule names are opened, and only messages of these topics are decoded; a
+rule for silences needs the log times alone.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import hashlib
 import heapq
 import time
 from dataclasses import KW_ONLY, dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -51,12 +53,13 @@ if TYPE_CHECKING:
 
 
 LEAST_NEAR_NS: Final[Ns] = 60 * NS_PER_S
-"""Recordings that take over from each other overlap by less."""
+"""Recordings that take over from each other overlap by less, ..."""
 _SPLITS_NEAR: Final = 3
+"""... and by less than so many splits."""
 _BURST_NS: Final[Ns] = 5 * NS_PER_S
-"""In so much time a new subscriber receives what its publishers repeat."""
+"""A new subscriber receives the messages that its publishers repeat within so much time."""
 _MARKED_RECORDINGS: Final = 3
-"""Recordings whose latched messages are remembered: the newest ones, which can still overlap."""
+"""Latched messages of so many recordings are remembered: the newest ones, which may overlap."""
 
 
 class Firing(NamedTuple):
@@ -106,46 +109,44 @@ class Rule:
         matches: bool | None,
         latched: bool = False,
     ) -> Firing | None:
-        """Takes the next message of a topic, and changes the matches that go on.
+        """Updates `runs` by the next message of a topic; returns whether the rule fires.
 
         Args:
             runs: the matches that go on, by topic; for a rule over silences, since when each topic
                 is silent.
             topic: the topic of the message.
-            time: its log time.
-            matches: whether it meets the condition; None where it cannot be decoded.
-            latched: whether its value holds until the next message.
+            time: the log time of the message.
+            matches: whether the message meets the condition; None if it cannot be decoded.
+            latched: whether the value of the message holds until the next one.
         """
         run = runs.get(topic)
         if run is not None and time < run.last - SILENCE_NS:
             run = None  # the clock was set back
-        match self.kind:
-            case "recorder_restart":
-                return None
-            case "silent":
-                spoke = time if run is None else max(time, run.last)
-                runs[topic] = RunRecord(spoke, spoke)
-                return self._fire(topic, run, time)
-            case "message":
-                fired = None
-                if run is not None and run.lasts:
-                    # Its value held until now, whatever it is from now on.
-                    fired = self._fire(topic, run, time)
-                elif run is not None and abs(time - run.last) > SILENCE_NS:
-                    run = None
-                if matches is False:
-                    run = None
-                elif matches and run is None:
-                    run = RunRecord(time, time, lasts=latched)
-                if run is None:
-                    runs.pop(topic, None)
-                    return fired
-                runs[topic] = run
-                run.last = max(run.last, time)
-                return fired or (self._fire(topic, run, time) if matches else None)
+        if self.kind == "silent":
+            last = time if run is None else max(time, run.last)
+            runs[topic] = RunRecord(last, last)
+            return self._fire(topic, run, time)
+        fired = None
+        if run is not None and run.lasts:
+            # The value held until now, whatever it is from now on.
+            fired = self._fire(topic, run, time)
+        elif run is not None and abs(time - run.last) > SILENCE_NS:
+            run = None
+        if matches is False:
+            run = None
+        elif matches and run is None:
+            run = RunRecord(time, time, lasts=latched)
+        if run is None:
+            runs.pop(topic, None)
+            return fired
+        runs[topic] = run
+        run.last = max(run.last, time)
+        if matches and fired is None:
+            fired = self._fire(topic, run, time)
+        return fired
 
     def reach(self, runs: Mapping[str, RunRecord], until: Ns) -> Iterator[Firing]:
-        """Yields what fires because nothing more came before a moment."""
+        """Yields the firings of silences and lasting matches that go on at a log time."""
         for topic, run in runs.items():
             if self.kind == "silent" or run.lasts:
                 fired = self._fire(topic, run, until)
@@ -153,6 +154,7 @@ class Rule:
                     yield fired
 
     def _fire(self, topic: str, run: RunRecord | None, time: Ns) -> Firing | None:
+        """Returns the firing of a match that has held for long enough at a log time, once."""
         if run is None or run.fired or time - run.first < self.hold:
             return None
         run.fired = True
@@ -167,10 +169,20 @@ class SearchPart(NamedTuple):
     bags: tuple[BagFile, ...]
 
 
+class SearchResult(NamedTuple):
+    """What a search fired, in order.
+
+    `stopped_at` is the log time at which its time was over; None if all is searched.
+    """
+
+    firings: list[Firing]
+    stopped_at: Ns | None
+
+
 class SearchChain(NamedTuple):
     """Parts of recordings that took over from each other, in order.
 
-    `goes_on`: the first of them goes on from what was searched before, without a gap.
+    `goes_on`: the first part follows the part that was searched last, without a gap.
     """
 
     parts: tuple[SearchPart, ...]
@@ -184,13 +196,13 @@ def chains_to_search(
     previous: Callable[[str], str | None],
     split_ns: Ns,
 ) -> list[SearchChain]:
-    """Returns what can be searched of recordings.
+    """Returns the parts of recordings that can be searched now.
 
     Args:
-        closed: their closed bags, by recording, in the order in which the recordings began.
-        live: those that are being written.
-        searched: until when each was searched.
-        previous: gives the recording that one took over from; None where it took over from none.
+        closed: the closed bags by recording, in the order in which the recordings began.
+        live: the recordings that are being written.
+        searched: until which log time each recording was searched.
+        previous: returns the recording that one took over from, or None.
         split_ns: how long one bag is.
     """
     ends = {name: max((bag.end for bag in bags), default=MIN_NS) for name, bags in closed.items()}
@@ -205,38 +217,39 @@ def chains_to_search(
         if window.empty or not touched:
             continue
         part = SearchPart(name, window, touched)
-        from_before = name in searched
-        other = None if from_before else previous(name)
-        if last is not None and (from_before or other == last):
+        is_known = name in searched
+        predecessor = None if is_known else previous(name)
+        if last is not None and (is_known or predecessor == last):
             chains[-1] = SearchChain((*chains[-1].parts, part), chains[-1].goes_on)
         else:
-            chains.append(SearchChain((part,), from_before or other in searched))
+            chains.append(SearchChain((part,), is_known or predecessor in searched))
         last = name
     return chains
 
 
 def horizons(ends: Mapping[str, Ns], live: Mapping[str, Ns | None], split_ns: Ns) -> dict[str, Ns]:
-    """Returns until when nothing can come any more that affects recordings; MAX_NS for all times.
+    """Returns the log time before which no more messages can come that affect each recording.
+
+    It is MAX_NS for a recording that no live one affects.
 
     Args:
-        ends: where what is closed of each recording ends.
-        live: the same of those that are being written; None where nothing of one is closed.
+        ends: the last log time in the closed bags of each recording.
+        live: the same for each recording that is being written; None if none of its bags is closed.
         split_ns: how long one bag is.
     """
-    begun = {name: named_start(name) if end is None else end for name, end in live.items()}
-    reached = {name: end - OUT_OF_ORDER_NS for name, end in begun.items() if end is not None}
+    reached: dict[str, Ns] = {}
+    for name, last in live.items():
+        end = named_start(name) if last is None else last
+        if end is not None:
+            reached[name] = end - OUT_OF_ORDER_NS
     near = max(LEAST_NEAR_NS, _SPLITS_NEAR * split_ns)
-    return {
-        name: min(
-            (
-                until
-                for other, until in reached.items()
-                if other == name or abs(until - end) <= near
-            ),
-            default=MAX_NS,
-        )
-        for name, end in ends.items()
-    }
+    limits: dict[str, Ns] = {}
+    for name, end in ends.items():
+        limits[name] = MAX_NS
+        for other, until in reached.items():
+            if other == name or abs(until - end) <= near:
+                limits[name] = min(limits[name], until)
+    return limits
 
 
 class _Event(NamedTuple):
@@ -250,7 +263,7 @@ class _Event(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class SplitSearch:
-    """Searches on behalf of some rules."""
+    """Searches bags for messages and silences that make rules fire."""
 
     reader: BagReader
     extractor: SchemaExtractor
@@ -267,11 +280,8 @@ class SplitSearch:
 
     def search(
         self, chain: SearchChain, state: TriggerState, is_over: Callable[[], bool]
-    ) -> tuple[list[Firing], Ns | None]:
-        """Searches a chain and changes the state; returns what fired, in order.
-
-        With it the log time at which the search stopped since its time was over; None where all is
-        searched.
+    ) -> SearchResult:
+        """Searches a chain until `is_over`, and carries the state on.
 
         Raises:
             BagUnreachableError: the disk fails to read a bag, and may recover; the state is
@@ -281,7 +291,7 @@ class SplitSearch:
             record = state.rules.setdefault(rule.name, RuleRecord())
             if not chain.goes_on:
                 record.runs.clear()  # the recorder did not run on
-        fired: list[Firing] = []
+        firings: list[Firing] = []
         stopped: Ns | None = None
         previous: Ns | None = None
         bags = (
@@ -290,27 +300,29 @@ class SplitSearch:
             for bag in part.bags
             if any(self._rules_of(topic.topic) for topic in bag.summary.topics)
         )
-        for event in heapq.merge(*bags, key=lambda event: event.time):
+        for event in heapq.merge(*bags, key=attrgetter("time")):
             if not event.topic:
                 continue
+            # Messages of one log time are searched together: the next search begins after them.
             if previous is not None and event.time > previous and is_over():
                 stopped = event.time
                 break
             previous = event.time
-            fired += self._firings_at(event, state)
+            firings += self._firings_at(event, state)
         until = max(part.window.stop for part in chain.parts)
         searched = until if stopped is None else min(stopped, until)
         for rule in self._rules:
-            fired += rule.reach(state.rules[rule.name].runs, searched)
-        return fired, stopped
+            firings += rule.reach(state.rules[rule.name].runs, searched)
+        return SearchResult(firings, stopped)
 
     def _firings_at(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
+        """Yields what a message fires; nothing for a repeated latched message."""
         record, latched = event.record, False
         value: JsonValue | UndecodableError = None
         rules = self._rules_of(event.topic)
         if record is not None:
             latched = record.channel.latched
-            if latched and _receive(record, event.recording, state):
+            if latched and _mark_received(record, event.recording, state):
                 return
             if any(rule.kind == "message" for rule in rules):
                 try:
@@ -333,11 +345,12 @@ class SplitSearch:
         value: JsonValue | UndecodableError,
         state: TriggerState,
     ) -> bool | None:
-        """Returns whether a value meets a rule's condition; None where it has none.
+        """Returns whether a value meets a rule's condition.
 
-        None, too, where the value could not be decoded, or does not say.
+        None if the rule has no condition, or the value could not be decoded or does not say.
 
-        Notes why messages cannot make the rule fire; whether any could, once for each topic.
+        Stores a problem in the rule's record if the message cannot make the rule fire. Whether any
+        message of its type could is tested once for each topic.
         """
         record = state.rules[rule.name]
         if rule.condition is None:
@@ -367,25 +380,28 @@ class SplitSearch:
     def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:
         """Yields the messages of a bag in a window, in order of log time.
 
-        Before them an event without a topic, at which the bag has not been opened yet. What cannot
-        be read of it is reported as a problem of the rules.
+        The first event has no topic: `heapq.merge` takes it before the bag is opened, so that bags
+        are opened one after the other. A part that cannot be read becomes a problem of the rules.
         """
         yield _Event(max(bag.start, part.window.start), "", part.recording, None)
-        topics = [topic.topic for topic in bag.summary.topics]
-        watched = {topic: rules for topic in topics if (rules := self._rules_of(topic))}
+        watched: dict[str, tuple[Rule, ...]] = {}
+        for topic in bag.summary.topics:
+            if rules := self._rules_of(topic.topic):
+                watched[topic.topic] = rules
         try:
             yield from self._messages(bag, part, watched)
         except BagError as error:
             if self._failing.may_recover(bag.path, error):
                 raise
             problem = f"not all could be searched: {bag.path.name}: {error.reason}"
-            for rule in {rule.name for rules in watched.values() for rule in rules}:
-                state.rules[rule].problem = problem
+            for rules in watched.values():
+                for rule in rules:
+                    state.rules[rule.name].problem = problem
 
     def _messages(
         self, bag: BagFile, part: SearchPart, watched: Mapping[str, Sequence[Rule]]
     ) -> Iterator[_Event]:
-        """Yields the messages of topics that rules watch; their times alone where these suffice.
+        """Yields the messages of watched topics; without records if no rule tests their values.
 
         Raises:
             BagError: the bag cannot be read.
@@ -405,11 +421,11 @@ class SplitSearch:
             for record in records
         )
         bare = (_Event(time, topic, part.recording, None) for time, topic in sorted(times))
-        yield from heapq.merge(with_records, bare, key=lambda event: event.time)
+        yield from heapq.merge(with_records, bare, key=attrgetter("time"))
 
 
-def _receive(record: Record, recording: str, state: TriggerState) -> bool:
-    """Remembers a latched message; returns whether another recording received it before."""
+def _mark_received(record: Record, recording: str, state: TriggerState) -> bool:
+    """Marks a latched message as received; returns whether another recording received it before."""
     mark = state.latched.setdefault(record.channel.topic, LatchedMark())
     payload = hashlib.blake2b(record.payload, digest_size=8).hexdigest()
     mark.begun.setdefault(recording, record.log_time)
@@ -427,11 +443,11 @@ def _receive(record: Record, recording: str, state: TriggerState) -> bool:
 
 
 def _is_repeat(record: Record, recording: str, payload: str, mark: LatchedMark) -> bool:
-    """Returns whether a latched message was published before this recording received it.
+    """Returns whether a latched message was sent before, and this recording received it again.
 
-    Every recording receives those of a topic again. What it receives in its first seconds and was
-    published long before is one, whether a recorder saw it or not. Where a format keeps no publish
-    time, the first message in a recording is one if it is like the last one.
+    A message that a recording receives in its first seconds, and that was published long before,
+    is repeated, whether another recording has it or not. If a format keeps no publish time, the
+    first message of a recording is repeated if its payload is that of the last message.
     """
     logged, published = record.log_time, record.publish_time
     if published in {0, logged}:

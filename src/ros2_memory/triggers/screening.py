@@ -1,21 +1,15 @@
 """Screens closed splits before they are served: cuts out what `recording.exclude_when` excludes.
 
-Which times those are is computed from the values of a topic in each recording. A message is valid
-from its log time on: on a latched topic until the next one, on any other topic for `stale` after
-the last one. It is valid only in its own recording, since the next one receives the topic again.
-Exception: a condition that is true at the end of a recording stays true in the following ones, for
-at most `stale`, until one of them receives the topic. If another recording has taken over by then,
-the last value is valid for `stale` more, until that recording must have received the topic. All
-other times are unknown, and so are spans in which the clock was set back.
+Which times are excluded is computed in `exclusion`.
 
-Each split is read once for what the rules' topics show in it. It is released once nothing that
-comes can reach into it any more, with its margin: mostly when the next split was read. Before that
-what falls into an excluded stretch is cut out of it. While no message has ever shown whether a rule
-holds, for want of its field, splits stay as they are and are not served: a corrected rule reads
-them.
+Each split is read once for the values of the rules' topics. It is released once no later message
+can exclude any of it, margins included: mostly when the next split was read. Before that, the
+messages in excluded stretches are cut out of it. While no message has ever shown whether a rule
+holds, since none has its field, splits stay as they are and are not served: a corrected rule reads
+them again.
 
-What was learned is written before the first cut, since a cut takes the messages that showed it. A
-kill in between does no harm: what is not released yet is cut again, to the same result.
+The values are written down before the first cut, since a cut takes the messages that showed them. A
+kill in between does no harm: a split that is not released is cut again, to the same result.
 """
 
 from __future__ import annotations
@@ -26,7 +20,6 @@ from collections import Counter
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass
-from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.conditions import Equals, leaves
@@ -55,28 +48,36 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span, ns_from_unix
+from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
 from ros2_memory.retention.repair import reason_of, rewritten
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
+from ros2_memory.triggers.exclusion import (
+    Cut,
+    ExclusionRule,
+    RecordingConditions,
+    add_excluded,
+    add_message,
+    excluded_intervals,
+)
 from ros2_memory.triggers.rules import horizons
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
 
 MOST_AT_ONCE: Final = 16
 """So many splits are released in one step, which is then written down."""
 DONE_KEPT: Final = 2
-"""Recordings that are done but still matter to later ones."""
+"""So many finished recordings are remembered, since their values matter to later ones."""
 MOST_EXCLUDED: Final = 1000
-"""Stretches that are remembered, the newest ones."""
+"""So many excluded stretches are remembered: the newest ones."""
 RETRY_S: Final = 30.0
 """How long until a split that could not be cut is tried again."""
 REMIND_S: Final = 600.0
@@ -85,267 +86,32 @@ REMIND_S: Final = 600.0
 _log = get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExclusionRule:
-    """A rule of `recording.exclude_when`.
-
-    Attributes:
-        margin: how long before and after is excluded, too.
-        stale: for how long a message is valid if its topic is not latched.
-        excludes_unknown: whether times with an unknown value are excluded, too.
-    """
-
-    name: str
-    topic: str
-    condition: Condition
-    margin: Ns
-    stale: Ns
-    excludes_unknown: bool = True
-
-
-class RecordingConditions(NamedTuple):
-    """The values of a topic in one recording, in the order in which they were written.
-
-    `end` is None while it is being written. `previous` is the recording that it took over from
-    while both ran, if there is one: the clock of any other may have been set since.
-    """
-
-    start: Ns
-    end: Ns | None
-    heard: Sequence[ConditionInterval]
-    unclear: Sequence[Span] = ()
-    name: str = ""
-    previous: str | None = None
-
-    @property
-    def stop(self) -> Ns:
-        """The end, excluded."""
-        return MAX_NS if self.end is None else self.end + 1
-
-
-def add_message(
-    heard: list[ConditionInterval], time: Ns, holds: bool | None, *, latched: bool, stale: Ns
-) -> None:
-    """Adds the next message; `holds` is None if it cannot be read.
-
-    A message that lies before the last one was logged out of order, and changes nothing unless the
-    condition holds.
-    """
-    last = heard[-1] if heard else None
-    if last is not None and time < last.last:
-        if holds is False:
-            return
-        if holds is None:
-            time = last.last
-        elif last.holds and last.lasts == latched:
-            last.first = min(last.first, time)
-            return
-    if (
-        last is not None
-        and (last.holds, last.lasts) == (holds, latched)
-        and (latched or time - last.last <= stale)
-    ):
-        last.last = time
-    else:
-        heard.append(ConditionInterval(time, time, holds, latched))
-
-
-def excluded_intervals(
-    rule: ExclusionRule, recordings: Sequence[RecordingConditions]
-) -> list[Excluded]:
-    """Returns the intervals to cut out, with the margin, in order of time.
-
-    Those in which the condition held, and those in which it was not known, are apart, and may
-    overlap. Recordings come in the order in which they began; one that begins before the one before
-    it follows a clock that was set back, and learns from it only that the condition held.
-    """
-    held: Spans = []
-    free: list[Spans] = []
-    for place, recording in enumerate(recordings, 1):
-        later = recordings[place:]
-        free_here: Spans = []
-        for run, following in zip_longest(recording.heard, recording.heard[1:]):
-            stop = _valid_until(run, following, recording, rule.stale)
-            if following is None and stop >= recording.stop < MAX_NS:
-                stop = _valid_past_end(run, recording, later, rule.stale)
-                if run.holds:
-                    held += _carried(run.first, recording, later, rule.stale)
-            if run.holds is True:
-                held.append((run.first, stop))
-            elif run.holds is False:
-                free_here.append((run.first, stop))
-        free.append(free_here)
-    unknown = [span for recording in recordings for span in recording.unclear]
-    if rule.excludes_unknown:
-        unknown += _unknown(recordings, held, free)
-    return [
-        *(Excluded(*span, held=True) for span in _widened(held, rule.margin)),
-        *(Excluded(*span, held=False) for span in _widened(unknown, rule.margin)),
-    ]
-
-
-def _unknown(
-    recordings: Sequence[RecordingConditions], held: Spans, free: Sequence[Spans]
-) -> Iterator[Span]:
-    """Yields where recordings did not know, by themselves or by others, whether it holds."""
-    for recording in recordings:
-        # Of those alone that ran beside it by one clock.
-        beside = (
-            spans
-            for spans, other in zip(free, recordings, strict=True)
-            if other is recording
-            or (recording.previous == other.name and not other.unclear)
-            or other.previous == recording.name
-        )
-        yield from without([(recording.start, recording.stop)], united(chain(held, *beside)))
-
-
-def _valid_until(
-    run: ConditionInterval,
-    following: ConditionInterval | None,
-    recording: RecordingConditions,
-    stale: Ns,
-) -> Ns:
-    """Returns until when a recording itself knows the value."""
-    stop = recording.stop
-    if following is not None and following.first >= run.last:
-        stop = following.first
-    elif following is not None and not run.holds:
-        # The clock was set back: nothing is sure but that the condition may hold.
-        return run.last + 1
-    return stop if run.lasts else min(stop, run.last + stale)
-
-
-def _valid_past_end(
-    run: ConditionInterval,
-    recording: RecordingConditions,
-    later: Iterable[RecordingConditions],
-    stale: Ns,
-) -> Ns:
-    """Returns until when the last value of a recording is valid; longer if another took over."""
-    was_taken_over = any(
-        recording.start <= other.start < recording.stop < other.stop for other in later
-    )
-    if run.holds or not was_taken_over:
-        return recording.stop
-    return (recording.stop if run.lasts else run.last) + stale
-
-
-def _carried(
-    since: Ns, ended: RecordingConditions, others: Iterable[RecordingConditions], stale: Ns
-) -> Spans:
-    """Returns where a condition that held from `since` to the end of a recording goes on after it.
-
-    One that took over may have begun, and received the topic, before the condition held.
-    """
-    spans: Spans = []
-    until: Ns | None = None
-    for other in others:
-        start = other.start
-        if other.previous == ended.name and not (ended.unclear or other.unclear):
-            start = max(since, start)
-        if other.start < ended.start:  # the clock was set back
-            start, until = other.start, other.start + stale
-        elif until is None:
-            until = max(other.start, ended.stop) + stale
-        stop = min(until, other.heard[0].first if other.heard else MAX_NS)
-        if start < stop:
-            spans.append((start, stop))
-        if other.heard:
-            break
-    return spans
-
-
-class Cut:
-    """Which messages of one bag are deleted.
-
-    The time of receipt decides, but on a latched topic, which each recording receives again, the
-    publish time: a message is deleted if it lies in a stretch in which the condition held, or in
-    one in which that was not known and the message was received in a stretch, too.
-
-    Args:
-        stretches: those of the bag's own time.
-        before: those that were excluded before, in which latched messages may have been published.
-        latched: the latched topics.
-    """
-
-    def __init__(
-        self, stretches: Sequence[Excluded], before: Sequence[Excluded], latched: Collection[str]
-    ) -> None:
-        self._latched = frozenset(latched)
-        self._all = united(stretch.span for stretch in stretches)
-        known = (*before, *stretches)
-        self._known = united(stretch.span for stretch in known)
-        self._held = united(stretch.span for stretch in known if stretch.held)
-
-    def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
-        """Returns whether a message is deleted."""
-        if topic not in self._latched:
-            return lies_inside(self._all, log_time)
-        return self.takes_always(log_time, publish_time) or (
-            lies_inside(self._known, _published(log_time, publish_time))
-            and lies_inside(self._all, log_time)
-        )
-
-    def takes_always(self, log_time: Ns, publish_time: Ns) -> bool:
-        """Returns whether a latched message is deleted whenever it is received."""
-        return lies_inside(self._held, _published(log_time, publish_time))
-
-    def touches(self, topic: str, first: Ns, last: Ns) -> bool:
-        """Returns whether messages of a topic between two log times may be deleted."""
-        if topic in self._latched:
-            return bool(self._known)
-        return overlaps_any(self._all, first, last)
-
-
-def add_excluded(
-    known: Sequence[Excluded], stretches: Iterable[Excluded], start: Ns, end: Ns
-) -> list[Excluded]:
-    """Returns what is known with the parts of stretches that touch a file from `start` to `end`.
-
-    What lies between two files, less than messages are out of order, counts with both.
-    """
-    low, high = start - OUT_OF_ORDER_NS, end + OUT_OF_ORDER_NS + 1
-    parts = [
-        Excluded(max(stretch.start, low), min(stretch.stop, high), stretch.held)
-        for stretch in stretches
-        if stretch.start <= end and start < stretch.stop
-    ]
-    joined: list[Excluded] = []
-    for held in (True, False):
-        spans = [stretch.span for stretch in (*known, *parts) if stretch.held is held]
-        joined += (Excluded(*span, held=held) for span in united(spans))
-    return sorted(joined, key=lambda stretch: stretch.span)
-
-
-def _published(log_time: Ns, publish_time: Ns) -> Ns:
-    return publish_time if 0 < publish_time < log_time else log_time
-
-
-def _widened(spans: Iterable[Span], margin: Ns) -> Spans:
-    return united(
-        (max(start - margin, MIN_NS), min(stop + margin, MAX_NS))
-        for start, stop in spans
-        if start < stop
-    )
-
-
 _ClosedFiles: TypeAlias = "list[tuple[Path, BagSummary]]"
 
 
 class _UselessRuleError(EpisodicError):
-    """A rule that was never evaluated cannot be evaluated on a split either."""
+    """A rule could not be evaluated on a split, nor on any split before."""
+
+
+class _TestResult(NamedTuple):
+    """Whether a condition holds; None if the message cannot show it.
+
+    `refusal` is the reason if no message of this type could show it.
+    """
+
+    holds: bool | None
+    refusal: str | None = None
 
 
 @dataclass(eq=False, repr=False)
 class Screening:
     """Screens the recordings of one bag directory.
 
-    `announce` and `plan` are for the thread that begins recordings, the step that `plan` returns
-    for any one other.
+    The thread that begins recordings calls `announce` and `plan`. One other thread runs the steps
+    that `plan` returns.
 
     Args:
-        rules: what is excluded, by unique names; with none nothing is announced.
+        rules: the rules, with unique names.
         reader: reads files as they are, also what does not count in answers.
     """
 
@@ -373,7 +139,7 @@ class Screening:
         self._excluded_latched = frozenset[str]()
 
     def announce(self, recording: str) -> None:
-        """Holds back a recording of which nothing exists yet.
+        """Holds back a recording that has not begun yet.
 
         Raises:
             RecorderError: that cannot be written down, and the recording must not begin.
@@ -391,8 +157,8 @@ class Screening:
         """Returns the next step, which may take some seconds; `live` are being written now.
 
         Raises:
-            EpisodicError: what is known cannot be read.
-            OSError: likewise.
+            RecorderError: the state file is damaged.
+            OSError: the state file cannot be read.
         """
         with self._lock:
             names = [name for name, screen in self._loaded().recordings.items() if not screen.done]
@@ -419,7 +185,7 @@ class Screening:
     def excluded_latched(self) -> frozenset[str]:
         """Returns the latched topics whose newest message is excluded whenever it is received.
 
-        Not those that decide: each recording needs their value.
+        The rules' own topics are not among them: each recording needs their value.
         """
         return self._excluded_latched.difference(rule.topic for rule in self.rules)
 
@@ -433,50 +199,55 @@ class Screening:
         """
         with self._lock:
             state = deepcopy(self._loaded())
-        closed: dict[str, _ClosedFiles] = {}
-        is_held = False
+        unreleased: dict[str, _ClosedFiles] = {}
+        is_held_back = False
         for name in names:
-            files, is_whole = self._read_recording(name, state.recordings[name], live)
-            is_held |= not is_whole
-            # What a condition was in a recording that is held back may matter to later ones.
-            closed[name] = [] if is_held else files
-        self._problems = {
-            name: reason
-            for name, reason in self._problems.items()
-            if (self.bag_dir / name).exists()
-        }
+            files, is_read = self._read_recording(name, state.recordings[name], live)
+            is_held_back = is_held_back or not is_read
+            # Values in a recording that is not read yet may matter to later ones.
+            unreleased[name] = [] if is_held_back else files
+        for file in [*self._problems]:
+            if not (self.bag_dir / file).exists():
+                del self._problems[file]
         self._commit(state, names)
-        ready = self._ready(state, closed, live)
+        ready = self._ready(state, unreleased, live)
         stretches = self._stretches(state, live) if ready else []
         for path, summary in ready[:MOST_AT_ONCE]:
-            try:
-                self._cut_split(path, summary, stretches, state.excluded)
-            except (EpisodicError, OSError) as error:
-                self._report(path, error)
-                self._put_off(path)
-                continue
-            state.recordings[path.parent.name].files[path.name] = FileStep.RELEASED
-            if not summary.empty:
-                excluded = add_excluded(state.excluded, stretches, summary.start, summary.end)
-                state.excluded = excluded[-MOST_EXCLUDED:]
-            self._problems.pop(_file_name(path), None)
-            self._retry_s.pop(path, None)
+            self._release(path, summary, stretches, state)
         for name in names:
             if name not in live:
                 self._finish_recording(name, state)
         self._commit(state, names)
 
+    def _release(
+        self, path: Path, summary: BagSummary, stretches: Sequence[Excluded], state: ScreenState
+    ) -> None:
+        """Cuts a split and marks it as released in the state; a fault is reported."""
+        try:
+            self._cut_split(path, summary, stretches, state.excluded)
+        except (EpisodicError, OSError) as error:
+            self._report(path, error)
+            self._put_off(path)
+            return
+        state.recordings[path.parent.name].files[path.name] = FileStep.RELEASED
+        if not summary.empty:
+            excluded = add_excluded(state.excluded, stretches, summary.start, summary.end)
+            state.excluded = excluded[-MOST_EXCLUDED:]
+        self._problems.pop(_file_name(path), None)
+        self._retry_s.pop(path, None)
+
     def _read_recording(
         self, name: str, screen: RecordingScreen, live: Collection[str]
     ) -> tuple[_ClosedFiles, bool]:
-        """Reads the closed files of a recording that were not; returns those not released yet.
+        """Reads the new closed files of a recording into its state.
 
-        With it whether all closed files are read: none where a useless rule waits for another.
+        Returns the closed files that are not released, and whether all of them are read. A useless
+        rule, or a file that is put off, ends the reading.
         """
         unreleased: _ClosedFiles = []
         paths, known = self._files(name), screen.files
         screen.files = {path.name: known[path.name] for path in paths if path.name in known}
-        for nth, path in enumerate(paths):
+        for number, path in enumerate(paths):
             step = screen.files.get(path.name)
             if step in {FileStep.RELEASED, FileStep.UNREADABLE}:
                 continue
@@ -485,7 +256,7 @@ class Screening:
             try:
                 summary = self._read_file(path, screen)
             except _UselessRuleError as error:
-                self._problems |= dict.fromkeys(map(_file_name, paths[nth:]), str(error))
+                self._problems |= dict.fromkeys(map(_file_name, paths[number:]), str(error))
                 self._put_off(path)
                 return unreleased, False
             if summary is not None:
@@ -495,14 +266,14 @@ class Screening:
         return unreleased, True
 
     def _read_file(self, path: Path, screen: RecordingScreen) -> BagSummary | None:
-        """Adds what a file shows to the state, once; returns its summary.
+        """Adds the values of a file to the state, once; returns its summary.
 
-        None where it is open, or cannot be read. One that a crash left open is read once it was
-        repaired.
+        None if the file is open, or cannot be read. A file that a crash left open is read when it
+        is repaired.
 
         Raises:
-            BagUnreachableError: the disk fails to read it, and may recover.
-            _UselessRuleError: as `_add_conditions`.
+            BagUnreachableError: the disk fails to read the file, and may recover.
+            _UselessRuleError: see `_add_conditions`.
         """
         is_new = path.name not in screen.files
         try:
@@ -514,7 +285,7 @@ class Screening:
         except BagError as error:
             if self._failing.may_recover(path, error):
                 raise
-            _doubt(screen)
+            _add_unknown(screen)
             screen.files[path.name] = FileStep.UNREADABLE
             self._report(path, error)
             return None
@@ -536,12 +307,12 @@ class Screening:
         return []
 
     def _add_conditions(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
-        """Adds what a file shows to the state.
+        """Adds the values of a file to the state.
 
         Raises:
-            BagError: it cannot be read or rewritten.
-            _UselessRuleError: no message has shown yet whether a rule holds that excludes what is
-                not known; the state stays as it is.
+            BagError: the file cannot be read or rewritten.
+            _UselessRuleError: a rule excludes times of unknown state, and no message has ever shown
+                whether it holds; the state is unchanged.
         """
         if path.suffix != ".mcap" or not summary.complete:
             raise BagError(str(path), "it is not a complete MCAP file")
@@ -552,10 +323,10 @@ class Screening:
             heard = heard_by_rule.setdefault(rule.name, [])
             refusal: str | None = None
             for record in self.reader.records(path, (rule.topic,), TimeWindow.everything()):
-                holds, refused = self._test(rule, record)
-                refusal = refused or refusal
+                result = self._test(rule, record)
+                refusal = result.refusal or refusal
                 latched = record.channel.latched
-                add_message(heard, record.log_time, holds, latched=latched, stale=rule.stale)
+                add_message(heard, record.log_time, result.holds, latched=latched, stale=rule.stale)
             if refusal and rule.excludes_unknown and rule.name not in self._evaluated:
                 raise _UselessRuleError(refusal)
         screen.heard = heard_by_rule
@@ -569,34 +340,24 @@ class Screening:
         screen.start = min(summary.start, MAX_NS if screen.start is None else screen.start)
         screen.end = summary.end if screen.end is None else max(screen.end, summary.end)
 
-    def _test(self, rule: ExclusionRule, record: Record) -> tuple[bool | None, str | None]:
-        """Returns whether a rule's condition holds; None where a message cannot show it.
-
-        With it the reason, where no message of this shape can show it.
-        """
+    def _test(self, rule: ExclusionRule, record: Record) -> _TestResult:
         type_name = record.channel.type
         condition = rule.condition.of_type(type_name, self.extractor)
         try:
             value = self.extractor.exact(self.reader.decode(record), type_name)
         except UndecodableError as error:
             self._refuse(rule, str(error))
-            return None, None
+            return _TestResult(None)
         holds = condition.matches(value)
-        refusal = None
-        if not holds and condition.can_be_refused:
-            refusal = refusal_for(condition, value)
-        if not holds and refusal is None and isinstance(condition.test, Equals):
-            is_number = any(isinstance(leaf, bool | int | float) for leaf in leaves(value))
-            if isinstance(condition.test.value, bool) and not is_number:
-                refusal = "the values hold no boolean"
+        refusal = None if holds else _refusal_of(condition, value)
         if refusal is not None:
-            return None, self._refuse(rule, f"{rule.topic}: {refusal}")
+            return _TestResult(None, self._refuse(rule, f"{rule.topic}: {refusal}"))
         self._refusals.pop(rule.name, None)
         self._evaluated.add(rule.name)
-        return holds, None
+        return _TestResult(holds)
 
     def _refuse(self, rule: ExclusionRule, reason: str) -> str:
-        """Notes why a rule cannot be evaluated, and logs it, again every ten minutes."""
+        """Stores and returns why a rule cannot be evaluated; logs it every `REMIND_S`."""
         sentence = f"the rule {rule.name}: {reason}"
         self._refusals[rule.name] = sentence
         now_s = self.monotonic()
@@ -608,23 +369,25 @@ class Screening:
     def _ready(
         self,
         state: ScreenState,
-        closed: dict[str, _ClosedFiles],
+        unreleased: dict[str, _ClosedFiles],
         live: Collection[str],
     ) -> _ClosedFiles:
-        """Returns the splits that no later message can affect, but for those that wait."""
-        ends = {name: state.recordings[name].end or 0 for name in closed}
-        written = {name: state.recordings[name].end for name in live if name in state.recordings}
-        until = horizons(ends, dict.fromkeys(live) | written, self._split)
+        """Returns the splits that no later message can affect, and that are not put off."""
+        ends = {name: state.recordings[name].end or 0 for name in unreleased}
+        live_ends: dict[str, Ns | None] = {}
+        for name in live:
+            live_ends[name] = state.recordings[name].end if name in state.recordings else None
+        until = horizons(ends, live_ends, self._split)
         return [
             (path, summary)
-            for name, files in closed.items()
+            for name, files in unreleased.items()
             for path, summary in files
             if summary.empty or summary.end + self._margin < until[name]
             if not self._is_put_off(path)
         ]
 
     def _stretches(self, state: ScreenState, live: Collection[str]) -> list[Excluded]:
-        """Returns what is excluded of the time of recordings that are not done, or were last."""
+        """Returns the excluded stretches of the recordings in the state."""
         stretches: list[Excluded] = []
         for rule in self.rules:
             recordings = [
@@ -649,11 +412,11 @@ class Screening:
         stretches: Sequence[Excluded],
         before: Sequence[Excluded],
     ) -> None:
-        """Cuts the excluded data out of a split; see `Cut`.
+        """Cuts the excluded messages out of a split; see `Cut`.
 
         Raises:
-            EpisodicError: it cannot be rewritten.
-            OSError: likewise, or it has gone.
+            EpisodicError: the split cannot be rewritten.
+            OSError: the split cannot be rewritten, or has gone.
         """
         latched = {topic.topic for topic in summary.topics if topic.latched}
         cut = Cut(stretches, before, latched)
@@ -663,14 +426,15 @@ class Screening:
             if cut.touches(topic.topic, topic.first, topic.last)
         }
         gone = Counter[str]()
-        newest: dict[str, tuple[Ns, bool]] = {}  # when it was published, and if it is excluded
+        # By latched topic: when the newest message was published, and whether it is excluded.
+        newest: dict[str, tuple[Ns, bool]] = {}
         for record in self.reader.records(path, sorted(topics), TimeWindow.everything()):
             topic, logged, published = record.channel.topic, record.log_time, record.publish_time
             if cut.takes(topic, logged, published):
                 gone[topic] += 1
             if topic in latched:
-                latched_record = (published or logged, cut.takes_always(logged, published))
-                newest[topic] = max(latched_record, newest.get(topic, latched_record))
+                candidate = (published or logged, cut.takes_always(logged, published))
+                newest[topic] = max(candidate, newest.get(topic, candidate))
         if gone:
             recording, file = path.parent.name, path.name
             if split_number(recording, file) is None:
@@ -679,13 +443,13 @@ class Screening:
             with rewritten(self.bag_dir, path, status, self.writer, takes=cut.takes, expected=gone):
                 pass
             _log.info("messages_excluded", recording=recording, file=file, messages=gone.total())
-        returning = {topic for topic, (_, is_excluded) in newest.items() if is_excluded}
-        self._excluded_latched = (self._excluded_latched - newest.keys()) | returning
+        self._excluded_latched -= newest.keys()
+        self._excluded_latched |= {topic for topic, (_, excluded) in newest.items() if excluded}
 
     def _finish_recording(self, name: str, state: ScreenState) -> None:
-        """Marks an ended recording as done once nothing of it is held back."""
-        screen, files = state.recordings[name], [file.name for file in self._files(name)]
-        if any(screen.files.get(file) is not FileStep.RELEASED for file in files):
+        """Marks an ended recording as done when all of its files are released."""
+        screen = state.recordings[name]
+        if any(screen.files.get(f.name) is not FileStep.RELEASED for f in self._files(name)):
             return
         if state.excluded and (reason := why_not_corrected(self.bag_dir / name, self.reader)):
             _log.warning(
@@ -700,8 +464,8 @@ class Screening:
         """Returns the state; call it with the lock held.
 
         Raises:
-            RecorderError: it is damaged.
-            OSError: it cannot be read.
+            RecorderError: the state file is damaged.
+            OSError: the state file cannot be read.
         """
         if self._state is None:
             try:
@@ -715,28 +479,28 @@ class Screening:
         return self._state
 
     def _commit(self, state: ScreenState, names: Sequence[str]) -> None:
-        """Writes what a step changed, if anything, beside what was announced meanwhile.
+        """Writes what a step changed, with the recordings that were announced meanwhile.
 
         Raises:
-            OSError: it cannot be written; the state in memory stays as it was.
+            OSError: it cannot be written; the state in memory is unchanged.
         """
         with self._lock:
             recordings = dict(self._loaded().recordings)
             recordings.update({name: deepcopy(state.recordings[name]) for name in names})
             done = [name for name, screen in recordings.items() if screen.done]
-            informative = [name for name in done if recordings[name].start is not None][-DONE_KEPT:]
-            for name in {*done} - {*informative}:
+            with_values = [name for name in done if recordings[name].start is not None]
+            for name in {*done}.difference(with_values[-DONE_KEPT:]):
                 del recordings[name]
             self._write(ScreenState(recordings, list(state.excluded)))
 
     def _write(self, state: ScreenState) -> None:
-        """Writes a state, if it is another one; call it with the lock held."""
+        """Writes a state if it has changed; call it with the lock held."""
         if state != self._state:
             SCREENED.write(self.bag_dir, state)
             self._state = state
 
     def _report(self, path: Path, error: Exception) -> None:
-        """Notes why a split is held back, and logs it once."""
+        """Stores why a split is held back, and logs it once."""
         name, reason = _file_name(path), reason_of(error)
         if self._problems.get(name) != reason:
             _log.error("split_held_back", file=name, reason=reason)
@@ -747,8 +511,19 @@ def _file_name(path: Path) -> str:
     return f"{path.parent.name}/{path.name}"
 
 
-def _doubt(screen: RecordingScreen) -> None:
-    """Notes a file that cannot be read: the state of the conditions after it is unknown, too."""
+def _refusal_of(condition: Condition, value: JsonValue) -> str | None:
+    """Returns why no message like this one can meet a condition; None if one could."""
+    if condition.can_be_refused and (refusal := refusal_for(condition, value)):
+        return refusal
+    test = condition.test
+    if not isinstance(test, Equals) or not isinstance(test.value, bool):
+        return None
+    has_number = any(isinstance(leaf, bool | int | float) for leaf in leaves(value))
+    return None if has_number else "the values hold no boolean"
+
+
+def _add_unknown(screen: RecordingScreen) -> None:
+    """Adds a file that cannot be read: after it, a condition that did not hold is unknown."""
     for heard in screen.heard.values():
         if heard and not heard[-1].holds:
             last = heard[-1].last

@@ -1,9 +1,9 @@
 """Evaluates the rules of one bag directory, and stores the moments that they ask for.
 
-Each look copies the state, searches what was closed since, begins or extends moments,
-and writes the state. A kill in between does no harm: the next look finds the same again, and a
-moment that was begun is recognised by its number. What cannot be stored, as on a full disk, is
-tried again with every look.
+Each look copies the state, searches the bags that were closed since, begins or extends moments, and
+writes the state. A kill in between does no harm: the next look finds the same again, and a moment
+that was begun is recognised by its number. A moment that cannot be stored, for example because the
+disk is full, is tried again with every look.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
     from ros2_memory.retention.saved_moments import MomentKeeper
 
 GLOB_MARKS: Final = "*?["
-"""What makes a topic of a rule a glob."""
+"""Characters that make a topic of a rule a glob."""
 LOOK_S: Final = 2.0
 """How long one look searches: meanwhile nothing is deleted, and no other moment is saved."""
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 LONGEST_NS: Final[Ns] = 600 * NS_PER_S
 """Matches join to moments that are no longer than this, or than one match needs."""
 MOST_WAITING: Final = 100
-"""Moments of a rule that wait because they cannot be stored."""
+"""So many moments of a rule may wait to be stored."""
 MOST_SEARCHED: Final = 64
-"""Recordings that are remembered one by one; older ones were searched to their end."""
+"""So many recordings are remembered one by one; older ones were searched to their end."""
 
 _log = get_logger(__name__)
 
@@ -59,11 +59,11 @@ class Triggers:
     """The rules of one bag directory. Not thread-safe, except for `note_restart`.
 
     Args:
-        rules: what to look for, by unique names.
-        own: the recordings that the recorder made, which alone are searched.
+        rules: the rules, with unique names.
+        own: the recordings that the recorder made. No other recording is searched.
 
     Attributes:
-        restarts: those of the recording that are still to be evaluated; from when to when.
+        restarts: the restarts of the recording (wall times) that are still to be evaluated.
     """
 
     bag_dir: Path
@@ -119,11 +119,10 @@ class Triggers:
             _log.warning("needed_bags_deleted", bags=deleted, reason=sentence)
             for record in state.rules.values():
                 record.problem = sentence
-        # What lies far back was searched to its end.
         while len(state.searched) > MOST_SEARCHED:
             state.before = next(iter(state.searched))
             del state.searched[state.before]
-        # Even if it cannot be written, what was found is not searched for again.
+        # Set before it is written: if that fails, nothing is searched twice.
         self._is_written &= state == self._state
         self._state = state
         if not self._is_written:
@@ -134,28 +133,30 @@ class Triggers:
         deadline = time.monotonic() + LOOK_S
         closed, live = self._closed_bags(snapshot, state)
         for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
-            fired, stopped = self.search.search(chain, state, lambda: time.monotonic() > deadline)
-            for firing in fired:
+            firings, stopped_at = self.search.search(
+                chain, state, lambda: time.monotonic() > deadline
+            )
+            for firing in firings:
                 self._add_firing(firing, state, snapshot)
             for part in chain.parts:
-                stop = part.window.stop if stopped is None else min(part.window.stop, stopped)
-                state.searched[part.recording] = max(stop, part.window.start)
-            if stopped is not None:
+                window = part.window
+                stop = window.stop if stopped_at is None else min(window.stop, stopped_at)
+                state.searched[part.recording] = max(stop, window.start)
+            if stopped_at is not None:
                 break
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
-        """Returns the bags that rules may still need: those not searched, and some time before."""
+        """Returns the bags that are not searched, and those of the time before that rules save."""
         state = self._current_state(snapshot)
         before = max((rule.before for rule in self._rules.values()), default=0)
         reached = next(reversed(state.searched.values()), None)
         since = MIN_NS if reached is None else reached - before
         closed, _ = self._closed_bags(snapshot, state)
-        return frozenset(
-            bag.file
-            for name, bags in closed.items()
-            for bag in bags
-            if bag.end >= min(state.searched.get(name, MIN_NS), since)
-        )
+        needed: set[str] = set()
+        for name, bags in closed.items():
+            earliest = min(state.searched.get(name, MIN_NS), since)
+            needed.update(bag.file for bag in bags if bag.end >= earliest)
+        return frozenset(needed)
 
     def note_deleted(self, bags: int) -> None:
         """Records how many needed bags were deleted: the size budget comes first."""
@@ -163,54 +164,61 @@ class Triggers:
             self._deleted += bags
 
     def _current_state(self, snapshot: Snapshot) -> TriggerState:
-        """Returns the state, which begins with what is recorded from now on.
+        """Returns the state. Without a state file, only what is recorded from now on is searched.
 
         Raises:
-            OSError: it cannot be read.
+            OSError: the state cannot be read.
         """
-        state = self._state
-        if state is None:
-            problem = None
-            try:
-                state = TRIGGERS.read(self.bag_dir)
-            except ValueError as error:
-                problem = f"the state of the rules is lost: .episodic/triggers.json: {error}"
-                _log.error("trigger_state_lost", reason=problem)
-            if state is None:
-                closed, live = self._closed_bags(snapshot, TriggerState())
-                ended = [name for name in self.own.names() if name not in live]
-                newest = {name: max(bag.end for bag in bags) for name, bags in closed.items()}
-                searched = {name: end + 1 for name, end in newest.items() if name in live}
-                state = TriggerState(before=ended[-1] if ended else None, searched=searched)
-            state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
-            for name, record in state.rules.items():
-                record.problem = problem or record.problem
-                topic = self._rules[name].topic
-                if topic is None or any(mark in topic for mark in GLOB_MARKS):
-                    continue
-                never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
-                if not self.is_recorded(topic):
-                    record.problem = never
-                    _log.warning("rule_not_recorded", rule=name, reason=never)
-                elif record.problem == never:
-                    record.problem = None
-            self._state = state
+        if self._state is not None:
+            return self._state
+        state, problem = None, None
+        try:
+            state = TRIGGERS.read(self.bag_dir)
+        except ValueError as error:
+            problem = f"the state of the rules is lost: .episodic/triggers.json: {error}"
+            _log.error("trigger_state_lost", reason=problem)
+        state = state or self._new_state(snapshot)
+        state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
+        for name, record in state.rules.items():
+            record.problem = problem or record.problem
+            self._check_topic(self._rules[name], record)
+        self._state = state
         return state
+
+    def _new_state(self, snapshot: Snapshot) -> TriggerState:
+        """Returns a state in which all closed bags are searched."""
+        closed, live = self._closed_bags(snapshot, TriggerState())
+        ended = [name for name in self.own.names() if name not in live]
+        newest = {name: max(bag.end for bag in bags) for name, bags in closed.items()}
+        searched = {name: end + 1 for name, end in newest.items() if name in live}
+        return TriggerState(before=ended[-1] if ended else None, searched=searched)
+
+    def _check_topic(self, rule: Rule, record: RuleRecord) -> None:
+        """Stores and logs whether a rule can never fire since its topic is not recorded."""
+        topic = rule.topic
+        if topic is None or any(mark in topic for mark in GLOB_MARKS):
+            return
+        never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
+        if not self.is_recorded(topic):
+            record.problem = never
+            _log.warning("rule_not_recorded", rule=rule.name, reason=never)
+        elif record.problem == never:
+            record.problem = None
 
     def _closed_bags(
         self, snapshot: Snapshot, state: TriggerState
     ) -> tuple[dict[str, list[BagFile]], frozenset[str]]:
-        """Returns the closed bags of recordings that are not finished, in their order.
+        """Returns the closed bags of recordings that are not searched to their end, in order.
 
-        With them the recordings that are being written.
+        Also returns the names of the recordings that are being written.
         """
         active = (self.own.name_of(aside.path.parent) for aside in snapshot.active)
         live = frozenset((*read_heartbeat(self.bag_dir).recordings, *active))
         names = [*self.own.names()]
-        positions = {name: number for number, name in enumerate(names)}
-        searched = (positions[name] for name in state.searched if name in positions)
-        before = positions.get(state.before or "")
-        first = min(searched, default=0) if before is None else before + 1
+        if state.before in names:
+            first = names.index(state.before) + 1
+        else:
+            first = min((names.index(name) for name in state.searched if name in names), default=0)
         folders = {str(self.bag_dir / name): name for name in names[first:]}
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
@@ -255,22 +263,24 @@ class Triggers:
         record.begun.append(firing.at)
         if not self._was_logged_recently(rule.name, firing.at):
             record.problem = None
+        # The same number after a kill, so that the moment is recognised.
         number = uuid.uuid5(uuid.NAMESPACE_OID, f"{rule.name}/{firing.topic}/{firing.at}").hex
         record.newest.append(RuleMoment(number, window.start, window.stop))
 
     def _store_moments(self, name: str, record: RuleRecord, snapshot: Snapshot) -> None:
-        """Has the moments of a rule stored that are not; a fault is reported, and tried again."""
-        kept = [
+        """Stores the waiting moments of a rule. Drops refused ones, and stored ones but the newest.
+
+        The next match may extend the newest moment.
+        """
+        left = [
             moment
             for moment in record.newest
-            if moment.stored or self._may_store(name, record, moment, snapshot)
+            if moment.stored or self._store(name, record, moment, snapshot)
         ]
-        record.newest = [moment for moment in kept[:-1] if not moment.stored] + kept[-1:]
+        record.newest = [moment for moment in left[:-1] if not moment.stored] + left[-1:]
 
-    def _may_store(
-        self, name: str, record: RuleRecord, moment: RuleMoment, snapshot: Snapshot
-    ) -> bool:
-        """Has a moment stored, if the disk can; returns False where it is refused for good."""
+    def _store(self, name: str, record: RuleRecord, moment: RuleMoment, snapshot: Snapshot) -> bool:
+        """Stores a moment, or reports why the disk cannot; returns False if it is refused."""
         request = SaveRequest(
             moment.number, self._rules[name].label, moment.start, moment.end, self.clock.now()
         )
@@ -283,7 +293,8 @@ class Triggers:
         if refused is not None:
             self._refuse(name, record, refused)
             return False
-        record.moments += not moment.known
+        if not moment.known:
+            record.moments += 1
         moment.known = True
         return True
 
@@ -292,7 +303,7 @@ class Triggers:
         self._report(name, record, reason)
 
     def _report(self, name: str, record: RuleRecord, problem: str) -> None:
-        """Notes why a rule keeps nothing, and logs it once for as long as that goes on."""
+        """Stores why a rule saves nothing, and logs it once for as long as that goes on."""
         at = record.last_fired or 0
         if record.problem != problem or not self._was_logged_recently(name, at):
             _log.warning("trigger_not_kept", rule=name, reason=problem)
@@ -305,18 +316,18 @@ class Triggers:
 
 
 def _note_lasting_match(name: str, record: RuleRecord) -> None:
-    """Logs once that a rule has matched for too long to be useful."""
-    lasting = (
-        run.first for run in record.runs.values() if run.fired and run.last - run.first > HOUR_NS
+    """Stores since when a rule has matched for more than an hour, and logs it once."""
+    since = min(
+        (run.first for run in record.runs.values() if run.fired and run.last - run.first > HOUR_NS),
+        default=None,
     )
-    longest = min(lasting, default=None)
-    if longest is not None and record.always_since is None:
-        _log.warning("trigger_matches_always", rule=name, since_ns=longest)
-    record.always_since = longest
+    if since is not None and record.always_since is None:
+        _log.warning("trigger_matches_always", rule=name, since_ns=since)
+    record.always_since = since
 
 
 def _joins(moment: RuleMoment, window: TimeWindow) -> bool:
-    """Whether a window touches a moment, and is not too long with it."""
+    """Whether a window touches a moment, and the two together are not too long."""
     if window.start > moment.end or moment.start > window.stop:
         return False
     longest = max(LONGEST_NS, moment.end - moment.start, window.stop - window.start)

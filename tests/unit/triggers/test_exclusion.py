@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
 from ros2_memory.core.spans import lies_inside, united, without
-from ros2_memory.triggers.screening import (
+from ros2_memory.triggers.exclusion import (
     Cut,
     ExclusionRule,
     RecordingConditions,

@@ -17,7 +17,7 @@ from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
-from ros2_memory.triggers.screening import ExclusionRule
+from ros2_memory.triggers.exclusion import ExclusionRule
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.examples import LONG
 from tests.support.fakes import broken
