@@ -1,4 +1,4 @@
-"""The bags of a robot and those that only a lake has, as one memory."""
+"""One index over a robot's own bags and those that only a lake has."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _NAME_IN_USE: Final = "the lake has another bag of this name: rename its folder"
 
 @dataclass(slots=True, eq=False)
 class JoinedIndex:
-    """What a lake has of a robot, and what the robot's bag directory has besides.
+    """The bags of a robot in a lake, and the bags that only its bag directory has.
 
-    A bag of both is that of the lake: what was made of it stays true when retention deletes it.
-    Where the bag directory is missing, or cannot be read, what was shipped answers.
+    A bag in both is taken from the lake, so that it stays the same when retention deletes the file.
+    If the bag directory is missing or cannot be read, the lake alone answers.
 
     Attributes:
         shipped: the bags in the lake, by the paths that they had in the bag directory.
@@ -58,7 +58,7 @@ class JoinedIndex:
         return shipped if shipped is None or own is None else self._joined(shipped, own, MAX_NS)
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """Returns a current snapshot; of some days up to `reach` where these are not the newest.
+        """Returns a current snapshot; of days up to `reach` if these are not the newest ones.
 
         Raises:
             RefusedError: the lake cannot be read.
@@ -77,43 +77,54 @@ class JoinedIndex:
         return self.own.heartbeat()
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
-        """Returns what handovers join with a recording, now or when it was shipped."""
+        """Returns the recordings that handovers join with one, now or when it was shipped."""
         return self.own.joined_with(recording) or self.shipped.joined_with(recording)
 
     def _joined(self, shipped: Snapshot, own: Snapshot, until: Ns) -> Snapshot:
-        """Returns the bags of the lake, and own ones that begin up to a time and are not there.
+        """Returns one snapshot of the bags in the lake, and own bags that begin up to `until`.
 
-        Own ones of days of which those of the lake are not shown (`Snapshot.older`) are left out,
-        too; one whose path is that of another bag is set aside.
+        Own bags of older days than those of the lake (`Snapshot.older`) are left out.
         """
         if own.problem is not None:
             return shipped if shipped.timeline.segments else own
-        made = shipped.timeline.memo.of(_JOINED, dict)
-        known = made.get(own.timeline)
-        if known is None:
-            deleted = deleted_spans(self.bag_dir) if own.timeline.thinned else ()
-            known = _timeline_of_both(shipped, own.timeline, until, deleted)
-            made.clear()
-            made[own.timeline] = known
-        timeline, unnamed = known
+        memo = shipped.timeline.memo.of(_JOINED, dict)
+        joined = memo.get(own.timeline)
+        if joined is None:
+            joined = self._timeline_of_both(shipped, own.timeline, until)
+            memo.clear()
+            memo[own.timeline] = joined
+        timeline, set_aside = joined
         silent = (own.silent_topics | shipped.silent_topics).difference(timeline.topics())
         return replace(
             own,
             timeline=timeline,
-            unread=(*own.unread, *unnamed),
+            unread=(*own.unread, *set_aside),
             silent_topics=silent,
             older=shipped.older,
         )
 
+    def _timeline_of_both(
+        self, shipped: Snapshot, own: Timeline, until: Ns
+    ) -> tuple[Timeline, tuple[SetAside, ...]]:
+        """Returns the bags of both, and own bags whose path another bag has in the lake."""
+        bags = _bags_not_in_lake(shipped, own, until)
+        if own.thinned:
+            bags = _without_shipped_days(bags, shipped.timeline, deleted_spans(self.bag_dir))
+        same_path = {bag.file: bag for bag in shipped.timeline.named({bag.file for bag in bags})}
+        named: list[BagFile] = []
+        set_aside: list[SetAside] = []
+        for bag in bags:
+            in_lake = same_path.get(bag.file)
+            if in_lake is None:
+                named.append(bag)
+            # A bag without its first messages, which were deleted, is the one in the lake.
+            elif not (in_lake.start <= bag.start and bag.end <= in_lake.end):
+                set_aside.append(SetAside(bag.path, _NAME_IN_USE))
+        return shipped.timeline.changed((), named), tuple(set_aside)
 
-def _timeline_of_both(
-    shipped: Snapshot, own: Timeline, until: Ns, deleted: Sequence[Span]
-) -> tuple[Timeline, tuple[SetAside, ...]]:
-    """Returns the bags of both, and the own ones whose path another bag has in the lake.
 
-    A bag is known by its first message, or, if that was deleted since, by its path and time. What
-    stayed of a day counts unless the lake has all that was `deleted` of it.
-    """
+def _bags_not_in_lake(shipped: Snapshot, own: Timeline, until: Ns) -> list[BagFile]:
+    """Returns the own bags of the days that are shown whose first message is in no shipped bag."""
     after = MIN_NS if shipped.older is None else shipped.older
     in_lake = shipped.timeline.starts
     bags: list[BagFile] = []
@@ -122,31 +133,28 @@ def _timeline_of_both(
         # Both are in order, so equal ones are found without a hash of them all.
         is_new = np.searchsorted(in_lake, starts) == np.searchsorted(in_lake, starts, "right")
         if segment.unthinned is not segment or segment.recorded is not segment:
-            # What stayed of bags begins with a message of one of them.
+            # A derived bag begins with a message of a recorded one, and is new all the same.
             is_new |= [*map(is_derived, segment.bags.files())]
         is_own = is_new & (starts > after) & (starts <= until)
         bags += segment.bags.at(np.flatnonzero(is_own))
-    if own.thinned:
-        tables = [segment.bags for segment in shipped.timeline.segments]
-        firsts = chain.from_iterable(table.starts.tolist() for table in tables)
-        stops = chain.from_iterable((table.ends + 1).tolist() for table in tables)
-        lost = without(deleted, united(zip(firsts, stops, strict=True), NS_PER_S))
-        bags = [bag for bag in bags if not is_thinned(bag.file) or _is_needed(bag, deleted, lost)]
-    same_name = {bag.file: bag for bag in shipped.timeline.named({bag.file for bag in bags})}
-    unnamed = (
-        SetAside(bag.path, _NAME_IN_USE)
-        for bag in bags
-        if (before := same_name.get(bag.file))
-        # Messages were deleted from one that lies within it: the lake has it as it was.
-        and not (before.start <= bag.start and bag.end <= before.end)
-    )
-    named = (bag for bag in bags if bag.file not in same_name)
-    return shipped.timeline.changed((), named), tuple(unnamed)
+    return bags
 
 
-def _is_needed(day: BagFile, deleted: Sequence[Span], lost: Sequence[Span]) -> bool:
-    """Returns whether what stayed of a day may be of bags that were `lost`: deleted, not shipped.
+def _without_shipped_days(
+    bags: Sequence[BagFile], shipped: Timeline, deleted: Sequence[Span]
+) -> list[BagFile]:
+    """Returns the bags without the thinned days of which the lake has all deleted bags.
 
-    True also of a day before the oldest entry of `deleted`, of which this is unknown.
+    Days before the oldest of the `deleted` spans stay: whether the lake has their bags is unknown.
     """
-    return not lies_inside(deleted, day.start) or overlaps_any(lost, day.start, day.end)
+    tables = [segment.bags for segment in shipped.segments]
+    starts = chain.from_iterable(table.starts.tolist() for table in tables)
+    stops = chain.from_iterable((table.ends + 1).tolist() for table in tables)
+    lost = without(deleted, united(zip(starts, stops, strict=True), NS_PER_S))
+    return [
+        bag
+        for bag in bags
+        if not is_thinned(bag.file)
+        or not lies_inside(deleted, bag.start)
+        or overlaps_any(lost, bag.start, bag.end)
+    ]

@@ -40,9 +40,9 @@ AT_ONCE: Final = 4
 _OF_ONE: Final = 0.4
 """The part of the time of a call that one robot of several may take."""
 _OF_ALL: Final = 0.9
-"""The part that all may take together, or one alone; the rest is for merging the answers."""
+"""The part that all robots, or a single one, may take; the rest is for merging the answers."""
 _GRACE: Final = 0.05
-"""How much later than its limit a robot counts as stuck: a disk that hangs heeds no limit."""
+"""The part by which a robot may exceed its limit before it counts as stuck."""
 
 log = get_logger(__name__)
 
@@ -58,27 +58,28 @@ class StoppedClock(Clock):
         return self.at
 
 
-class FromLake(NamedTuple):
-    """What a reply has to report of an answer from a lake.
+class LakeReport(NamedTuple):
+    """What a reply has to report if its answer is from a lake.
 
     Attributes:
-        latest: the log time of the newest message there; None if there is none.
-        older: up to which log time (inclusive) there is more, which was not looked at; None if not.
-        is_alone: whether nothing but what was shipped could answer.
+        latest: the log time of the robot's newest message in the lake; None if there is none.
+        older: the last log time (inclusive) of older days that were not looked at; None if the
+            answer is from all days.
+        is_alone: whether the lake alone could answer: the robot has no bags of its own here.
     """
 
     latest: Ns | None
     older: Ns | None = None
     is_alone: bool = True
 
-    def since(self, begin: Ns) -> FromLake:
+    def since(self, begin: Ns) -> LakeReport:
         """Returns the report for an answer that needs nothing before a log time."""
         is_whole = self.older is None or begin > self.older
         return self._replace(older=None) if is_whole else self
 
     @property
     def notes(self) -> list[str]:
-        """The note on days that the answer would need, if any."""
+        """The note on days that were not looked at, if there are any."""
         if self.older is None:
             return []
         since = datetime.fromtimestamp((self.older + 1) // NS_PER_S, tz=UTC).date()
@@ -91,10 +92,10 @@ class Robot:
     """One robot of a fleet.
 
     Attributes:
-        name: as replies and arguments have it; never a path.
+        name: its name in replies and arguments; never a path.
         bag_dir: the bag directory, which need not exist.
-        memory: over its bags, and over what a lake has of it, where there is a lake.
-        own: over its bags alone; None where it has no bag directory, or there is no lake.
+        memory: the memory over its bags and, if there is a lake, the bags that were shipped.
+        own: the memory over its bags alone; None if it has no bag directory, or there is no lake.
         in_lake: whether `memory` is over a lake, too.
     """
 
@@ -104,17 +105,17 @@ class Robot:
     own: Memory | None = None
     in_lake: bool = False
 
-    def asked(
+    def ask(
         self,
         ask: Callable[[Memory, Call], T],
         call: Call,
         since: Callable[[Ns], Ns | None] = lambda _: MIN_NS,
-    ) -> tuple[T, FromLake | None]:
-        """Returns what `ask` finds in the memory, and what to report with it if that is a lake's.
+    ) -> tuple[T, LakeReport | None]:
+        """Returns what `ask` finds in the memory, and a report if the answer is from a lake.
 
-        Where the lake cannot be read, the robot's own bags answer if they reach back to the time
-        `since` (of now) that the question is about; also where the lake has only the times of the
-        messages that it needs.
+        If the lake cannot be read, the robot's own bags answer, provided that they reach back to
+        the time that the question is about; `since` returns it, given now. They also answer if the
+        lake has only the times of the messages.
 
         Raises:
             EpisodicError: there is no answer.
@@ -123,27 +124,26 @@ class Robot:
             return ask(self.memory, call), None
         call.older = MAX_NS
         try:
-            return ask(self.memory, call), self._from_lake(call)
+            return ask(self.memory, call), self._lake_report(call)
         except NoDataError as error:
-            detail = "; ".join((error.detail, *self._from_lake(call).notes))
+            detail = "; ".join((error.detail, *self._lake_report(call).notes))
             raise NoDataError(error.reason, detail, error.notes) from error
         except (NotInLakeError, RefusedError, LakeError) as failure:
-            is_whole = isinstance(failure, NotInLakeError)
-            if self.own is None or not (is_whole or _reaches_back(self.own, since)):
+            lacks_payloads = isinstance(failure, NotInLakeError)
+            if self.own is None or not (lacks_payloads or _reaches_back(self.own, since)):
                 raise
             try:
                 return ask(self.own, call), None
             except NoDataError as error:
-                if is_whole:
+                if lacks_payloads:
                     raise failure from None
                 notes = (*error.notes, f"the lake has no answer either: {failure}")
                 raise NoDataError(error.reason, error.detail, notes) from failure
 
-    def _from_lake(self, call: Call) -> FromLake:
-        """Returns what to report of an answer that a call got."""
+    def _lake_report(self, call: Call) -> LakeReport:
         own = None if self.own is None else self.own.index.published
         is_alone = own is None or own.problem is not None or not own.bags
-        return FromLake(self.latest, None if call.older == MAX_NS else call.older, is_alone)
+        return LakeReport(self.latest, None if call.older == MAX_NS else call.older, is_alone)
 
     @property
     def latest(self) -> Ns | None:
@@ -163,15 +163,15 @@ class Fleet:
     """The robots that one server answers for.
 
     Args:
-        robots: no two have one name.
-        clock: the wall clock, read once for a question to several.
-        shared_map: whether coordinates mean the same place for all of them.
-        join: returns the robots that a lake has besides those of some names, where there is one.
-            It looks there, unless it did so a moment ago.
-        tables: the lake, where there is one.
+        robots: the configured robots, with unique names.
+        clock: the wall clock, read once for a question to several robots.
+        shared_map: whether coordinates mean the same place for all robots.
+        join: returns the robots in the lake whose names are not given; None if there is no lake.
+            It looks into the lake, unless it did so a moment ago.
+        tables: the lake; None if there is none.
 
     Attributes:
-        robots: all of them, by their names.
+        robots: all robots by name, the configured ones and those in the lake.
     """
 
     def __init__(
@@ -211,9 +211,9 @@ class Fleet:
         """Returns the robot with a name.
 
         Raises:
-            InvalidArgumentsError: there is none, or the call may not ask about it, which the
-                sentence does not tell apart.
-            EpisodicError: the lake, which may have it, cannot be read.
+            InvalidArgumentsError: there is no such robot, or the call may not ask about it; the
+                sentence is the same.
+            EpisodicError: the lake, which may have the robot, cannot be read.
         """
         name = name.strip() if isinstance(name, str) else name
         if isinstance(name, str) and name not in self.robots and call.robots is None:
@@ -222,12 +222,14 @@ class Fleet:
         for robot in allowed:
             if robot.name == name:
                 return robot
-        raise InvalidArgumentsError(f"there is no robot {abbreviate(name)}; {there_are(allowed)}")
+        clause = robots_clause(allowed)
+        raise InvalidArgumentsError(f"there is no robot {abbreviate(name)}; {clause}")
 
     def chosen(self, named: object, call: Call) -> list[Robot]:
-        """Returns the robot of a name, several (a, b), or where it is None all that are allowed.
+        """Returns the named robot, several ("a, b"), or all allowed ones if `named` is None.
 
-        Raises as `named`.
+        Raises:
+            EpisodicError: see `named`.
         """
         if named is None:
             return self.allowed(call)
@@ -235,23 +237,25 @@ class Fleet:
         return [*dict.fromkeys([self.named(name, call) for name in names])]
 
     def newest(self, named: object, call: Call) -> Memory | None:
-        """Returns the memory with the newest data of the robots of `chosen`; None if none answers.
+        """Returns the memory with the newest data of the `chosen` robots; None if none answers.
 
-        Raises as `named`.
+        Raises:
+            EpisodicError: see `named`.
         """
 
-        def dated(robot: Robot, own: Call) -> tuple[Ns, Memory]:
-            return robot.asked(
-                lambda memory, _: (memory.index.snapshot().dating.latest or MIN_NS, memory), own
-            )[0]
+        def read_latest(memory: Memory, _: Call) -> tuple[Ns, Memory]:
+            return memory.index.snapshot().dating.latest or MIN_NS, memory
 
-        answers = FanOut().ask(self.chosen(named, call), dated, call).values()
-        dates = [answer for answer in answers if isinstance(answer, tuple)]
-        return max(dates, key=itemgetter(0))[1] if dates else None
+        answers = FanOut().ask(
+            self.chosen(named, call), lambda robot, own: robot.ask(read_latest, own)[0], call
+        )
+        dated = [answer for answer in answers.values() if isinstance(answer, tuple)]
+        _, memory = max(dated, key=itemgetter(0), default=(MIN_NS, None))
+        return memory
 
 
-def there_are(robots: Iterable[Robot]) -> str:
-    """Returns a clause that names the robots that there are."""
+def robots_clause(robots: Iterable[Robot]) -> str:
+    """Returns a clause that lists robots, such as "there are a, b"."""
     names = [robot.name for robot in robots]
     if not names:
         return "there is none"
@@ -259,11 +263,10 @@ def there_are(robots: Iterable[Robot]) -> str:
 
 
 class FanOut:
-    """Asks robots in threads, a few at a time: each has its time limit, and none waits for one.
+    """Asks robots in threads, a few at a time, each with a time limit. Thread-safe.
 
-    A robot that is stuck is not asked again until it is done.
-
-    So a hanging disk blocks one thread, however many questions follow. Thread-safe.
+    A robot that is stuck is not asked again until it is done. So a hanging disk blocks one thread,
+    however many questions follow.
     """
 
     def __init__(self, at_once: int = AT_ONCE) -> None:
@@ -273,9 +276,9 @@ class FanOut:
     def ask(
         self, robots: Sequence[Robot], work: Callable[[Robot, Call], T], call: Call
     ) -> Mapping[str, T | EpisodicError]:
-        """Returns, by robot and in their order, what `work` returned, or the error why not.
+        """Returns what `work` returned for each robot, or the error, in the order of the robots.
 
-        Every robot is in it. Takes 0.95 of the time that is left of the call, at most.
+        It takes at most `_OF_ALL` plus `_GRACE` of the time that is left of the call.
         """
         left_s, begun_s = call.deadline.left_s(), time.monotonic()
         limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
@@ -319,7 +322,7 @@ class FanOut:
 def _start_asking(
     robot: Robot, work: Callable[[Robot, Call], T], call: Call, context: contextvars.Context
 ) -> Future[T | EpisodicError]:
-    """Returns what a robot will answer, in a thread of its own."""
+    """Asks a robot in a thread of its own; returns the future answer."""
     answer: Future[T | EpisodicError] = Future()
 
     def run() -> None:

@@ -61,10 +61,10 @@ def _answer(
     robot: str | None,
     limit: int,
 ) -> OfFleet:
-    """Returns the rows, with up to when each robot was shipped.
+    """Returns the rows, with a note on the time up to which each robot's bags were shipped.
 
     Raises:
-        EpisodicError: there is none; see `Lake.query`.
+        EpisodicError: nothing was shipped, or there is no answer; see `Lake.query`.
     """
     del memory
     fleet.add_shipped()
@@ -84,7 +84,7 @@ def _answer(
         [named(cell) if isinstance(cell, str) else quote(cell) for cell in row]
         for row in found.rows
     ]
-    notes = [_shipped(latest, names)]
+    notes = [_shipped_note(latest, names)]
     more: JsonObject = {}
     if found.is_cut:
         more = {"more": True}
@@ -93,12 +93,12 @@ def _answer(
     return OfFleet(with_notes({"fields": [*found.columns], "rows": rows, **more}, notes))
 
 
-def _shipped(latest: Mapping[str, Ns], names: Collection[str]) -> str:
-    """Returns the note on what the lake has of robots."""
+def _shipped_note(latest: Mapping[str, Ns], names: Collection[str]) -> str:
+    """Returns the note on the times up to which the lake has robots, and on robots it lacks."""
     least = min(latest, key=lambda name: latest[name])
-    times = [iso_local(at) or str(at) for at in (latest[least], max(latest.values()))]
-    text = f"from the lake, which has what was shipped: {least} up to {times[0]}"
+    first, last = latest[least], max(latest.values())
+    text = f"from the lake, which has what was shipped: {least} up to {iso_local(first) or first}"
     if len(latest) > 1:
-        text += f", others up to {times[1]} at most"
+        text += f", others up to {iso_local(last) or last} at most"
     lacking = sorted({*names} - latest.keys())
     return f"{text}; nothing of {listed(lacking)}" if lacking else text

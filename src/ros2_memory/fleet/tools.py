@@ -1,12 +1,12 @@
-"""The tools of one robot as those of a fleet: with the argument `robot`, and for all without it.
+"""Makes the tools of one robot tools of a fleet: with the argument `robot`, and for all without it.
 
-The tools themselves are unchanged: each is asked of the memory of a robot. Where it is asked of
-several, their replies become one, and what keeps a robot from answering is a note.
+The tools themselves are unchanged: each asks the memory of one robot. If several robots are asked,
+their replies become one reply, and a note says why a robot has no answer.
 
-Two ways. Where a reply is a list of rows along time, the rows of all robots become one list, newest
-first, each with the name of its robot (`MERGED_ROWS`). What else the replies have is there once
-where all agree, else listed by robot, with a sum where that says something. Where a reply is about
-one robot as a whole, it becomes a row itself (`SHORT_KEYS`).
+There are two kinds of merged replies. If a reply is a list of rows along time, the rows of all
+robots become one list, newest first, each with the name of its robot (`MERGED_ROWS`). The other
+keys are there once if all robots agree, else by robot, with a sum if that says something. If a
+reply is about one robot as a whole, it becomes a row itself (`SHORT_KEYS`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
-from typing import TYPE_CHECKING, Final, TypeVar, cast
+from itertools import chain
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar, cast
 
 from ros2_memory import results
 from ros2_memory.core import errors
@@ -39,10 +40,10 @@ from ros2_memory.fleet.robots import (
     AT_ONCE,
     FanOut,
     Fleet,
-    FromLake,
+    LakeReport,
     Robot,
     StoppedClock,
-    there_are,
+    robots_clause,
 )
 from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings
 from ros2_memory.tools.replies import ROBOT_NAME, as_json
@@ -59,7 +60,7 @@ if TYPE_CHECKING:
 _MOST_NAMED: Final = 8
 """Robots that a note names."""
 _LEFT_OUT: Final = ("notes", "more", "local")
-"""Keys that are merged otherwise, or that say nothing of several robots."""
+"""Keys that are merged in another way, or that say nothing about several robots."""
 FAILED: Final = "robots_failed"
 """The key of the robots without an answer: for each the code of its error, whose note says more."""
 
@@ -69,10 +70,10 @@ class RobotReply:
     """What one robot answered.
 
     Attributes:
-        name: of the robot.
+        name: the robot.
         value: its reply, as a server of this robot alone would send it, before it is shortened.
         latest: the log time of its newest data; None if there is none.
-        is_ahead: whether that lies in the future, so that its times say little beside others'.
+        is_ahead: whether `latest` is in the future, so that times cannot be compared with others'.
         lake: what the reply has to report if the answer is from a lake.
     """
 
@@ -80,7 +81,7 @@ class RobotReply:
     value: JsonValue
     latest: Ns | None = None
     is_ahead: bool = False
-    lake: FromLake | None = None
+    lake: LakeReport | None = None
 
     @property
     def body(self) -> JsonObject:
@@ -90,7 +91,7 @@ class RobotReply:
 
 _TOTAL: Final = "total"
 AT_LEAST: Final = "at_least"
-"""How many there are in a reply that did not count all, in place of the total."""
+"""The key of a count that is not complete, in place of the total."""
 MATCHES: Final = "matches"
 TOPICS: Final = "topics"
 _ROBOT_NAMES: Final = f"{ROBOT_NAME}s"
@@ -112,7 +113,7 @@ SHORT_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
         ("data_time_range", (results.DataTimeRange,)),
     )
 }
-"""The tools with a row for each robot, and what is left of it where the whole is too long."""
+"""The tools with a row for each robot, and the keys of this row if the whole reply is too long."""
 
 ANSWER_FOR_ALL: Final = frozenset({*MERGED_ROWS, *SHORT_KEYS})
 """The tools that answer for all robots."""
@@ -125,12 +126,13 @@ ROBOT: Final = "robot"
 _AHEAD_NS: Final[Ns] = 60_000 * NS_PER_MS
 """Data that is newer than now by more was dated by a clock that runs ahead."""
 _TIMES: Final = ("start", "with_start", "timestamp", "timestamps", "around")
+"""Arguments with the time that a question is about."""
 _LENGTHS: Final = ("last_s", "seconds", "seconds_ago")
-"""Arguments that say from when a question is: a time, or seconds before now."""
+"""Arguments with seconds before now."""
 _OF_RECORDER: Final = frozenset({"memory_status"})
 """Tools about a bag directory and its recorder."""
 _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
-"""Tools about the bags that a robot has, which say themselves that its directory is missing."""
+"""Tools about a robot's bags, whose replies say themselves that its directory is missing."""
 
 
 def fleet_tools(
@@ -138,20 +140,20 @@ def fleet_tools(
 ) -> tuple[Tool, ...]:
     """Returns the tools of a fleet, without those that write.
 
-    `max_chars` is how long a reply may be: rows for many robots are given shortly before that.
-    `at_once`: how many robots are asked at once.
+    `max_chars` is how long a reply may be; if it would be longer, rows of whole robots are
+    shortened. `at_once`: how many robots are asked at once.
     """
     fan_out = FanOut(at_once)
 
     def question_of(tool: Tool, given: Mapping[str, object]) -> Question:
         own = {name: value for name, value in given.items() if name != ROBOT}
-        asked = _FleetQuestion(tool, fleet, fan_out, max_chars, tool.question(own), own)
-        return lambda _, call: asked.ask(given.get(ROBOT), call)
+        question = _FleetQuestion(tool, fleet, fan_out, max_chars, tool.question(own), own)
+        return lambda _, call: question.ask(given.get(ROBOT), call)
 
     return tuple(
         replace(
             tool,
-            describe=partial(_described, tool),
+            describe=partial(_describe, tool),
             # One robot that is slow must not keep a quick tool's thread.
             blocking=tool.blocking or tool.name in ANSWER_FOR_ALL | TABLE_FOR_ALL,
             question=partial(question_of, tool),
@@ -161,8 +163,8 @@ def fleet_tools(
     )
 
 
-def _described(tool: Tool) -> tuple[str, JsonObject]:
-    """Returns the description, with the shape of the reply for all robots, and the schema."""
+def _describe(tool: Tool) -> tuple[str, JsonObject]:
+    """Returns the tool's description, with the shape of the reply for all robots, and its schema."""
     text, needs = tool.description, "Its name."
     if tool.name in TABLE_FOR_ALL:
         needs = "Its name; without it, or with several (a, b), by of all."
@@ -181,7 +183,10 @@ def _described(tool: Tool) -> tuple[str, JsonObject]:
 
 @dataclass(frozen=True, slots=True)
 class _FleetQuestion:
-    """A question to robots of a fleet: what asks one of them, and its arguments."""
+    """A question to robots of a fleet.
+
+    `question` asks the memory of one robot; `given` are the arguments, without the robot.
+    """
 
     tool: Tool
     fleet: Fleet
@@ -191,35 +196,35 @@ class _FleetQuestion:
     given: Mapping[str, object]
 
     def ask(self, named: object, call: Call) -> OfRobot | OfFleet:
-        """Returns the answer of the robot of a name, of several (a, b), or where it is None of all.
+        """Returns the answer of the named robot, of several ("a, b"), or of all if it is None.
 
         Raises:
-            EpisodicError: there is none.
+            EpisodicError: there is no answer.
         """
         robots = self.fleet.chosen(named, call)
         tool, given = self.tool.name, self.given
         is_table = tool in TABLE_FOR_ALL and given.get("by") is not None
         is_of_all = (tool in ANSWER_FOR_ALL or is_table) and given.get("between") is None
         if is_of_all and (named is None or "," in str(named)):
-            return self._of_all(robots, call)
+            return self._ask_all(robots, call)
         if len(robots) == 1:
-            return self._of_one(robots[0], call)
+            return self._ask_one(robots[0], call)
         example = f", e.g. robot={robots[0].name}" if robots else ""
         raise InvalidArgumentsError(
-            f"which robot? {tool} answers for one: pass robot{example}; {there_are(robots)}"
+            f"which robot? {tool} answers for one: pass robot{example}; {robots_clause(robots)}"
         )
 
-    def _of_one(self, robot: Robot, call: Call) -> OfRobot:
+    def _ask_one(self, robot: Robot, call: Call) -> OfRobot:
         """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
 
         Raises:
-            EpisodicError: it has none.
+            EpisodicError: the robot has no answer.
         """
 
         def ask(_: Robot, own: Call) -> OfRobot:
-            answer, from_lake = self._asked(robot, partial(_answer, self.question), own)
-            lake = self._reported(answer, from_lake)
-            notes = () if lake is None else (*shipped_to({robot.name: lake}), *lake.notes)
+            answer, lake = self._ask_memory(robot, partial(_answer, self.question), own)
+            report = self._lake_report(answer, lake)
+            notes = () if report is None else (*shipped_to({robot.name: report}), *report.notes)
             return OfRobot(robot.name, robot.bag_dir, answer, notes, own.now)
 
         answer_or_error = self.fan_out.ask([robot], ask, call)[robot.name]
@@ -227,7 +232,7 @@ class _FleetQuestion:
             raise answer_or_error
         return answer_or_error
 
-    def _of_all(self, robots: list[Robot], call: Call) -> OfFleet:
+    def _ask_all(self, robots: Sequence[Robot], call: Call) -> OfFleet:
         given = self.given
         if not robots:
             raise errors.RefusedError("there is no robot that this token may ask about")
@@ -236,7 +241,8 @@ class _FleetQuestion:
                 f"{name} has coordinates, which each robot has in a map of its own: pass robot, or "
                 "where with the name of a place (fleet.shared_map is set where all share one map)"
             )
-        robots.sort(key=lambda robot: robot.latest or MIN_NS, reverse=True)
+        # A full page of the newest rows spares robots with older data most of their search.
+        robots = sorted(robots, key=lambda robot: robot.latest or MIN_NS, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
         wanted = given.get("limit")
         if wanted is None:
@@ -250,13 +256,13 @@ class _FleetQuestion:
         }
         if not replies:
             raise _shared_error(failed)
-        return OfFleet(merged(self.tool.name, replies, failed, page, self.max_chars))
+        return OfFleet(merge_replies(self.tool.name, replies, failed, page, self.max_chars))
 
     def _reply(self, now: StoppedClock, page: Page, robot: Robot, call: Call) -> RobotReply:
         """Returns a robot's reply; runs in a thread of its own.
 
         Raises:
-            EpisodicError: it has none.
+            EpisodicError: the robot has no answer.
         """
 
         def ask(memory: Memory, own: Call) -> tuple[RobotReply, OneAnswer]:
@@ -266,7 +272,7 @@ class _FleetQuestion:
                 raise errors.RefusedError(snapshot.problem)
             latest = snapshot.latest
             is_ahead = latest is not None and latest > now.at + _AHEAD_NS
-            # Rows of those whose clock is ahead come last, whenever they are.
+            # Rows of a robot whose clock is ahead come last, whatever their times are.
             own.rows_in = None if is_ahead else page.window()
             answer = _answer(self.question, replace(memory, clock=now), own)
             if isinstance(answer, Sightings) and not is_ahead:
@@ -277,33 +283,34 @@ class _FleetQuestion:
                 value = {"now": unix_rounded_up(own.now), **value}
             return RobotReply(robot.name, value, latest, is_ahead), answer
 
-        (reply, answer), lake = self._asked(robot, ask, call)
-        return replace(reply, lake=self._reported(answer, lake))
+        (reply, answer), lake = self._ask_memory(robot, ask, call)
+        return replace(reply, lake=self._lake_report(answer, lake))
 
-    def _asked(
+    def _ask_memory(
         self, robot: Robot, ask: Callable[[Memory, Call], T], call: Call
-    ) -> tuple[T, FromLake | None]:
-        """Returns what `Robot.asked` does; what a recorder does now is not in a lake."""
+    ) -> tuple[T, LakeReport | None]:
+        """Returns the same as `Robot.ask`, but asks about a recorder in its own bag directory."""
         if self.tool.name in _OF_RECORDER and robot.own is not None:
             return ask(robot.own, call), None
-        return robot.asked(ask, call, self._since)
+        return robot.ask(ask, call, self._since)
 
     def _since(self, now: Ns) -> Ns | None:
-        """Returns from when the question is; None where it is about the bags that there are."""
+        """Returns the time from which on the question is, or None if it is about all bags."""
         given = {name: value for name, value in self.given.items() if value is not None}
         begins = [now - ns_from_unix(float(str(given[name]))) for name in _LENGTHS if name in given]
-        for value in (given[name] for name in _TIMES if name in given):
+        for name in _TIMES:
+            value = given.get(name, [])
             for time in value if isinstance(value, list) else [value]:
                 with suppress(ValueError):  # a list as text
-                    read = unix_from_text if isinstance(time, str) else float
-                    begins.append(ns_from_unix(read(str(time))))
+                    unix_s = unix_from_text(time) if isinstance(time, str) else float(str(time))
+                    begins.append(ns_from_unix(unix_s))
         # Without a time, searches are about all that there ever was.
         takes_time = self.tool.arguments.keys() & {*_TIMES, *_LENGTHS, "before"}
         searches = takes_time and self.tool.name not in _REPORTS_ITSELF
         return min(begins, default=MIN_NS if searches else None)
 
-    def _reported(self, answer: OneAnswer, lake: FromLake | None) -> FromLake | None:
-        """Returns what is to be reported of a lake, given from when its answer is."""
+    def _lake_report(self, answer: OneAnswer, lake: LakeReport | None) -> LakeReport | None:
+        """Returns the report on the lake for an answer, which may need no older days."""
         if lake is None:
             return None
         if isinstance(answer, Match) and answer.found is not None:
@@ -313,10 +320,10 @@ class _FleetQuestion:
 
 
 class Page:
-    """The `limit` rows that come first, of the rows of robots that answered so far.
+    """The times of the first `limit` rows of the robots that answered so far.
 
-    The newest rows come first, or the oldest. Rows that one of two threads does not see leave the
-    page longer than it needs to be, not shorter.
+    The newest rows come first, or the oldest. If two threads add rows at once, some may be missing;
+    then `window` is wider than it needs to be.
     """
 
     def __init__(self, limit: int | None, *, oldest_first: bool) -> None:
@@ -329,7 +336,7 @@ class Page:
         self._times = times[: self.limit]
 
     def window(self) -> TimeWindow | None:
-        """Returns where a row's time must lie for a place on the page; None while there is room."""
+        """Returns the times of rows that can be on the page; None while there is room for any."""
         times = self._times
         if self.limit is None or len(times) < max(self.limit, 1):
             return None
@@ -349,16 +356,19 @@ def _coordinates_in(given: Mapping[str, object]) -> str | None:
     for name in ("where", "near"):
         where = given.get(name)
         is_object = isinstance(where, dict) or str(where).lstrip().startswith("{")
-        if is_object and not (name == "near" and "label" in str(where)):
+        is_label = name == "near" and "label" in str(where)
+        if is_object and not is_label:
             return name
     if "near_position" in str(given.get("while")):
         return "while"
-    near = ("value",) if given.get("condition_type") == "near_position" else ()
-    return next((name for name in (*near, "x", "y") if given.get(name) is not None), None)
+    names = ["x", "y"]
+    if given.get("condition_type") == "near_position":
+        names.insert(0, "value")
+    return next((name for name in names if given.get(name) is not None), None)
 
 
 def _shared_error(failed: Mapping[str, EpisodicError]) -> EpisodicError:
-    """Returns the error where no robot has an answer."""
+    """Returns the error of a call to which no robot has an answer."""
     reasons = by_reason((name, reason_of(error)) for name, error in failed.items())
     text = "; ".join(f"{listed(names)}: {reason}" for reason, names in reasons.items())
     kinds = {type(error) for error in failed.values()}
@@ -373,7 +383,7 @@ def _shared_error(failed: Mapping[str, EpisodicError]) -> EpisodicError:
     return errors.QueryTimeoutError(text) if is_late else errors.RefusedError(text)
 
 
-def merged(
+def merge_replies(
     tool: str,
     replies: Sequence[RobotReply],
     failures: Mapping[str, EpisodicError],
@@ -384,73 +394,83 @@ def merged(
 
     Args:
         tool: one of `ANSWER_FOR_ALL`.
-        replies: of the robots that answered, whose rows have the order of the page.
-        failures: for each other robot, why there is no answer.
+        replies: the replies of the robots that answered, with rows in the order of the page.
+        failures: the errors of the other robots.
         page: how many rows are wanted, of all robots together.
-        max_chars: where the reply would be longer, rows for each robot are given shortly.
+        max_chars: if the reply would be longer, the rows of whole robots are shortened.
     """
     order = sorted(replies, key=lambda reply: (reply.is_ahead, -(reply.latest or 0), reply.name))
     codes: JsonObject = {name: error.code for name, error in failures.items()}
     failed: JsonObject = {FAILED: codes} if codes else {}
     notes = _notes_on(order, failures)
     if any("columns" in reply.body for reply in order):
-        reply_body = _one_table(order)
+        body = _merge_tables(order)
     elif tool == "list_recorded_topics":
-        reply_body = {TOPICS: _by_topic(order)}
+        body = {TOPICS: _merge_topics(order)}
     elif tool in MERGED_ROWS:
-        reply_body = _rows(MERGED_ROWS[tool], order, page)
+        body = _merge_rows(MERGED_ROWS[tool], order, page)
     else:
         whole: list[JsonObject] = [{ROBOT_NAME: reply.name, **reply.body} for reply in order]
-        reply_body = with_notes({"robots": [*whole], **failed}, notes)
-        if len(to_json_text(reply_body)) <= max_chars:
-            return reply_body
+        body = with_notes({"robots": [*whole], **failed}, notes)
+        if len(to_json_text(body)) <= max_chars:
+            return body
         keys = dict.fromkeys((ROBOT_NAME, "now", *SHORT_KEYS[tool]))
         short = [{key: row[key] for key in keys if key in row} for row in whole]
         do = "each robot shortly; pass robot for all of it"
         return with_notes({"robots": [*short], **failed}, [do, *notes])
-    of_robots = _sentences(
+    own_notes = _sentences(
         (reply.name, note)
         for reply in order
         # `str(note)` would lose that it is quoted.
         for note in _items(reply.body, "notes")
         if isinstance(note, str)
     )
-    return with_notes({**reply_body, **failed}, [*of_robots, *notes])
+    return with_notes({**body, **failed}, [*own_notes, *notes])
 
 
-def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) -> JsonObject:
-    """Returns the rows of all in order, those of robots whose clock is ahead last; and the rest."""
+class _TimedRow(NamedTuple):
+    """A row of a robot, with its place in the merged list: robots with a clock ahead come last."""
+
+    is_ahead: bool
+    order: float
+    key: str
+    row: JsonObject
+
+
+def _merge_rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) -> JsonObject:
+    """Returns the rows of all replies in order of time, and what the replies have besides."""
     values = {reply.name: _as_rows(reply) for reply in replies}
     times = {key.name: key.row_time for key in declared if key.row_time}
-    present = {name for value in values.values() for name in value}
-    # Of one robot there may be episodes, of another sightings.
-    keys = [name for name in times if name in present] or [*times][:1]
-    order: list[tuple[bool, float, str, JsonObject]] = []
+    # One robot may have episodes, another one sightings.
+    keys = [name for name in times if any(name in value for value in values.values())]
+    keys = keys or [*times][:1]
+    order: list[_TimedRow] = []
     for reply in replies:
         for key in keys:
-            for row in _list(values[reply.name].get(key)):
+            for row in _objects(values[reply.name].get(key)):
                 time = row.get(times[key], 0)
                 # A row whose time is null goes on.
-                at = math.inf if time is None else _number(time)
+                unix_s = math.inf if time is None else _number(time)
+                place = unix_s if page.oldest_first else -unix_s
                 named = {ROBOT_NAME: reply.name, **row}
-                order.append((reply.is_ahead, at if page.oldest_first else -at, key, named))
-    order.sort(key=itemgetter(0, 1))
-    # Of one robot every named place is listed, whatever the limit of visits is.
+                order.append(_TimedRow(reply.is_ahead, place, key, named))
+    order.sort(key=attrgetter("is_ahead", "order"))
+    # Each robot lists every named place, whatever the limit of visits is.
     shown = order if keys == ["places"] else order[: page.limit]
-    rows: JsonObject = {key: [row for *_, of, row in shown if of == key] for key in keys}
+    rows: JsonObject = {key: [timed.row for timed in shown if timed.key == key] for key in keys}
     if keys == [MATCHES]:
         never = [reply.name for reply in replies if reply.value is None]
         return {**rows, "never": [*never]} if never else rows
     rest = {name: _without(value, {*keys}) for name, value in values.items()}
-    is_cut = shown != order or any(value.get("more") for value in values.values())
-    more: JsonObject = {"more": True}
-    marks_more = is_cut and any(key.name == "more" for key in declared)
-    added = {key.name for key in declared if key.is_added}
-    return {**rows, **_combined(rest, added), **(more if marks_more else {})}
+    merged = {**rows, **_combined(rest, {key.name for key in declared if key.is_added})}
+    is_cut = len(shown) < len(order) or any(value.get("more") for value in values.values())
+    if is_cut and any(key.name == "more" for key in declared):
+        merged["more"] = True
+    return merged
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:
-    """Returns a reply as an object with a list of rows: one that is a row itself becomes a list."""
+    """Returns a reply as an object with a list of rows; a reply that is one row becomes a list."""
     value = reply.value
     if value is None:
         return {MATCHES: []}
@@ -460,64 +480,69 @@ def _as_rows(reply: RobotReply) -> JsonObject:
 
 
 def _combined(values: Mapping[str, JsonObject], added: Collection[str] = frozenset()) -> JsonObject:
-    """Returns what replies have besides rows: once where all agree, else by robot.
+    """Returns the keys of replies besides rows: once if all robots agree, else by robot.
 
-    Numbers of the keys that are `added` up are listed by robot, too; counts by name are not.
+    Of the `added` keys, counts by name are only summed; numbers are summed and listed by robot.
     """
     combined: JsonObject = {}
     by_robot: dict[str, JsonObject] = {}
-    # Where a robot has not counted all, there is no total, but at least so many.
+    # If a robot did not count all, the sum is not a total, but at least so many.
     is_counted = not any(AT_LEAST in value for value in values.values())
-    for key in dict.fromkeys(key for value in values.values() for key in value):
+    for key in dict.fromkeys(chain.from_iterable(values.values())):
         of_robots = {name: value[key] for name, value in values.items() if key in value}
         counts = [value for value in of_robots.values() if isinstance(value, dict)]
-        agree = len({*map(to_json_text, of_robots.values())}) == 1 and len(of_robots) == len(values)
+        texts = {to_json_text(value) for value in of_robots.values()}
         if key in _LEFT_OUT:
             continue
         if key in added and counts:
             combined[key] = dict(sum(map(Counter[str], counts), Counter()).most_common())
-        elif agree and key not in {AT_LEAST, *added}:
+            continue
+        if key == AT_LEAST:
+            totals = [value.get(_TOTAL) for value in values.values()]
+            combined[key] = _sum((*of_robots.values(), *totals))
+        elif key in added:
+            if is_counted or key != _TOTAL:
+                combined[key] = _sum(of_robots.values())
+        elif len(texts) == 1 and len(of_robots) == len(values):
             combined[key] = next(iter(of_robots.values()))
-        else:
-            if key == AT_LEAST or (key in added and (is_counted or key != _TOTAL)):
-                totals = [value.get(_TOTAL) for value in values.values() if key == AT_LEAST]
-                combined[key] = round(sum(map(_number, (*of_robots.values(), *totals))), 2)
-            for name, value in of_robots.items():
-                by_robot.setdefault(name, {})[key] = value
+            continue
+        for name, value in of_robots.items():
+            by_robot.setdefault(name, {})[key] = value
     return {**combined, "by_robot": {**by_robot}} if by_robot else combined
 
 
-def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
-    """Returns a row for each topic of a type, with the names of the robots that record it."""
+def _merge_topics(replies: Sequence[RobotReply]) -> list[JsonValue]:
+    """Returns a row for each topic and type, with the names of the robots that record it."""
     topics: dict[tuple[str, str], JsonObject] = {}
-    for reply in replies:  # those whose clock ran ahead come last
-        for row in _list(reply.value):
+    for reply in replies:  # robots with a clock ahead come last: their times count if alone
+        for row in _objects(reply.value):
             key = str(row["topic"]), str(row["type"])
             total = topics.setdefault(key, {**row, "count": 0})
-            for time, best in (("first_ts", min), ("last_ts", max)):
-                if not reply.is_ahead:
-                    total[time] = best(_number(total[time]), _number(row[time]))
+            if not reply.is_ahead:
+                total["first_ts"] = min(_number(total["first_ts"]), _number(row["first_ts"]))
+                total["last_ts"] = max(_number(total["last_ts"]), _number(row["last_ts"]))
             total["count"] = int(_number(total["count"]) + _number(row["count"]))
             total[_ROBOT_NAMES] = [*_items(total, _ROBOT_NAMES), reply.name]
     return [*sorted(topics.values(), key=lambda row: (-_number(row["last_ts"]), str(row["topic"])))]
 
 
-def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
+def _merge_tables(replies: Sequence[RobotReply]) -> JsonObject:
     """Returns the tables of robots as one, whose first column is the robot.
 
-    A column that one of them lacks is null there.
+    A column that a robot lacks is null in its rows.
     """
     headers = {reply.name: [*map(str, _items(reply.body, "columns"))] for reply in replies}
-    columns = [*dict.fromkeys(name for own in headers.values() for name in own)]
+    columns = [*dict.fromkeys(chain.from_iterable(headers.values()))]
     rows: list[JsonValue] = []
     totals: JsonObject = {}
     for reply in replies:
-        name, header = reply.name, headers[reply.name]
+        header = headers[reply.name]
         for row in _items(reply.body, "rows"):
             cells = dict(zip(header, row if isinstance(row, list) else (), strict=True))
-            rows.append([name, *map(cells.get, columns)])
+            rows.append([reply.name, *map(cells.get, columns)])
         if total := _items(reply.body, "all"):
-            totals[name] = [*map(dict(zip(header[1:], total, strict=True)).get, columns[1:])]
+            cells = dict(zip(header[1:], total, strict=True))
+            totals[reply.name] = [*map(cells.get, columns[1:])]
     rest = {reply.name: _without(reply.body, {"columns", "rows", "all"}) for reply in replies}
     table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": totals}
     return table | _combined(rest)
@@ -551,12 +576,12 @@ def _sentences(reasons: Iterable[tuple[str, str]], begin: str = "") -> list[str]
 
 
 def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicError]) -> list[str]:
-    """Returns what is to be known of robots: who did not answer and why, whose clock is ahead."""
+    """Returns notes on robots without an answer, answers from a lake, and clocks that are ahead."""
     failed = ((name, reason_of(error)) for name, error in failures.items())
-    of_lake = {reply.name: reply.lake for reply in replies if reply.lake is not None}
+    reports = {reply.name: reply.lake for reply in replies if reply.lake is not None}
     notes = _sentences(failed, "no answer of ")
-    notes += _sentences((name, note) for name, lake in of_lake.items() for note in lake.notes)
-    notes += shipped_to(of_lake)
+    notes += _sentences((name, note) for name, report in reports.items() for note in report.notes)
+    notes += shipped_to(reports)
     if ahead := [reply.name for reply in replies if reply.is_ahead]:
         notes.append(
             f"{listed(ahead, at_most=_MOST_NAMED)}: dated in the future by a clock that ran ahead, "
@@ -565,12 +590,14 @@ def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicErro
     return notes
 
 
-def shipped_to(of_lake: Mapping[str, FromLake]) -> list[str]:
+def shipped_to(reports: Mapping[str, LakeReport]) -> list[str]:
     """Returns the note on answers from a lake alone: up to when each robot's bags were shipped."""
-    latest = {name: lake.latest for name, lake in of_lake.items() if lake.is_alone}
-    order = sorted(latest.items(), key=lambda shipped: shipped[1] or 0)
-    times = [(name, "no time" if at is None else iso_local(at) or str(at)) for name, at in order]
-    parts = [f"{name} up to {time}" for name, time in times[:_MOST_NAMED]]
+    latest = {name: report.latest for name, report in reports.items() if report.is_alone}
+    order = sorted(latest, key=lambda name: latest[name] or 0)
+    parts: list[str] = []
+    for name in order[:_MOST_NAMED]:
+        at = latest[name]
+        parts.append(f"{name} up to {'no time' if at is None else iso_local(at) or at}")
     if more := len(order) - len(parts):
         parts.append(f"{more} others up to later")
     return [f"from the lake, which has what was shipped: {', '.join(parts)}"] if parts else []
@@ -585,9 +612,13 @@ def _items(reply: JsonObject, key: str) -> list[JsonValue]:
     return values if isinstance(values, list) else []
 
 
-def _list(value: JsonValue) -> list[JsonObject]:
+def _objects(value: JsonValue) -> list[JsonObject]:
     return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
 
 
 def _number(value: JsonValue) -> float:
     return value if isinstance(value, int | float) else 0
+
+
+def _sum(values: Iterable[JsonValue]) -> float:
+    return round(sum(map(_number, values)), 2)

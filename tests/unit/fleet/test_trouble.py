@@ -24,7 +24,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.robots import FanOut, Fleet, Robot
-from ros2_memory.fleet.tools import Page, RobotReply, merged
+from ros2_memory.fleet.tools import Page, RobotReply, merge_replies
 from ros2_memory.history.context import Call
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.declaration import Tool
@@ -224,7 +224,7 @@ def test_a_robot_is_told_when_its_time_is_up() -> None:
 
 
 def one_reply(tool: str, *replies: RobotReply) -> Any:
-    found = merged(tool, replies, {}, Page(None, oldest_first=False), 10**6)
+    found = merge_replies(tool, replies, {}, Page(None, oldest_first=False), 10**6)
     assert json.loads(json.dumps(found)) == found
     return found
 

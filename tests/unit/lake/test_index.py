@@ -307,10 +307,10 @@ def test_where_the_time_is_short_it_says_how_far_it_looked(
         return find_last_match(memory, call, topic, "contains", "mug")
 
     call = Call(Deadline.after(60))
-    found, lake = robot.asked(partial(ask, SEEN), call)
+    found, lake = robot.ask(partial(ask, SEEN), call)
     assert found.found is None
     assert lake is not None
     [note] = lake.notes
     assert note.startswith("the lake has days before ")
     with pytest.raises(NoDataError, match=r"/none.*; the lake has days before "):
-        robot.asked(partial(ask, "/none"), Call(Deadline.after(60)))
+        robot.ask(partial(ask, "/none"), Call(Deadline.after(60)))
