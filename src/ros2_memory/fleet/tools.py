@@ -164,7 +164,7 @@ def fleet_tools(
 
 
 def _describe(tool: Tool) -> tuple[str, JsonObject]:
-    """Returns the tool's description, with the shape of the reply for all robots, and its schema."""
+    """Returns a tool's description with the shape of replies for all robots, and its schema."""
     text, needs = tool.description, "Its name."
     if tool.name in TABLE_FOR_ALL:
         needs = "Its name; without it, or with several (a, b), by of all."

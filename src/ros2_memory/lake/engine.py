@@ -41,13 +41,19 @@ if TYPE_CHECKING:
 
 _AT_ONCE: Final = 2
 """Statements that are answered at once: each may take `memory_mb`."""
-_FEW_ROWS: Final = 16
-_PAGE_BY_PAGE: Final = ParquetFragmentScanOptions(
-    use_buffered_stream=True, buffer_size=4 << 20, pre_buffer=False
-)
-"""How a column is read of which a group of rows may be larger than memory."""
+_PAGE_BY_PAGE: Final[Mapping[str, object]] = {
+    "batch_size": 16,
+    "batch_readahead": 1,
+    "fragment_readahead": 1,
+    "fragment_scan_options": ParquetFragmentScanOptions(
+        use_buffered_stream=True, buffer_size=4 << 20, pre_buffer=False
+    ),
+}
+"""How a column is read whose group of rows may be larger than memory."""
 _MESSAGE_BYTES: Final = 16 << 20
+"""Packed messages that stay in memory."""
 _CHANNEL_BYTES: Final = 8 << 20
+"""Channels that stay in memory."""
 
 log = get_logger(__name__)
 
@@ -56,14 +62,14 @@ class Lake:
     """The tables of a lake as they are now. Thread-safe.
 
     Args:
-        catalog: of the tables.
+        catalog: the catalogue of the tables.
         translated: turns the errors of catalogues and stores into those of this program.
         memory_mb: how much memory DuckDB may use for a statement.
-        threads: how many threads; None for one for each core.
+        threads: how many threads DuckDB may use; None for one for each core.
 
     Attributes:
-        messages: packed ones that were read last, of all robots.
-        channels: those of the bags that were read last.
+        messages: the packed messages that were read last, of all robots.
+        channels: the channels that were read last, of all robots.
     """
 
     def __init__(
@@ -84,24 +90,24 @@ class Lake:
         self._partitions: defaultdict[str, Partitions] = defaultdict(Partitions)
 
     def refresh(self, within_s: float = 0.0) -> None:
-        """Looks for what was committed since, unless that was done within so many seconds.
+        """Looks for new commits, unless that was done less than `within_s` ago.
 
-        `bags` is committed last, so nothing else changes for those who ask about its rows.
+        `bags` is committed last, so the other tables have the rows of all bags that it lists.
 
         Raises:
-            RefusedError: the lake cannot be read; so do all others.
+            RefusedError: the lake cannot be read; all other methods raise it, too.
         """
         with self._looking():
             if time.monotonic() - self._looked_at >= within_s:
-                # Other tables are looked up later, and have the rows of these bags by then.
+                # Other tables are loaded when they are asked for.
                 self._tables = {}
                 self._loaded_table("bags")
                 self._looked_at = time.monotonic()
 
     def days(self, name: str) -> Mapping[str, Days]:
-        """Returns the files of a table by robot, in order; no file of rows is read.
+        """Returns the files of a table by robot and day, without reading them.
 
-        In those of a robot no row of another one is.
+        Each file has rows of one robot and day.
         """
         with self._looking():
             table = self._loaded_table(name)
@@ -114,27 +120,19 @@ class Lake:
         columns: Sequence[str],
         condition: pc.Expression | None = None,
     ) -> pa.Table:
-        """Returns the rows of a table in some of its files, if any, in no order.
+        """Returns the rows of a table in the given files, in no order.
 
-        A column that a file lacks is null there. `condition`: of which rows; None: of all.
+        A column that a file lacks is null there. Without a `condition` all rows are returned.
 
         Raises:
-            RefusedError: a file cannot be read; the log has why.
+            RefusedError: a file cannot be read; the log has the reason.
         """
+        options = _PAGE_BY_PAGE if "packed" in columns else {}
         try:
-            rows, wanted = self._files_of(name, files).dataset(), [*columns]
-            if "packed" not in columns:
-                return rows.to_table(wanted, filter=condition)
-            return rows.to_table(
-                wanted,
-                filter=condition,
-                batch_size=_FEW_ROWS,
-                batch_readahead=1,
-                fragment_readahead=1,
-                fragment_scan_options=_PAGE_BY_PAGE,
-            )
+            dataset = self._files_of(name, files).dataset()
+            return dataset.to_table([*columns], filter=condition, **options)
         except (OSError, pa.ArrowException) as error:
-            # The error leaves out its sentence, as it may have a path or a key.
+            # Only the log has the whole error: its text may have a path or a key.
             kind = type(error).__name__
             log.warning("lake_engine_failed", reason=f"{kind}: {error}")
             text = f"the lake cannot be read ({kind}); the server's log has the reason"
@@ -149,15 +147,15 @@ class Lake:
         most_chars: int | None = None,
         deadline: Deadline | None = None,
     ) -> Selected:
-        """Returns the rows of a SELECT, which anybody may have written, over the tables as of now.
+        """Returns the rows of a SELECT over the current tables; `sql` need not be trusted.
 
-        Those of all robots, or of some. `select.Select` has the limits.
+        It sees the rows of the given robots, or of all. For the limits see `select.Select`.
 
         Raises:
-            BusyError: its time was over before others were answered.
-            InvalidArgumentsError: it is no SELECT over the tables; the sentence has the reason.
-            QueryTimeoutError: its time was over.
-            RefusedError: the lake cannot be read, or it needs more memory.
+            BusyError: the time was over before the statements of others were answered.
+            InvalidArgumentsError: `sql` is no SELECT over the tables; the sentence has the reason.
+            QueryTimeoutError: the time was over.
+            RefusedError: the lake cannot be read, or the SELECT needs more memory.
         """
         deadline = deadline or Deadline.never()
         self.refresh()
@@ -180,7 +178,7 @@ class Lake:
         return {name: table.columns.keys() for name, table in TABLES.items()}
 
     def shipped_until(self, robots: Collection[str] | None = None) -> Mapping[str, Ns]:
-        """Returns the log time of the newest message that is there, of each robot, or of some.
+        """Returns the log time of the newest message of each robot, or of each given robot.
 
         Raises:
             RefusedError: the lake cannot be read.
@@ -190,21 +188,22 @@ class Lake:
         return dict(zip(newest["robot"].to_pylist(), newest["end_ns_max"].to_pylist(), strict=True))
 
     def _files_for(self, robots: Collection[str] | None, name: str) -> Iterator[LakeFile]:
-        """Yields the files of a table that have rows of some robots; None: of any."""
+        """Yields the files of a table with rows of the given robots, or of all."""
         for robot, days in self.days(name).items():
             if robots is None or robot in robots:
                 yield from chain.from_iterable(days.values())
 
     def _files_of(self, name: str, files: Iterable[LakeFile]) -> TableFiles:
-        """Returns some files of a table, and what reads them."""
-        places = [PyArrowFileIO.parse_location(file.location) for file in files]
-        paths, schema = [path for *_, path in places], TABLES[name].arrow_schema
-        if {scheme for scheme, *_ in places} <= {"file"}:
+        """Returns files of a table, with the settings of their store."""
+        locations = [PyArrowFileIO.parse_location(file.location) for file in files]
+        paths, schema = [path for _, _, path in locations], TABLES[name].arrow_schema
+        if all(scheme == "file" for scheme, _, _ in locations):
             return TableFiles(schema, paths)
+        scheme, host, _ = locations[0]
         with self._looking():
             table = self._loaded_table(name)
         properties = {} if table is None else dict(table.io.properties)
-        return TableFiles(schema, paths, *places[0][:2], properties)
+        return TableFiles(schema, paths, scheme, host, properties)
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

@@ -19,6 +19,7 @@ from ros2_memory.columns.pack import is_large
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
 from ros2_memory.core.model import COMPRESSED, BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
@@ -38,17 +39,18 @@ if TYPE_CHECKING:
     from ros2_memory.lake.warehouse import Days
 
 MOST_BAGS: Final = 45_000
-"""Bags that are looked at together: a month of minutes, or some years of ten a day."""
+"""Bags that an index shows at once: a month of minutes, or some years of ten a day."""
 _MOST_WINDOWS: Final = 6
-"""Times before the newest days that stay in memory."""
-_TOGETHER: Final = 64
-"""Bags of a day whose messages are read together."""
+"""Windows before the newest days that stay in memory."""
+_GROUP: Final = 64
+"""Bags of a day whose channels are read at once."""
 _NEAR_BYTES: Final = 4 << 20
-"""Packed messages that are read with those of a bag: of the bags before it, and of those after."""
+"""Packed messages that are read beside those of a bag: so many before it, and so many after."""
 _LOOKS: Final = 4
-"""What is known of the lake serves for all robots for this part of the time that it may be old."""
+"""The lake is looked into anew after this fraction of the time that an index may be old."""
 _GONE: Final = "it is not in the lake any more"
 _HEAD_BYTES: Final = 200
+"""About what a channel takes in memory."""
 
 _BAGS: Final = (*ShippedBag._fields, "summary", "counts", "joined")
 _IN_ORDER: Final = [(column, "ascending") for column in ("start_ns", "end_ns", "bag_id")]
@@ -63,49 +65,49 @@ class LakeBag(NamedTuple):
     Attributes:
         bag_id: its id there.
         day: the day that its rows are under.
-        file: the bag, by the path that it had on the robot.
+        file: the bag, with the path that it had on the robot.
         joined: the recordings that handovers join with its own.
-        together: the states by id of the bags of that day that are read together.
+        group: the bags of that day that are read with it, and itself: their `sidecar_ns` by id.
     """
 
     bag_id: str
     day: date
     file: BagFile
     joined: tuple[str, ...]
-    together: dict[str, int]
+    group: dict[str, int]
 
 
 @dataclass(frozen=True)
 class _Window:
-    """Consecutive days of a robot, and what the lake has of them.
+    """The bags of consecutive days of a robot.
 
     Attributes:
-        older: the end of the newest day before them, as a log time; None where there is none.
-        made_of: the files whose rows are the bags of each day.
-        timeline: the bags of all.
-        bags: these by their paths.
-        joined: names of recordings that handovers join with one, by its folder.
+        older: the last log time of the newest day before them; None if there is none.
+        files: the files of the table `bags` for each day.
+        timeline: the bags in order.
+        bags: the bags by path.
+        joined: the names of the recordings that handovers join with one, by its folder.
     """
 
     older: Ns | None = None
-    made_of: Days = field(default_factory=dict)
+    files: Days = field(default_factory=dict)
     timeline: Timeline = field(default_factory=Timeline)
     bags: Mapping[str, LakeBag] = field(default_factory=dict)
     joined: Mapping[Path, tuple[str, ...]] = field(default_factory=dict)
 
 
-def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date | None]:
-    """Returns the newest days with rows up to one, and the one before them, if there is one.
+def newest_days(days: Days, until: date, most_rows: int, fewest: int) -> tuple[Days, date | None]:
+    """Returns the newest days with rows up to `until`, and the day with rows before them, if any.
 
-    They are those of `fewest` days, and more while all have at most `rows` rows.
+    They span `fewest` days, or more while they have at most `most_rows` rows.
     """
     order = [*days]
     begin = end = bisect_right(order, until)
-    total = 0
+    rows = 0
     while begin:
         day = order[begin - 1]
-        total += sum(file.rows for file in days[day])
-        if total > rows and day <= order[end - 1] - timedelta(days=fewest):
+        rows += sum(file.rows for file in days[day])
+        if rows > most_rows and day <= order[end - 1] - timedelta(days=fewest):
             break
         begin -= 1
     chosen = {day: days[day] for day in order[begin:end]}
@@ -114,20 +116,20 @@ def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date 
 
 @dataclass(eq=False, repr=False)
 class LakeIndex:
-    """What a lake has of one robot, as of some seconds ago. Thread-safe.
+    """The bags of one robot in a lake, as of some seconds ago. Thread-safe.
 
-    It is of the newest days, and of other days where a question is about a time before these. Bags
+    It has the newest days; for a question about an earlier time, the days up to that time. Bags
     have the paths that they had on the robot. Which messages count at a handover was decided when
-    they were shipped.
+    the bags were shipped.
 
     Attributes:
         lake: the lake.
-        robot: its name there.
-        bag_dir: where the bags are on the robot, or a path that no directory need have.
+        robot: the name of the robot in the lake.
+        bag_dir: where the bags are on the robot; the directory need not exist here.
         clock: the wall clock.
-        refresh_s: how old (s) the index may be: at most one commit of a table is made meanwhile.
-        days: how many days are looked at together, at least: the newest; more of few bags.
-        most_bags: so many bags at most, where that is more days.
+        refresh_s: how old the index may be.
+        days: how many days are shown at least.
+        most_bags: up to so many bags, more days are shown.
     """
 
     lake: Lake
@@ -144,24 +146,24 @@ class LakeIndex:
 
     @property
     def published(self) -> Snapshot | None:
-        """The index as it is known now."""
+        """The last snapshot; None before the first."""
         return self._snapshot
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """Returns an index at most `refresh_s` old; what is not shipped yet is not in it.
+        """Returns the newest days as of at most `refresh_s` ago.
 
-        Where `reach` is before the newest days, it is of the days up to that time.
+        If `reach` is before the newest days, it has the days up to `reach` instead.
 
         Raises:
             RefusedError: the lake cannot be read.
         """
         current = self._snapshot
-        # A clock that was set back says nothing about its age.
-        if (
-            current is None
-            or not 0 <= self.clock.now() - current.scanned_at <= self.refresh_s * 1e9
-        ):
-            current = self.refresh()
+        if current is not None:
+            age = self.clock.now() - current.scanned_at
+            # Below 0 the clock was set back, and the age is unknown.
+            if not 0 <= age <= ns_from_unix(self.refresh_s):
+                current = None
+        current = current or self.refresh()
         if reach is None or current.older is None or reach > current.older:
             return current
         day = day_of(reach)
@@ -174,7 +176,7 @@ class LakeIndex:
         return replace(current, timeline=window.timeline, older=window.older)
 
     def refresh(self) -> Snapshot:
-        """Looks into the lake now; what was just seen there for another robot is not old."""
+        """Looks into the lake now, unless another robot's index did so a moment ago."""
         with self._lock:
             self.lake.refresh(self.refresh_s / _LOOKS)
             window = self._window(date.max, self.days)
@@ -187,34 +189,35 @@ class LakeIndex:
             return self._snapshot
 
     def heartbeat(self) -> Heartbeat | None:
-        """Returns None: what a robot's recorder does now is not in a lake."""
+        """Returns None: the heartbeat of a robot's recorder is not in a lake."""
         return None
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
-        """Returns what the robot's handovers were when the bags were shipped."""
+        """Returns the recordings that handovers joined with one when its bags were shipped."""
         joined = (window.joined.get(recording) for window in self._windows.values())
         return next(filter(None, joined), ())
 
     def bag(self, path: Path) -> LakeBag | None:
-        """Returns the bag of a snapshot that has a path there; None if there is none."""
+        """Returns the bag with this path in a snapshot; None if there is none."""
         bags = (window.bags.get(str(path)) for window in self._windows.values())
         return next(filter(None, bags), None)
 
     def _window(self, until: date, fewest: int) -> _Window:
-        """Returns the newest days up to one; only those are read of which a file is new."""
+        """Returns the newest days up to `until`. Only days with new files are read."""
         before = self._windows.get(until, _Window())
         of_robot = self.lake.days("bags").get(self.robot, {})
-        made_of, day_before = newest(of_robot, until, self.most_bags, fewest)
-        window = replace(before, older=None if day_before is None else end_of(day_before))
-        if made_of != before.made_of:
-            new = {day: files for day, files in made_of.items() if before.made_of.get(day) != files}
-            same = made_of.keys() - new.keys()
+        files, day_before = newest_days(of_robot, until, self.most_bags, fewest)
+        older = None if day_before is None else end_of(day_before)
+        window = replace(before, older=older)
+        if files != before.files:
+            new = {day: of_day for day, of_day in files.items() if before.files.get(day) != of_day}
+            same = files.keys() - new.keys()
             bags = {path: bag for path, bag in before.bags.items() if bag.day in same}
-            bags |= self._read(new, before.bags)
-            gone, come = _missing(before.bags, bags), _missing(bags, before.bags)
-            timeline = before.timeline.changed(gone, come)
+            bags |= self._read_bags(new, before.bags)
+            gone, added = _missing(before.bags, bags), _missing(bags, before.bags)
+            timeline = before.timeline.changed(gone, added)
             joined = {bag.file.recording: bag.joined for bag in bags.values() if bag.joined}
-            window = _Window(window.older, made_of, timeline, bags, joined)
+            window = _Window(older, files, timeline, bags, joined)
         # A new dict: other threads look for the bags of their answers in the old one.
         windows = {**self._windows}
         windows.pop(until, None)  # the one that was asked for last comes last
@@ -223,44 +226,51 @@ class LakeIndex:
         self._windows = {day: windows[day] for day in (date.max, *dated[-_MOST_WINDOWS:])}
         return window
 
-    def _read(self, made_of: Days, known: Mapping[str, LakeBag]) -> dict[str, LakeBag]:
-        """Returns the bags of some days by path; those that are known keep path and object."""
-        files = chain.from_iterable(made_of.values())
-        rows = self.lake.rows("bags", files, _BAGS).sort_by(_IN_ORDER)
-        windows = self._windows.values()
-        owners = {path: bag.bag_id for each in windows for path, bag in each.bags.items()}
+    def _read_bags(self, days: Days, known: Mapping[str, LakeBag]) -> dict[str, LakeBag]:
+        """Returns the bags of the days by path; known ones keep their path and their `BagFile`."""
+        rows = self.lake.rows("bags", chain.from_iterable(days.values()), _BAGS).sort_by(_IN_ORDER)
+        ids_by_path: dict[str, str] = {}
+        for window in self._windows.values():
+            ids_by_path.update((path, bag.bag_id) for path, bag in window.bags.items())
         schemas: dict[str, SummarySchema] = {}
-        together, day = dict[str, int](), date.min
+        group, day = dict[str, int](), date.min
         bags: dict[str, LakeBag] = {}
         for row in rows.to_pylist():
             schema, counts, joined = map(row.pop, ("summary", "counts", "joined"))
-            bag = ShippedBag(**row)
-            path = f"{self.bag_dir}/{bag.file.removesuffix(COMPRESSED)}"
-            # Another bag may have it, whose name was used again.
-            if owners.setdefault(path, bag.bag_id) != bag.bag_id:
-                path = f"{path}-{bag.bag_id}"
+            shipped = ShippedBag(**row)
+            path = f"{self.bag_dir}/{shipped.file.removesuffix(COMPRESSED)}"
+            # A name may have been used again for another bag.
+            if ids_by_path.setdefault(path, shipped.bag_id) != shipped.bag_id:
+                path = f"{path}-{shipped.bag_id}"
             if schema not in schemas:
                 schemas[schema] = SummarySchema.from_json(schema)
-            summary = BagSummary.decoded(schemas[schema], counts)
-            # One as large and as old may have other messages.
-            state = crc32(f"{bag.bag_id} {bag.sha256} {bag.made_of}".encode())
-            span = bag.start_ns, bag.end_ns
-            file = BagFile(path, bag.size, bag.mtime_ns, BagState.CLOSED, summary, *span, state)
+            file = _bag_file(path, shipped, BagSummary.decoded(schemas[schema], counts))
             before = known.get(path)
             if before is not None and before.file == file:
-                file = before.file  # what was remembered of it stays
-            if bag.day != day or len(together) == _TOGETHER:
-                together, day = {}, bag.day
-            together[bag.bag_id] = state
+                file = before.file  # derived data is remembered by this object
+            if shipped.day != day or len(group) == _GROUP:
+                group, day = {}, shipped.day
+            group[shipped.bag_id] = file.sidecar_ns
             names = tuple(joined.split("/")) if joined else ()
-            bags[path] = LakeBag(bag.bag_id, bag.day, file, names, together)
+            bags[path] = LakeBag(shipped.bag_id, day, file, names, group)
         return bags
 
 
+def _bag_file(path: str, shipped: ShippedBag, summary: BagSummary) -> BagFile:
+    """Returns a shipped bag as an index has it; `sidecar_ns` is another one for other messages."""
+    state = crc32(f"{shipped.bag_id} {shipped.sha256} {shipped.made_of}".encode())
+    span = shipped.start_ns, shipped.end_ns
+    return BagFile(path, shipped.size, shipped.mtime_ns, BagState.CLOSED, summary, *span, state)
+
+
 def _missing(bags: Mapping[str, LakeBag], others: Mapping[str, LakeBag]) -> list[BagFile]:
-    """Returns the files of bags that are not, or not the same, among others."""
-    same = {path for path, bag in others.items() if path in bags and bags[path].file is bag.file}
-    return [bag.file for path, bag in bags.items() if path not in same]
+    """Returns the files of the bags that are not among the others, by path and identity."""
+    missing: list[BagFile] = []
+    for path, bag in bags.items():
+        other = others.get(path)
+        if other is None or other.file is not bag.file:
+            missing.append(bag.file)
+    return missing
 
 
 class _Head(NamedTuple):
@@ -273,15 +283,15 @@ class _Head(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class LakeReader(BagReader):
-    """An adapter of `BagReader`: the bags of one robot in a lake, and all others as its own reader.
+    """An adapter of `BagReader` for one robot's bags in a lake; its own reader reads all others.
 
-    Of images, clouds, scans and the like a lake has the times alone: to read their payloads is
+    Of images, clouds, scans and the like a lake has only the times: reading their payloads is
     refused.
 
     Attributes:
-        index: the bags of the lake.
-        own: reads others, and decodes.
-        large: the turn to hold much of a bag.
+        index: the bags in the lake.
+        own: reads other bags, and decodes messages.
+        large: the turn to have much of a bag in memory.
     """
 
     index: LakeIndex
@@ -289,11 +299,11 @@ class LakeReader(BagReader):
     large: LargeReads
 
     def reads(self, path: Path) -> bool:
-        """Returns whether it is a bag of the index, or one that the robot's own reader reads."""
+        """Returns whether a path is a bag of the index, or one that the own reader reads."""
         return self.index.bag(path) is not None or self.own.reads(path)
 
     def closing(self, path: Path) -> Closing:
-        """Returns whether the writer has finished a bag: none is shipped before."""
+        """Returns whether the writer has finished a bag; shipped bags are finished."""
         return Closing.CLOSED if self.index.bag(path) else self.own.closing(path)
 
     def summarize(self, path: Path) -> BagSummary:
@@ -304,10 +314,10 @@ class LakeReader(BagReader):
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
     ) -> Iterator[Record]:
-        """Yields the messages.
+        """Yields the messages in order of log time.
 
         Raises:
-            NotInLakeError: the lake has the times of a topic alone.
+            NotInLakeError: the lake has only the times of a topic.
         """
         bag = self.index.bag(path)
         if bag is None:
@@ -320,7 +330,7 @@ class LakeReader(BagReader):
         """Yields the messages of a channel at once.
 
         Raises:
-            NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
+            NotInLakeError: the lake has only the times of a topic that is not `bare`.
         """
         bag = self.index.bag(path)
         if bag is None:
@@ -334,11 +344,11 @@ class LakeReader(BagReader):
         return {head.channel.topic for head in self._heads_of(bag) if not head.has_payloads}
 
     def is_file(self, path: Path) -> bool:
-        """Returns whether a bag is a file: whether it is the robot's own."""
+        """Returns whether a bag is a file, not rows of the lake."""
         return self.index.bag(path) is None
 
     def channels(self, path: Path) -> Sequence[Channel]:
-        """Returns the channels of a bag; of one in the lake those that have messages."""
+        """Returns the channels of a bag; of a bag in the lake only those with messages."""
         if (bag := self.index.bag(path)) is None:
             return self.own.channels(path)
         return [head.channel for head in self._heads_of(bag)]
@@ -348,11 +358,11 @@ class LakeReader(BagReader):
         return self.own.undecodable(channel)
 
     def decode(self, record: Record) -> object:
-        """Decodes a message as that of a file."""
+        """Decodes a message."""
         return self.own.decode(record)
 
     def definition(self, channel: Channel) -> Definition | None:
-        """Returns the fields of a channel's messages, as of that of a file."""
+        """Returns the fields of a channel's messages."""
         return self.own.definition(channel)
 
     def _records(
@@ -363,7 +373,7 @@ class LakeReader(BagReader):
             key=itemgetter(0, 1),
             reverse=step < 0,
         )
-        yield from (record for *_, record in merged)
+        yield from (record for _, _, record in merged)
 
     def _batches(
         self, bag: LakeBag, topics: Collection[str], window: TimeWindow, bare: Collection[str] = ()
@@ -390,18 +400,18 @@ class LakeReader(BagReader):
                 yield batch if inside.all() else batch.taken(inside)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
-        """Returns the channels of a bag; those of the bags beside it are read with it, and cached.
+        """Returns the channels of a bag; those of its group are read and cached with it.
 
         Raises:
-            BagVanishedError: it is not in the lake any more.
+            BagVanishedError: the bag is not in the lake any more.
         """
         known = self.index.lake.channels
         heads = cast("Sequence[_Head] | None", known.get((bag.bag_id, bag.file.sidecar_ns)))
         if heads is None:
             heads_by_bag = self._read_heads(bag)
-            for bag_id, read in heads_by_bag.items():
-                size_bytes = _HEAD_BYTES * (1 + len(read))
-                known.put((bag_id, bag.together[bag_id]), read, size_bytes)
+            for bag_id, of_bag in heads_by_bag.items():
+                size_bytes = _HEAD_BYTES * (1 + len(of_bag))
+                known.put((bag_id, bag.group[bag_id]), of_bag, size_bytes)
             heads = heads_by_bag[bag.bag_id]
         if not heads and bag.file.summary.count:
             # Deleted, or replaced under another id, since the index of this robot was read.
@@ -409,9 +419,9 @@ class LakeReader(BagReader):
         return heads
 
     def _read_heads(self, bag: LakeBag) -> dict[str, list[_Head]]:
-        """Returns the channels of a bag and of those that are read with it, by the ids of bags."""
-        heads_by_bag: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
-        rows = self._rows(bag, [*bag.together], _HEADS).to_pylist()
+        """Returns the channels of the bags of a group, by their ids."""
+        heads_by_bag: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.group}
+        rows = self._rows(bag, [*bag.group], _HEADS).to_pylist()
         for row in sorted(rows, key=itemgetter("channel")):
             schema = Schema(row["type"], row["schema_encoding"], row["schema"])
             metadata = tuple((key, value) for key, value in json.loads(row["metadata"]))
@@ -421,42 +431,54 @@ class LakeReader(BagReader):
         return heads_by_bag
 
     def _packed_of(self, bag: LakeBag, number: int, topics: Sequence[str]) -> bytes | None:
-        """Returns the packed messages of a channel; None where they are gone.
+        """Returns the packed messages of a channel; None if they are gone.
 
-        With it those of other `topics` are read, which are asked for next. Who has read one bag
-        and goes on, reads those beside it, too, as many as may be in memory.
+        All `topics` are read at once, since they are asked for next.
         """
         messages = self.index.lake.messages
-        packed = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
+        wanted = (bag.bag_id, bag.file.sidecar_ns, number)
+        packed = messages.get(wanted)
         if packed is None:
-            beside = (messages.get((*state, number)) for state in bag.together.items())
-            largest = max(map(len, filter(None, beside)), default=_NEAR_BYTES + 1)
-            near, ids = _NEAR_BYTES // (largest * len(topics)), [*bag.together]
-            at = ids.index(bag.bag_id)
-            bags = ids[max(at - near, 0) : at + near + 1]
-            for row in self._rows(bag, bags, _PACKED, topics).to_pylist():
-                key = (row["bag_id"], bag.together[row["bag_id"]], row["channel"])
+            bag_ids = self._ids_to_read(bag, number, len(topics))
+            for row in self._rows(bag, bag_ids, _PACKED, topics).to_pylist():
+                key = (row["bag_id"], bag.group[row["bag_id"]], row["channel"])
                 messages.put(key, row["packed"], len(row["packed"]))
-                if key == (bag.bag_id, bag.file.sidecar_ns, number):
+                if key == wanted:
                     packed = row["packed"]
         return packed
 
+    def _ids_to_read(self, bag: LakeBag, number: int, topics: int) -> list[str]:
+        """Returns a bag's id, and those of as many bags beside it as `_NEAR_BYTES` may hold.
+
+        The size is judged by the channel in bags of the group that were read before. If none was,
+        the bag is read alone: the next one may not be asked for.
+        """
+        largest = 0
+        for bag_id, state in bag.group.items():
+            largest = max(
+                largest, len(self.index.lake.messages.get((bag_id, state, number)) or b"")
+            )
+        near = _NEAR_BYTES // (largest * topics) if largest else 0
+        ids = [*bag.group]
+        at = ids.index(bag.bag_id)
+        return ids[max(at - near, 0) : at + near + 1]
+
     def _rows(
-        self, bag: LakeBag, bags: list[str], columns: Sequence[str], topics: Sequence[str] = ()
+        self, bag: LakeBag, bag_ids: list[str], columns: Sequence[str], topics: Sequence[str] = ()
     ) -> pa.Table:
-        """Returns the channels of some bags of a day, of some topics or of all, in no order."""
-        first, last = min(bags), max(bags)
+        """Returns the rows of bags of one day in `channels`; `topics`: of these alone."""
+        first, last = min(bag_ids), max(bag_ids)
         of_day = self.index.lake.days("channels").get(self.index.robot, {}).get(bag.day, ())
         files = [file for file in of_day if file.first <= last and first <= file.last]
         bag_id = pc.field("bag_id")
         # The bounds let Arrow pass over groups of rows.
-        wanted = (bag_id >= first) & (bag_id <= last) & bag_id.isin(bags)
+        wanted = (bag_id >= first) & (bag_id <= last) & bag_id.isin(bag_ids)
         if topics:
             wanted &= pc.field("topic").isin(topics)
         return self.index.lake.rows("channels", files, columns, wanted)
 
 
 def _in_order(batch: Batch, step: int) -> Iterator[tuple[Ns, int, Record]]:
-    """Yields time, place and record of each message, with a `step` of -1 from the last one on."""
+    """Yields log time, place in the file and record of each message; a step of -1 goes back."""
     times, places = batch.log_times[::step].tolist(), batch.places[::step].tolist()
     return zip(times, places, map(batch.record, range(len(times))[::step]), strict=True)

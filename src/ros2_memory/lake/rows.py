@@ -1,8 +1,8 @@
-"""The rows of closed bags.
+"""Makes the rows of closed bags.
 
-The bag is the one that the memory sees: messages that count in another recording are left out, as
-in answers. Its channels are the robot's own bytes: whatever is asked of them is asked as of the
-bag, by a later version, too. All other rows are for people, and follow from the same memory.
+The rows are of the bag as the memory sees it: messages that count in another recording are left
+out, as in answers. `channels` has the robot's own bytes, so that a later version, too, answers from
+it as from the bag. All other rows are for people, and are derived from the same memory.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -61,17 +61,19 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.units import Rows
+    from ros2_memory.history.detections import Detected
     from ros2_memory.storage.base import Batch, Channel, IntArray
 
 _MOST_OF_MESSAGE: Final = 512
-"""Packed bytes of each message on average; of a channel with more the lake has the times alone."""
+"""The lake has only the times of a channel whose messages take more packed bytes on average, ..."""
 _LEAST_OF_CHANNEL: Final = 16 << 10
-"""A channel may take this, however few its messages are: a description, a map of a room."""
+"""... unless the channel takes less than this, such as a robot description or a map of a room."""
 _MOST_BYTES: Final = 64 << 20
-"""Payloads of a bag that are in memory at once; beyond it the largest channel goes first."""
+"""Payloads of a bag that are in memory at once; beyond it the largest channel is dropped first."""
 _MAP_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"}
 """The map of `messages` that has values of a type."""
 _LARGEST: Final = 1 << 63
+"""The first integer beyond those of Iceberg."""
 _NO_SCORE: Final = -1
 _NOWHERE: Final = (math.nan, math.nan)
 _MM: Final = 1000.0
@@ -81,41 +83,57 @@ _Rows: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.int64]]"
 
 
 def bag_id_of(robot: str, recording: str, file: str, first: Ns) -> str:
-    """Returns the id of a bag: of its robot, its recording, its file's name and its first message.
+    """Returns the id of a bag, a hash of its robot, recording, file name and first log time.
 
-    So it is the same wherever the bag is copied to, also into a saved moment, and another one for
-    another bag of the same name. Its size is no part of it: a bag of which messages were deleted
-    by request is the same bag with less in it. `first` is the log time of the first message in the
-    file, whether it counts there or in another recording. The id begins with it, so that the files
-    of a table that can hold a bag are few: ids of one time lie side by side.
+    It is the same for a copy of the bag, as in a saved moment, and another one for another bag of
+    the same name. It does not depend on the size: a bag is the same after messages were forgotten.
+    `first` is the log time of the first message in the file, whether it counts there or in another
+    recording. The id begins with it, so that few files of a table have ids of one time.
     """
     return f"{max(first, 0):016x}{_digest([robot, recording, file, first])}"
 
 
 def _digest(value: object) -> str:
-    """Returns half of the hash of a JSON value."""
+    """Returns the first half of the SHA-256 of a JSON value, in hexadecimal."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def sha256_of(path: Path) -> str:
-    """Returns the hash of a file's bytes.
+    """Returns the SHA-256 of a file's bytes, in hexadecimal.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with path.open("rb", buffering=0) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+class _BagEvents(NamedTuple):
+    """The events of a bag as rows, and the topics that may have detections in it."""
+
+    rows: list[Row]
+    topics: list[str]
+
+
+class _Derived(NamedTuple):
+    """What rows of bags that lie close together are made of."""
+
+    window: TimeWindow
+    poses: Mapping[str, Poses]
+    events: Mapping[str, _BagEvents]
+    things: Mapping[BagFile, Sequence[Row]]
+    detections: Mapping[BagFile, Mapping[str, Sequence[Rows]]]
+
+
 class RowMaker:
     """Makes the rows of a robot's bags, all as one call sees the memory.
 
-    Who makes many takes a new one from time to time: it remembers what it has read.
+    It keeps what it has read, so a long run takes a new one from time to time.
 
-    Attributes:
-        memory: over the bag directory.
+    Args:
+        memory: the memory over the bag directory.
         config: names the settings that rows depend on.
-        whole: topics whose messages are shipped, whatever they take.
+        whole: the topics whose messages are shipped whatever they take.
     """
 
     def __init__(self, memory: Memory, config: str, whole: Collection[str]) -> None:
@@ -131,7 +149,10 @@ class RowMaker:
         These are the messages that count, the handovers of its recording, the static transforms in
         force, the pose topic, the spellings of labels, the settings and the topics shipped whole.
         """
-        counted = [*map(attrgetter("topic", "type", "count", "first", "last"), bag.summary.topics)]
+        counted = [
+            (topic.topic, topic.type, topic.count, topic.first, topic.last)
+            for topic in bag.summary.topics
+        ]
         sessions = self._view.sessions
         recordings = sessions.lending_to(bag.recording, bag.end)
         statics = repr(static_at(sessions.static(recordings), bag.end))
@@ -142,62 +163,77 @@ class RowMaker:
         return _digest([*settings, statics, sorted(self._whole), counted, *joined])
 
     def rows(self, bags: Mapping[BagFile, ShippedBag]) -> dict[str, pa.Table]:
-        """Returns the rows of some bags, which lie close together in time, by table.
+        """Returns the rows of bags, which lie close together in time, by table.
 
         Raises:
-            BagError: one of them, or a part of it, cannot be read.
+            BagError: a bag, or a part of it, cannot be read.
         """
         rows: dict[str, list[Row]] = {name: [] for name in TABLES}
+        derived = self._derive(bags)
+        for bag, shipped in bags.items():
+            keys = {name: getattr(shipped, name) for name in KEYS}
+            for name, of_table in self._rows_of_bag(bag, shipped, derived).items():
+                rows[name] += ({**keys, **row} for row in of_table)
+        return {name: table.filled(rows[name]) for name, table in TABLES.items()}
+
+    def _derive(self, bags: Collection[BagFile]) -> _Derived:
+        """Reads the poses, events, things and detections of all bags at once."""
         window = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
         files = {bag.file for bag in bags}
-        posed = scan(self._view, self._view.pose_topic, window, copies=True)
-        poses = poses_by_bag(self._view, posed, files)
+        pose_rows = scan(self._view, self._view.pose_topic, window, copies=True)
         events = self._events(window, files)
         things: dict[BagFile, list[Row]] = defaultdict(list)
         for bag, frame, sights in self._sight_reader.sights_by_bag([*bags]):
             things[bag] += self._things(frame, sights)
-        seen: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
-        for topic in dict.fromkeys(chain(*(topics for _, topics in events.values()))):
-            among = {file for file, (_, topics) in events.items() if topic in topics}
+        files_by_topic: dict[str, set[str]] = defaultdict(set)
+        for file, of_bag in events.items():
+            for topic in of_bag.topics:
+                files_by_topic[topic].add(file)
+        detections: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
+        for topic, among in files_by_topic.items():
             for rows_of_bags in scan(self._view, topic, window, copies=True):
                 for bag, positions in rows_of_bags.bag_rows(among):
-                    seen[bag][topic].append(rows_of_bags.some(positions))
-        for bag, shipped in bags.items():
-            tracks = self._tracks(bag, window)
-            map_frame, track = tracks[0] if tracks else (None, empty_track())
-            sightings, undecodable = self._sightings(seen[bag], map_frame, track)
-            driven, stood = self._driven(poses.get(bag.file))
-            joined = self._memory.index.joined_with(bag.recording)
-            of_bag_alone = {
-                "recording": bag.recording.name,
-                "messages": bag.summary.count,
-                "undecodable": undecodable,
-                "detections": len(sightings),
-                "pose_topic": self._view.pose_topic,
-                "map_frame": map_frame,
-                **driven,
-                "summary": bag.summary.schema.to_json(),
-                "counts": bag.summary.data,
-                "joined": "/".join(joined) or None,
-            }
-            made = {
-                "channels": self._channels(bag),
-                "poses": (row for of_frame in tracks for row in self._poses(*of_frame)),
-                "sightings": sightings,
-                "things": things[bag],
-                "events": (*stood, *events.get(bag.file, ([], ()))[0]),
-                "messages": self._messages(bag),
-                "bags": (shipped._asdict() | of_bag_alone,),
-            }
-            keys = {name: getattr(shipped, name) for name in KEYS}
-            for name, of_table in made.items():
-                rows[name] += ({**keys, **row} for row in of_table)
-        return {name: table.filled(rows[name]) for name, table in TABLES.items()}
+                    detections[bag][topic].append(rows_of_bags.some(positions))
+        poses = poses_by_bag(self._view, pose_rows, files)
+        return _Derived(window, poses, events, things, detections)
+
+    def _rows_of_bag(
+        self, bag: BagFile, shipped: ShippedBag, derived: _Derived
+    ) -> Mapping[str, Iterable[Row]]:
+        """Returns the rows of one bag by table, without the columns that all tables have."""
+        tracks = self._tracks(bag, derived.window)
+        map_frame, track = tracks[0] if tracks else (None, empty_track())
+        sightings, undecodable = self._sightings(derived.detections.get(bag, {}), map_frame, track)
+        driven, stops = self._driven(derived.poses.get(bag.file))
+        events = derived.events.get(bag.file)
+        joined = self._memory.index.joined_with(bag.recording)
+        of_bag_alone = {
+            "recording": bag.recording.name,
+            "messages": bag.summary.count,
+            "undecodable": undecodable,
+            "detections": len(sightings),
+            "pose_topic": self._view.pose_topic,
+            "map_frame": map_frame,
+            **driven,
+            "summary": bag.summary.schema.to_json(),
+            "counts": bag.summary.data,
+            "joined": "/".join(joined) or None,
+        }
+        return {
+            "channels": self._channels(bag),
+            "poses": (row for of_frame in tracks for row in self._poses(*of_frame)),
+            "sightings": sightings,
+            "things": derived.things.get(bag, ()),
+            "events": (*stops, *(events.rows if events else ())),
+            "messages": self._messages(bag),
+            "bags": (shipped._asdict() | of_bag_alone,),
+        }
 
     def _tracks(self, bag: BagFile, around: TimeWindow) -> list[tuple[str, RobotTrack]]:
-        """Returns the robot's track in the bag, with its frame: in the map, and in the poses' own.
+        """Returns the robot's track in the bag with its frame: in the map, and in the poses' frame.
 
-        The first of them has the place that other rows name. That `around` is made once.
+        Other rows take their places from the first track. Only the track of all bags, in the window
+        `around` them, is computed; that of one bag is cut out of it.
         """
         window = TimeWindow(bag.start, bag.end + 1)
         places = robot_places(self._view, window)
@@ -210,7 +246,7 @@ class RowMaker:
         return [(frame, track) for frame, track in tracks if len(track.times)]
 
     def _track(self, frame: str, *windows: TimeWindow) -> RobotTrack:
-        """Returns the track in the first of some windows in which all messages carry positions."""
+        """Returns the track in the first window in which all messages have positions."""
         reader = TrackReader(self._view, frame)
         for window in windows:
             with suppress(InvalidArgumentsError):
@@ -219,9 +255,9 @@ class RowMaker:
 
     def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:
         same = {"topic": self._view.pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
-        # In a track it goes on beyond half a turn, as it did since the first vertex.
-        turned = np.remainder(track.heading + math.pi, 2 * math.pi) - math.pi
-        heading = turned.round(_ANGLE_DIGITS)
+        # A track counts whole turns; here headings are from -pi to pi.
+        wrapped = np.remainder(track.heading + math.pi, 2 * math.pi) - math.pi
+        heading = wrapped.round(_ANGLE_DIGITS)
         begins, x, y = track.begins, track.x, track.y
         return _rows(same, time_ns=track.times, x=x, y=y, begins=begins, heading=heading)
 
@@ -246,7 +282,7 @@ class RowMaker:
         )
 
     def _driven(self, poses: Poses | None) -> tuple[Row, list[Row]]:
-        """Returns what the row of a bag has of its poses, and their standstills and drops."""
+        """Returns columns of `bags` that follow from poses, and standstills and drops as events."""
         topic = self._view.pose_topic
         if poses is None:
             return {}, []
@@ -272,7 +308,11 @@ class RowMaker:
         return {**driven, "stood_s": unix_from_ns(stood_ns)}, events
 
     def _channels(self, bag: BagFile) -> Iterator[Row]:
-        """Yields the channels, by topic. A bag with damage anywhere is not shipped as if whole."""
+        """Yields the channels, by topic.
+
+        Raises:
+            BagError: the bag is damaged; it is not shipped as if it were whole.
+        """
         # By identity, since hashing a channel hashes its definition.
         by_channel: dict[int, _Messages] = {}
         topics = {topic.topic for topic in bag.summary.topics}
@@ -287,8 +327,8 @@ class RowMaker:
         order = sorted(by_channel.values(), key=attrgetter("channel.topic", "channel.type"))
         times = [np.unique(np.concatenate(messages.parts, 1)[0]) for messages in order]
         none = np.empty(0, np.int64)
-        moments, channels = np.unique(np.concatenate([none, *times]), return_counts=True)
-        tied = moments[channels > 1]
+        log_times, channels = np.unique(np.concatenate([none, *times]), return_counts=True)
+        tied = log_times[channels > 1]
         for number, messages in enumerate(order):
             yield messages.row(number, tied)
 
@@ -302,79 +342,88 @@ class RowMaker:
         sightings, undecodable = list[Row](), 0
         for topic, of_topic in rows_of_topics.items():
             times = np.sort(np.concatenate([rows.times for rows in of_topic]))
-            left = [*of_topic]
-            for rows in left:
-                detected = self._detections.of(rows)
-                lost = len(rows) - len(detected.log_times)
-                if lost and len(rows) > 1 and rows.ranks.any():
-                    # Which of those of one log time are lost shows where they are read alone.
-                    tied = np.isin(rows.times, rows.times[rows.ranks > 0])
-                    alone = map(rows.some, np.flatnonzero(tied)[:, np.newaxis])
-                    left += [rows.some(np.flatnonzero(~tied)), *alone]
-                    continue
-                undecodable += lost
-                number = np.searchsorted(times, detected.log_times)
-                number += 0 if lost else rows.ranks
-                found, at = detected.found, detected.found.rows
-                places = [place_at(track, time) for time in detected.log_times.tolist()]
-                robot_x, robot_y = (
-                    np.array([place or _NOWHERE for place in places]).reshape(-1, 2).T
-                )
-                labels, (x, y, z) = found.labels.values(), found.places.T
-                sightings += _rows(
-                    {"topic": topic, "type": rows.table.channel.type},
-                    time_ns=detected.log_times[at],
-                    message=number[at],
-                    label=labels,
-                    thing=map(self._thing, labels),
-                    score=found.scores,
-                    frame_id=found.frames.values(),
-                    x=x,
-                    y=y,
-                    z=z,
-                    robot_frame=[frame if places[message] else None for message in at.tolist()],
-                    robot_x=robot_x[at],
-                    robot_y=robot_y[at],
-                )
+            for rows, detected in chain.from_iterable(map(self._detected, of_topic)):
+                undecodable += len(rows) - len(detected.log_times)
+                same = {"topic": topic, "type": rows.table.channel.type}
+                message = np.searchsorted(times, detected.log_times)
+                if len(rows) == len(detected.log_times):
+                    message += rows.ranks
+                sightings += self._sighting_rows(same, detected, message, frame, track)
         return sightings, undecodable
+
+    def _detected(self, rows: Rows) -> Iterator[tuple[Rows, Detected]]:
+        """Yields rows with their detections; rows of one log time one by one if any is undecodable.
+
+        Only then it shows which of the messages of this log time is undecodable.
+        """
+        detected = self._detections.of(rows)
+        lost = len(rows) - len(detected.log_times)
+        if lost and len(rows) > 1 and rows.ranks.any():
+            tied = np.isin(rows.times, rows.times[rows.ranks > 0])
+            parts = [np.flatnonzero(~tied), *np.flatnonzero(tied)[:, np.newaxis]]
+            for part in map(rows.some, parts):
+                yield part, self._detections.of(part)
+        else:
+            yield rows, detected
+
+    def _sighting_rows(
+        self, same: Row, detected: Detected, message: IntArray, frame: str | None, track: RobotTrack
+    ) -> Iterator[Row]:
+        """Yields a row for each detection; `message` is the number of each message in its topic."""
+        found, at = detected.found, detected.found.rows
+        places = [place_at(track, time) for time in detected.log_times.tolist()]
+        robot_x, robot_y = np.array([place or _NOWHERE for place in places]).reshape(-1, 2).T
+        labels, (x, y, z) = found.labels.values(), found.places.T
+        return _rows(
+            same,
+            time_ns=detected.log_times[at],
+            message=message[at],
+            label=labels,
+            thing=map(self._thing, labels),
+            score=found.scores,
+            frame_id=found.frames.values(),
+            x=x,
+            y=y,
+            z=z,
+            robot_frame=[frame if places[row] else None for row in at.tolist()],
+            robot_x=robot_x[at],
+            robot_y=robot_y[at],
+        )
 
     def _messages(self, bag: BagFile) -> Iterator[Row]:
         """Yields the messages of the topics that are shipped whole."""
         reader, extractor = self._memory.reader, self._memory.extractor
         numbers = Counter[str]()
         topics = {*self._whole}.intersection(topic.topic for topic in bag.summary.topics)
-        for record in reader.records(bag.path, topics, TimeWindow.everything()) if topics else ():
+        if not topics:
+            return
+        for record in reader.records(bag.path, topics, TimeWindow.everything()):
             topic, kind = record.channel.topic, record.channel.type
             try:
-                value = taken_apart(extractor.exact(reader.decode(record), kind))
+                value = _split_value(extractor.exact(reader.decode(record), kind))
             except UndecodableError as error:
                 value = {"undecodable": error.reason}
             times = {"time_ns": record.log_time, "publish_ns": record.publish_time}
             yield {"topic": topic, "type": kind, **times, "message": numbers[topic], **value}
             numbers[topic] += 1
 
-    def _events(
-        self, window: TimeWindow, files: Collection[str]
-    ) -> dict[str, tuple[list[Row], list[str]]]:
-        """Returns the events in each of some bags, and the topics that may have detections there.
-
-        By their files.
-        """
-        found: dict[str, tuple[list[Row], list[str]]] = defaultdict(lambda: ([], []))
+    def _events(self, window: TimeWindow, files: Collection[str]) -> dict[str, _BagEvents]:
+        """Returns the events of bags by file."""
+        events_by_file: dict[str, _BagEvents] = {}
         for topic in self._view.timeline.topics():
             types = self._view.timeline.types_of(topic)
             if not any(map(has_events, types)):
                 continue
             may_be_seen = any(map(may_have_detections, types))
             tables = scan(self._view, topic, window, copies=True)
-            for file, of_bag in events_by_bag(self._view, tables, files).items():
-                events = of_bag.limited(MAX_PER_BAG, MAX_PER_BAG)
-                rows, seen = found[file]
-                rows += self._events_of(topic, events)
-                # What the events of a topic rule out is not decoded.
+            for file, all_events in events_by_bag(self._view, tables, files).items():
+                events = all_events.limited(MAX_PER_BAG, MAX_PER_BAG)
+                of_bag = events_by_file.setdefault(file, _BagEvents([], []))
+                of_bag.rows.extend(self._events_of(topic, events))
+                # A topic whose events show no detections is not decoded.
                 if may_be_seen and (events.visible.size or events.left_out):
-                    seen.append(topic)
-        return found
+                    of_bag.topics.append(topic)
+        return events_by_file
 
     def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
         for seen in events.visible.intervals():
@@ -391,7 +440,7 @@ class RowMaker:
 
 
 def _drop_payloads(channels: Collection[_Messages]) -> None:
-    """Drops payloads of the largest channels until `_MOST_BYTES` hold all; those whole stay."""
+    """Drops payloads of the largest channels that are not whole, down to `_MOST_BYTES` in all."""
     droppable = [messages for messages in channels if not messages.is_whole]
     while droppable and sum(messages.size for messages in channels) > _MOST_BYTES:
         largest = max(droppable, key=attrgetter("size"))
@@ -400,31 +449,35 @@ def _drop_payloads(channels: Collection[_Messages]) -> None:
 
 
 def _rows(same: Row, **columns: IntArray | NDArray[np.float64] | Iterable[object]) -> Iterator[Row]:
-    """Yields rows with what is the `same` in all, and a value of each column."""
+    """Yields rows with the values that are the `same` in all, and a value of each column."""
     values = (
         column.tolist() if isinstance(column, np.ndarray) else column for column in columns.values()
     )
-    return ({**same, **dict(zip(columns, row, strict=True))} for row in zip(*values, strict=True))
+    for row in zip(*values, strict=True):
+        yield {**same, **dict(zip(columns, row, strict=True))}
 
 
 def _event(topic: str, kind: str, first: Ns, text: str, **more: object) -> Row:
     return {"topic": topic, "kind": kind, "first_ns": first, "text": text, **more}
 
 
-def taken_apart(value: JsonValue) -> Row:
-    """Returns a value as `messages` has it: scalars in maps by dot-path, and `value`, JSON of else.
+def _split_value(value: JsonValue) -> Row:
+    """Returns a value as `messages` has it: maps of its scalars by dot-path, and `value`, as JSON.
 
-    In the JSON every scalar that a map has is null. So it is one text for all messages of a type
-    without lists, which Parquet stores once. Lists stay whole, and what has a dot in its name.
+    In the JSON every scalar that a map has is null. So the JSON is the same for all messages of a
+    type without lists, and Parquet stores it once. Lists, and fields with a dot in their name, stay
+    in the JSON.
     """
     scalars: dict[str, list[tuple[str, object]]] = {name: [] for name in _MAP_OF.values()}
 
-    def rest(inner: JsonValue, path: str) -> JsonValue:
+    def without_scalars(inner: JsonValue, path: str) -> JsonValue:
         if isinstance(inner, dict):
-            return {
-                name: part if "." in name or not name else rest(part, f"{path}.{name}".lstrip("."))
-                for name, part in inner.items()
-            }
+            left: dict[str, JsonValue] = {}
+            for name, part in inner.items():
+                has_path = name and "." not in name
+                inner_path = f"{path}.{name}" if path else name
+                left[name] = without_scalars(part, inner_path) if has_path else part
+            return left
         kind = _MAP_OF.get(type(inner))
         is_large = type(inner) is int and not -_LARGEST <= inner < _LARGEST
         if kind is None or not path or is_large:
@@ -432,16 +485,19 @@ def taken_apart(value: JsonValue) -> Row:
         scalars[kind].append((path, inner))
         return None
 
-    text = json.dumps(rest(value, ""), ensure_ascii=False, separators=(",", ":"))
+    text = json.dumps(without_scalars(value, ""), ensure_ascii=False, separators=(",", ":"))
     return {**scalars, "value": text}
 
 
 @dataclass(slots=True, eq=False)
 class _Messages:
-    """The messages of a channel. `payloads`: None where they are not shipped; `size`: of these.
+    """The messages of a channel.
 
-    `is_whole`: they are shipped whatever they take; of other images, clouds, scans and the like,
-    the times alone are. `parts`: their log times, places and publish times.
+    Attributes:
+        is_whole: whether the payloads are shipped whatever they take.
+        payloads: the payloads; None if only the times are shipped.
+        parts: log times, places and publish times, as rows of arrays.
+        size: the bytes of the payloads.
     """
 
     channel: Channel
@@ -451,7 +507,7 @@ class _Messages:
     size: int = 0
 
     def add(self, batch: Batch) -> None:
-        """Takes more messages."""
+        """Adds more messages."""
         self.parts.append(np.stack((batch.log_times, batch.places, batch.publish_times)))
         if self.payloads is not None:
             buffer, starts, sizes = batch.buffer, batch.starts, batch.sizes
@@ -460,25 +516,30 @@ class _Messages:
             self.size += int(batch.sizes.sum())
 
     def row(self, number: int, tied: IntArray) -> Row:
-        """Returns its row, the n-th of the bag; without payloads where these take too much.
+        """Returns the row of channel `number` of the bag; without payloads if these are too large.
 
-        `tied`: log times of which several channels have messages.
+        `tied` are the log times at which several channels have messages.
         """
         times, channel = np.concatenate(self.parts, 1), self.channel
         order = np.lexsort((times[1], times[0]))
         logged, places, published = times[:, order]
-        payloads = self.payloads and [self.payloads[nth] for nth in order.tolist()]
-        order_counts = places if np.isin(logged, tied).any() else None
-        packed = packed_messages(logged, published, payloads, order_counts)
+        payloads = None
+        if self.payloads is not None:
+            payloads = [self.payloads[position] for position in order.tolist()]
+        needed_places = places if np.isin(logged, tied).any() else None
+        packed = packed_messages(logged, published, payloads, needed_places)
         most = max(_MOST_OF_MESSAGE * len(logged), _LEAST_OF_CHANNEL)
         if payloads is not None and not self.is_whole and len(packed) > most:
             payloads = None
-            packed = packed_messages(logged, published, None, order_counts)
-        schema = {"schema_encoding": channel.schema.encoding, "schema": channel.schema.text}
+            packed = packed_messages(logged, published, None, needed_places)
         return {
-            **{name: getattr(channel, name) for name in ("topic", "type", "encoding", "latched")},
+            "topic": channel.topic,
+            "type": channel.type,
+            "encoding": channel.encoding,
+            "latched": channel.latched,
             "channel": number,
-            **schema,
+            "schema_encoding": channel.schema.encoding,
+            "schema": channel.schema.text,
             "metadata": json.dumps(channel.metadata),
             "messages": len(logged),
             "first_ns": int(logged[0]),

@@ -1,12 +1,12 @@
 """Answers one SELECT over the tables of a lake, in a process of its own.
 
-The statement may be anybody's. Inside of a server `repeat('x', 1e9)` would take memory that DuckDB
-does not count, and not end when it is interrupted. This process has a limit of its address space,
-no disk to write to, and ends when its time is up. DuckDB may open no file there: Arrow reads the
+The statement is not trusted. In a server, `repeat('x', 1e9)` would take memory that DuckDB does not
+count, and would not end when it is interrupted. This process has a limit of its address space,
+cannot write files, and ends when its time is up. DuckDB may open no file there: Arrow reads the
 files of the robots that the client may ask about.
 
-What a statement does is taken from its parse tree: it reads tables of the lake, its own common
-table expressions, and functions that make rows of numbers or lists.
+The parse tree of a statement is checked. It may read tables of the lake, its own common table
+expressions, and functions that make rows of numbers or lists.
 """
 
 from __future__ import annotations
@@ -54,17 +54,17 @@ _PROGRAM_MB: Final = 1024
 """Address space that Python, Arrow and the stacks of threads take beside DuckDB's memory."""
 _PROGRAM: Final = f"from {__name__} import main; main()"
 ALLOCATORS: Final = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2"}
-"""By default those of Arrow and of C reserve 2 GB of addresses for its threads."""
+"""The default allocators of Arrow and of C reserve 2 GB of addresses for the threads."""
 _WITHOUT_MEMORY: Final = (signal.SIGABRT, signal.SIGBUS, signal.SIGKILL, signal.SIGSEGV)
-"""Signals that end code of C which gets no memory, or come from a system that has none left."""
-_LOOKED_AGAIN_S: Final = 0.1
+"""Signals that end C code which gets no memory, or come from a system that has none left."""
+_DEADLINE_CHECK_S: Final = 0.1
 _LONGEST_S: Final = 86_400.0
-"""How long a statement may take for which nobody set a time."""
+"""How long a statement without a time limit may take."""
 _BATCH_ROWS: Final = 256
 _VIEWS_OF_ENGINE: Final = (
     "SELECT view_name FROM duckdb_views() WHERE internal AND schema_name <> 'information_schema'"
 )
-"""Views that a name without a schema finds."""
+"""Lists DuckDB's own views that a name without a schema finds."""
 _MOST_REASON_CHARS: Final = 500
 _TABLE_FUNCTIONS: Final = frozenset({"unnest", "range", "generate_series"})
 _OF_THE_ENGINE: Final = (
@@ -72,7 +72,7 @@ _OF_THE_ENGINE: Final = (
     *("json_serialize", "json_deserialize", "json_execute", "nextval", "currval", "setval"),
     *("sleep_ms", "write_log", "txid_", "current_query", "current_transaction", "current_conn"),
 )
-"""Functions that begin so are about this process, not about the lake."""
+"""Beginnings of the names of functions that are about this process, not about the lake."""
 _NODES: Final = frozenset(
     {
         *("SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE", "SHOW_REF"),
@@ -81,7 +81,7 @@ _NODES: Final = frozenset(
         *("ORDER_DEFAULT", "ASCENDING", "DESCENDING"),
     }
 )
-"""Kinds of nodes, besides expressions, that a SELECT has: others write, or read something else."""
+"""Types of nodes, besides expressions, in a SELECT; others write, or read something else."""
 
 _ERRORS: Final[Mapping[str, type[EpisodicError]]] = {
     error.code: error for error in (InvalidArgumentsError, RefusedError)
@@ -91,7 +91,7 @@ _LOGGED: Final = "the server's log has the reason"
 _OF_TEXT: Final = (duckdb.ParserException, duckdb.BinderException, duckdb.CatalogException)
 """Errors about the text of a statement; others may be about a value."""
 _OF_VALUES: Final = (OverflowError, RecursionError, TypeError, ValueError)
-"""Errors about values that Python or JSON has not."""
+"""Errors about values that Python or JSON does not have."""
 
 Node: TypeAlias = "dict[str, JsonValue]"
 """A node of a parse tree."""
@@ -100,14 +100,14 @@ log = get_logger(__name__)
 
 
 class TableFiles(NamedTuple):
-    """The rows of a table that are read: all of some Parquet files.
+    """The Parquet files of a table whose rows a statement sees.
 
     Attributes:
-        schema: the columns; a file that lacks one has nulls there.
-        paths: of the files.
-        scheme: of the store that has them.
-        host: of that store, or its bucket.
-        properties: its settings, as pyiceberg names them.
+        schema: the columns of the table; a column that a file lacks is null in its rows.
+        paths: the paths of the files in their store.
+        scheme: the scheme of the store.
+        host: the host of the store, or its bucket.
+        properties: the settings of the store, as pyiceberg names them.
     """
 
     schema: pa.Schema
@@ -117,7 +117,7 @@ class TableFiles(NamedTuple):
     properties: Mapping[str, str] | None = None
 
     def dataset(self) -> dataset.Dataset:
-        """Returns the rows, which Arrow reads when it is asked for some."""
+        """Returns the rows as a dataset, which reads the files when rows are taken."""
         store: fs.FileSystem = fs.LocalFileSystem()
         if self.scheme != "file":
             # A server with a lake has imported all of this; the process of a statement has not.
@@ -130,14 +130,14 @@ class TableFiles(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Select:
-    """A statement, and within what it is answered.
+    """A statement and its limits.
 
     Attributes:
         sql: the statement.
         memory_mb: how much memory DuckDB may use.
-        threads: how many threads; None for one for each core.
+        threads: how many threads DuckDB may use; None for one for each core.
         most_rows: how many rows are returned at most; None for all.
-        most_chars: how long the JSON of them all may be.
+        most_chars: how long the JSON of all rows may be; None for any length.
     """
 
     sql: str
@@ -147,12 +147,12 @@ class Select:
     most_chars: int | None = None
 
     def run(self, tables: Mapping[str, TableFiles], deadline: Deadline) -> Selected:
-        """Returns the rows, as a process finds them that ends with the deadline at the latest.
+        """Returns the rows, computed by a process that ends with the deadline at the latest.
 
         Raises:
             InvalidArgumentsError: it is no SELECT over these tables; the sentence has the reason.
-            QueryTimeoutError: its time was over.
-            RefusedError: a file cannot be read, or it needs more memory.
+            QueryTimeoutError: the time was over.
+            RefusedError: a file cannot be read, or the statement needs more memory.
         """
         left_s = min(deadline.left_s(), _LONGEST_S)
         request = pickle.dumps((self, tables, left_s))
@@ -165,13 +165,13 @@ class Select:
         )
         with process:
             try:
-                text = _printed(process, request, deadline)
+                text = _output_of(process, request, deadline)
             finally:
                 process.kill()
         if process.returncode:
             log.warning("lake_select_failed", reason=f"exit code {process.returncode}")
             lacks_memory = -process.returncode in _WITHOUT_MEMORY
-            reason = _too_much(self.memory_mb) if lacks_memory else f"it failed; {_LOGGED}"
+            reason = _memory_sentence(self.memory_mb) if lacks_memory else f"it failed; {_LOGGED}"
             raise RefusedError(reason)
         answer = json.loads(text)
         if "error" not in answer:
@@ -181,7 +181,11 @@ class Select:
         raise _ERRORS[answer["error"]](answer["reason"])
 
     def rows(self, tables: Mapping[str, TableFiles]) -> Selected:
-        """Returns the rows, as found in this process; raises as `run`."""
+        """Returns the rows, computed in this process.
+
+        Raises:
+            EpisodicError: see `run`.
+        """
         settings = {**_SETTINGS, "memory_limit": f"{self.memory_mb}MiB", "temp_directory": ""}
         if self.threads:
             settings["threads"] = str(self.threads)
@@ -192,29 +196,33 @@ class Select:
                     connection.register(name, files.dataset())
                 connection.execute("SET enable_external_access = false")
                 connection.execute("SET lock_configuration = true")
-                return self._taken(connection.sql(self.sql))
+                return self._read_rows(connection.sql(self.sql))
             except (duckdb.Error, OSError, *_OF_VALUES, MemoryError) as error:
-                raise self._explained(error, tables) from error
+                raise self._error_for(error, tables) from error
 
-    def _explained(self, error: Exception, tables: Mapping[str, TableFiles]) -> EpisodicError:
-        """Returns what to say of an error: what was asked is wrong, or it cannot be answered."""
+    def _error_for(self, error: Exception, tables: Mapping[str, TableFiles]) -> EpisodicError:
+        """Returns this program's error for one of DuckDB, Arrow or Python, without file names."""
         if isinstance(error, duckdb.OutOfMemoryException | MemoryError):
-            return RefusedError(_too_much(self.memory_mb))
+            return RefusedError(_memory_sentence(self.memory_mb))
         paths = (path for files in tables.values() for path in files.paths)
-        is_asked = isinstance(error, (duckdb.ProgrammingError, duckdb.DataError, *_OF_VALUES))
-        if not is_asked or any(path in str(error) for path in paths):
+        is_of_sql = isinstance(error, (duckdb.ProgrammingError, duckdb.DataError, *_OF_VALUES))
+        if not is_of_sql or any(path in str(error) for path in paths):
             return RefusedError(f"the lake cannot be read ({type(error).__name__}); {_LOGGED}")
         if isinstance(error, _OF_TEXT):
-            # What follows is advice on DuckDB.
+            # Further paragraphs are advice on DuckDB.
             reason, *_ = str(error).split("\n\n")
-            return InvalidArgumentsError(f"{_short(reason)}; {_there_are(tables)}")
+            return InvalidArgumentsError(f"{_short(reason)}; {_tables_clause(tables)}")
         # The sentence may repeat a recorded text.
         do = "cast it to VARCHAR, use TRY_CAST, or leave its row out"
         return InvalidArgumentsError(f"a value cannot be converted ({type(error).__name__}): {do}")
 
-    def _taken(self, found: duckdb.DuckDBPyRelation) -> Selected:
-        """Returns the rows that there is room for."""
-        reader = found.to_arrow_reader(_BATCH_ROWS)
+    def _read_rows(self, relation: duckdb.DuckDBPyRelation) -> Selected:
+        """Returns the first rows, within the limits.
+
+        Raises:
+            InvalidArgumentsError: not even the names of the columns are.
+        """
+        reader = relation.to_arrow_reader(_BATCH_ROWS)
         rows: list[list[JsonValue]] = []
         chars = sum(map(len, reader.schema.names))
         if self.most_chars is not None and chars > self.most_chars:
@@ -230,16 +238,20 @@ class Select:
         return Selected(reader.schema.names, rows)
 
 
-def _printed(process: subprocess.Popen[bytes], request: bytes, deadline: Deadline) -> bytes:
-    """Returns what a process prints about a request; raises QueryTimeoutError."""
-    given: bytes | None = request
+def _output_of(process: subprocess.Popen[bytes], request: bytes, deadline: Deadline) -> bytes:
+    """Sends a request to a process, and returns what it prints.
+
+    Raises:
+        QueryTimeoutError: the process has not ended at the deadline.
+    """
+    unsent: bytes | None = request
     while not deadline.expired():
         try:
-            text, _ = process.communicate(given, timeout=_LOOKED_AGAIN_S)
+            output, _ = process.communicate(unsent, timeout=_DEADLINE_CHECK_S)
         except subprocess.TimeoutExpired:
-            given = None
+            unsent = None  # the next call goes on sending
         else:
-            return text
+            return output
     do = "ask about fewer robots, days or columns"
     raise QueryTimeoutError(f"the select needs more than {deadline.budget_s:.3g} s: {do}")
 
@@ -250,28 +262,30 @@ def _rows_in(batch: pa.RecordBatch) -> Iterator[tuple[object, ...]]:
 
 
 def check_select(sql: str, tables: Collection[str], connection: duckdb.DuckDBPyConnection) -> None:
-    """Raises unless a text is one SELECT over some tables.
+    """Checks that a text is one SELECT over the tables.
 
     Raises:
-        InvalidArgumentsError: it is something else; the sentence names what.
+        InvalidArgumentsError: the text is something else; the sentence says what.
     """
     parsed = connection.execute("SELECT json_serialize_sql(?)", [sql]).fetchone()
     tree = json.loads(parsed[0]) if parsed else {}
     if tree.get("error") and tree["error_type"] != "not implemented":
-        raise InvalidArgumentsError(f"{_short(tree['error_message'])}; {_there_are(tables)}")
-    # Of other statements DuckDB has no tree.
+        raise InvalidArgumentsError(f"{_short(tree['error_message'])}; {_tables_clause(tables)}")
+    # DuckDB has no tree of other statements.
     if len(tree.get("statements", ())) != 1:
-        raise InvalidArgumentsError(f"one SELECT is answered; {_there_are(tables)}")
+        raise InvalidArgumentsError(f"one SELECT is answered; {_tables_clause(tables)}")
     nodes = [*_nodes(tree["statements"])]
-    own = {str(name).lower() for node in nodes for name in _expressions_of(node)}
-    of_engine = connection.execute(_VIEWS_OF_ENGINE)
-    # Outside of where it is defined, such a name would be that of DuckDB's own view.
-    own.difference_update(name for (name,) in of_engine.fetchall())
-    if refused := next(filter(None, (_refused(node, {*tables, *own}) for node in nodes)), None):
-        raise InvalidArgumentsError(f"{refused}; {_there_are(tables)}")
+    names = {str(name).lower() for node in nodes for name in _expressions_of(node)}
+    # Outside of its scope, the name of a common table expression may be that of DuckDB's own view.
+    names.difference_update(name for (name,) in connection.execute(_VIEWS_OF_ENGINE).fetchall())
+    names.update(tables)
+    for node in nodes:
+        if refusal := _refusal_of(node, names):
+            raise InvalidArgumentsError(f"{refusal}; {_tables_clause(tables)}")
 
 
 def _nodes(tree: JsonValue) -> Iterator[Node]:
+    """Yields all objects of a parse tree."""
     pending = [tree]
     while pending:
         node = pending.pop()
@@ -289,8 +303,8 @@ def _expressions_of(node: Node) -> Iterator[JsonValue]:
         yield from (entry["key"] for entry in entries if isinstance(entry, dict))
 
 
-def _refused(node: Node, names: Collection[str]) -> str | None:
-    """Returns what a node does that is not reading a lake, as a clause; None if it may stand."""
+def _refusal_of(node: Node, names: Collection[str]) -> str | None:
+    """Returns why a node is refused, as a clause; None if it may be executed."""
     kind, function = node.get("type"), str(node.get("function_name", "")).lower()
     if function.startswith(_OF_THE_ENGINE):
         return f"{abbreviate(function)} is not offered"
@@ -310,11 +324,11 @@ def _refused(node: Node, names: Collection[str]) -> str | None:
     return f"{kind} is not offered" if lists_tables or kind not in _NODES else None
 
 
-def _there_are(tables: Collection[str]) -> str:
+def _tables_clause(tables: Collection[str]) -> str:
     return f"the tables are {', '.join(tables)}"
 
 
-def _too_much(memory_mb: int) -> str:
+def _memory_sentence(memory_mb: int) -> str:
     return (
         f"the select needs more than {memory_mb} MiB (lake.engine.memory_mb): ask about fewer "
         "robots, days or columns"
@@ -326,9 +340,9 @@ def _short(reason: str) -> str:
 
 
 def _as_json(value: object) -> float | str:
-    """Returns a value of SQL that JSON has not: a decimal, bytes in hexadecimal, a time."""
+    """Returns a value of SQL as JSON has it: decimals, bytes in hexadecimal, times as text."""
     if isinstance(value, Decimal):
-        # A sum of integers is one, which a float would round.
+        # The sum of integers is a decimal, which a float would round.
         return int(value) if value == value.to_integral_value() else float(value)
     return value.hex() if isinstance(value, bytes) else str(value)
 
@@ -343,14 +357,14 @@ def main() -> None:
         (resource.RLIMIT_CORE, 0),
     ):
         resource.setrlimit(limit, (most, most))
-    # Nobody else ends this process if its parent is killed.
+    # If the parent is killed, nobody else ends this process.
     signal.setitimer(signal.ITIMER_REAL, max(left_s, 0.0) + 1.0)
     try:
-        found = select.rows(tables)
+        selected = select.rows(tables)
         # `asdict` would copy every value.
-        answer = {"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut}
+        answer = {"columns": selected.columns, "rows": selected.rows, "is_cut": selected.is_cut}
     except EpisodicError as error:
-        # The cause may name a path, which is for the log alone.
+        # The cause may name a path: it is only for the log.
         cause = _short(str(error.__cause__ or "")) if isinstance(error, RefusedError) else ""
         answer = {"error": error.code, "reason": str(error), "cause": cause}
     json.dump(answer, sys.stdout)

@@ -1,9 +1,9 @@
 """Ships closed bags into a lake, each exactly once.
 
-A bag is in the lake once it has a row in `bags`. For each batch, each table is overwritten where
-its rows are of the batch's bags, in one transaction: what an earlier attempt left there is replaced
-by the same rows. `bags` is committed last, then come the receipts. So a process that is killed
-anywhere, and one that runs again, leave every row once; only the lake is asked what is there.
+A bag is in the lake once it has a row in `bags`. For each batch, one transaction in each table
+replaces the rows of the batch's bags, also those that an earlier attempt left. `bags` is committed
+last, then the receipts are written. So every row is there once, even if a process is killed and
+runs again. Only the lake itself is asked what it has.
 """
 
 from __future__ import annotations
@@ -56,19 +56,27 @@ if TYPE_CHECKING:
 log = get_logger(__name__)
 
 MOST_BAGS: Final = 2_000
+"""Bags of one batch."""
 MOST_BYTES: Final = 64 << 20
-"""Of one batch: its rows are in memory, as Arrow has them, until it is committed."""
-_TOGETHER: Final = 64
-"""Bags whose rows are made together: what is read around one is that of the next."""
+"""Bytes of one batch, whose rows are in memory until it is committed."""
+_GROUP: Final = 64
+"""Bags whose rows are made at once: what is read around one bag is needed for the next."""
 PATIENCE_S: Final = 30.0
-"""How long a bag directory may take to show that it is there."""
+"""How long a bag directory may take to answer."""
 _BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
-"""A bag lies in the lake up to so far from where it begins and ends now: more of it counted."""
+"""The lake may have a bag with a begin or end so far away: more of its messages counted then."""
 
 
 @dataclass(slots=True)
 class Shipped:
-    """What a pass did: bags that were committed, forgotten, that wait, and what went wrong."""
+    """What a pass did.
+
+    Attributes:
+        bags: how many bags were committed, with so many `rows`.
+        forgotten: how many bags were deleted from the lake.
+        waiting: how many bags are not shipped yet since they are open, or too new.
+        problems: a sentence for each fault.
+    """
 
     bags: int = 0
     forgotten: int = 0
@@ -78,7 +86,7 @@ class Shipped:
 
 
 class _KnownState(NamedTuple):
-    """What was found out of a bag while it had a size, an mtime and sidecars.
+    """What is known of a bag while its size, mtime and sidecar are the same.
 
     `is_forgotten`: whether it has messages that were forgotten.
     """
@@ -89,7 +97,7 @@ class _KnownState(NamedTuple):
 
 
 class _BagToShip(NamedTuple):
-    """A bag, its row, and what the lake has of it, under other days and ids perhaps."""
+    """A bag, its row in `bags`, and the rows that it replaces, perhaps of other days and ids."""
 
     file: BagFile
     bag: ShippedBag
@@ -109,14 +117,14 @@ class Shipper:
     """Ships the bags of several robots into one lake, whose lock the caller holds.
 
     Args:
-        lake: its tables.
-        robots: whose bags are shipped.
-        clock: dates receipts.
-        tombstones: what was forgotten; a bag with a message of it is not shipped.
-        before_commit: called with whether the batch is full, else waits until one is allowed again.
+        lake: the tables of the lake.
+        robots: the robots whose bags are shipped.
+        clock: dates the receipts.
+        tombstones: what was forgotten; a bag with forgotten messages is not shipped.
+        before_commit: called with whether the batch is full; may wait with a small batch.
         alive: called for each bag.
-        most_bags: of one commit.
-        patience_s: a bag directory that takes longer to be looked into is passed over.
+        most_bags: how many bags a commit may have.
+        patience_s: a bag directory that takes longer to answer is passed over.
     """
 
     lake: LakeTables
@@ -134,7 +142,7 @@ class Shipper:
         self.look_again()
 
     def look_again(self) -> None:
-        """Has everything looked at again, in the bag directories and in the lake."""
+        """Makes the next pass look at all bags again, in the directories and in the lake."""
         for robot in self.robots:
             robot.look_again()
 
@@ -160,9 +168,9 @@ class Shipper:
         return done
 
     def keep_up(self, grace: Ns) -> None:
-        """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
+        """Compacts closed days, and deletes files that no version of `grace` ago or later needs.
 
-        What robots have stored of bags that are gone is deleted, too.
+        Stored columns of bags that are gone are deleted, too.
 
         Raises:
             LakeError: the lake cannot be read or written.
@@ -175,10 +183,12 @@ class Shipper:
         expire(self.lake, now - grace if grace else MAX_NS)
 
     def _forget(self, robot: RobotBags, done: Shipped) -> bool:
-        """Forgets what the robot's bag directory asks for; returns whether that is known.
+        """Deletes from the lake what was forgotten in a robot's bag directory.
+
+        Returns False if that is not known: then nothing of the robot may be shipped.
 
         Raises:
-            LakeError: the lake cannot be written; what is left is done when it is opened again.
+            LakeError: the lake cannot be written; it is finished when the lake is opened again.
         """
         if not robot.answers(self.patience_s):
             why = "does not answer: is its disk reachable? Until it does, nothing of it is shipped"
@@ -214,14 +224,13 @@ class Shipper:
             LakeError: the lake cannot be written; it is not known how far that came.
         """
         self.before_commit(is_full)
-        to_ship = [to_ship for ready in batch for to_ship in ready.bags]
-        bags = [bag for of_file in to_ship for bag in (of_file.bag, *of_file.replaced)]
-        # Few files have to be looked at for it.
+        to_ship = [to_ship for prepared in batch for to_ship in prepared.bags]
+        bags = [bag for one in to_ship for bag in (one.bag, *one.replaced)]
         condition = of_bags((bag.robot, bag.day, bag.bag_id) for bag in bags)
         rows = 0
         try:
             for name in TABLES:
-                whole = pa.concat_tables([ready.rows[name] for ready in batch])
+                whole = pa.concat_tables([prepared.rows[name] for prepared in batch])
                 rows += whole.num_rows
                 self.lake.replace(name, condition, whole)
         except LakeError:
@@ -230,27 +239,29 @@ class Shipper:
         done.bags += len(to_ship)
         done.rows += rows
         log.info("bags_shipped", bags=len(to_ship), rows=rows)
-        for robot, of_robot, _ in batch:
-            for bag in (bag for of_file in of_robot for bag in of_file.replaced):
-                robot.known.pop(bag.bag_id, None)
-            robot.confirm([of_file.bag for of_file in of_robot], self, done)
+        for prepared in batch:
+            robot = prepared.robot
+            for one in prepared.bags:
+                for bag in one.replaced:
+                    robot.known.pop(bag.bag_id, None)
+            robot.confirm([one.bag for one in prepared.bags], self, done)
 
 
 @dataclass(eq=False, repr=False)
 class RobotBags:
-    """One robot whose bags are shipped, and what is known of those that it has.
+    """One robot whose bags are shipped, and what is known of its bags.
 
-    `_states` has the newest state of each by its file, `known` what the lake has of them by their
-    ids, `_confirmed` those with a receipt; none has those that are gone: a hub runs for years.
+    `_states` has the newest state of each bag by its file, `known` the rows in the lake by id, and
+    `_confirmed` the bags with a receipt. Bags that are gone are dropped: a hub runs for years.
 
     Attributes:
-        name: the robot.
-        memory: over its bag directory.
+        name: the name of the robot.
+        memory: the memory over its bag directory.
         reader: reads whole files, also messages that count in another recording.
         config: names the settings that rows depend on.
-        messages: topics whose messages are shipped whole.
-        filling: stores the columns of bags before their rows are made of these; None: they are read
-            for each row anew.
+        messages: the topics whose messages are shipped whole.
+        filling: stores the columns of bags, of which their rows are made; None: the bags are read
+            for each kind of row anew.
     """
 
     name: str
@@ -262,9 +273,9 @@ class RobotBags:
     _looking: threading.Thread | None = field(default=None, init=False)
 
     def answers(self, patience_s: float) -> bool:
-        """Returns whether the bag directory can be looked into.
+        """Returns whether the bag directory can be listed.
 
-        One that hangs, as a mount does whose robot is gone, blocks one thread, however often asked.
+        A hanging mount, as of a robot that is gone, blocks one thread, however often it is asked.
         """
         if self._looking is None or not self._looking.is_alive():
             # A daemon: it must not keep the program from ending.
@@ -283,13 +294,13 @@ class RobotBags:
         return relative(bag.file, str(self.bag_dir))
 
     def look_again(self) -> None:
-        """Has everything looked at again."""
+        """Drops what is known of the bags."""
         self._states: dict[str, _KnownState] = {}
         self.known: dict[str, ShippedBag] = {}
         self._confirmed: set[ShippedBag] = set()
 
     def keep_up(self) -> None:
-        """Deletes what is stored of bags that are gone; looks whether the disk works again."""
+        """Deletes stored columns of bags that are gone; tries a store again whose disk failed."""
         snapshot = self.memory.index.snapshot()
         if self.filling is not None and snapshot.problem is None:
             self.filling.store.look_after()
@@ -297,9 +308,9 @@ class RobotBags:
             self.filling.prune(snapshot.timeline)
 
     def forget(self, times: Sequence[TimeWindow]) -> list[str]:
-        """Deletes what is stored of bags that have something of some times.
+        """Deletes the stored columns of bags that reach into the windows.
 
-        Returns why some of it may still be there.
+        Returns a sentence on columns that may still be there.
         """
         if self.filling is None or not times:
             return []
@@ -314,7 +325,7 @@ class RobotBags:
         return []
 
     def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBags]:
-        """Yields the bags that are to be shipped, the oldest first, with their rows."""
+        """Yields the bags to ship, the oldest first, with their rows."""
         snapshot = self.memory.index.refresh()
         if snapshot.problem is not None:
             done.problems.append(f"{self.name}: {snapshot.problem}")
@@ -325,12 +336,12 @@ class RobotBags:
         waiting = {bag.file: batch for batch in batches for bag in batch.bags}
         group: list[_BagToShip] = []
         for to_ship in self._to_ship(bags, shipper, done):
-            if group and not _are_made_together([*group, to_ship], shipper.most_bags):
-                yield from self._made(group, waiting, done)
+            if group and not _fit_in_group([*group, to_ship], shipper.most_bags):
+                yield from self._with_rows(group, waiting, done)
                 group = []
             group.append(to_ship)
         if group:
-            yield from self._made(group, waiting, done)
+            yield from self._with_rows(group, waiting, done)
         if self.filling is not None:
             self._cut_to_share(self.filling)
         self._drop_gone(bags)
@@ -338,42 +349,27 @@ class RobotBags:
     def _to_ship(
         self, bags: Sequence[BagFile], shipper: Shipper, done: Shipped
     ) -> Iterator[_BagToShip]:
-        """Yields those of some bags that are to be shipped; the others are confirmed at the end."""
+        """Yields the bags to ship; confirms the bags in the lake at the end."""
         by_file = {shipped.file: shipped for shipped in self.known.values()}
         receipts = cache(partial(read_receipts, self.bag_dir))
-        ids, confirmed = set[str](), list[ShippedBag]()
-        copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
-        # A saved moment's copy of a bag counts where the bag itself is gone.
-        for nth, bag in enumerate(sorted(bags, key=lambda bag: (bag.file in copies, bag.start))):
-            if nth % _TOGETHER == 0:
+        confirmed = list[ShippedBag]()
+        for number, (bag, bag_id) in enumerate(self._identified_bags(bags, shipper, done)):
+            if number % _GROUP == 0:
                 maker = RowMaker(self.memory, self.config, self.messages)
-            shipper.alive()
+            before, same_file = self.known.get(bag_id), by_file.get(self.name_of(bag))
             try:
-                bag_id, is_forgotten = self._identified(bag, shipper.tombstones)
-                before = self.known.get(bag_id)
-                if bag_id in ids or (before is not None and bag.file in copies):
-                    continue
-                if is_forgotten:
-                    do = "it is not shipped: delete it, or the messages, with ros2-memory forget"
-                    why = f"{bag.file} has messages that were forgotten in the lake; {do}"
-                    done.problems.append(f"{self.name}: {why}")
-                    continue
-                ids.add(bag_id)
-                same_file = by_file.get(self.name_of(bag))
                 if same_file is not None and _is_cut(same_file, bag, receipts):
                     continue
                 shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
             except (EpisodicError, OSError, ValueError) as error:
-                problem = f"{self.name}: {error}"
-                if problem not in done.problems:  # once where receipts cannot be read
-                    done.problems.append(problem)
+                self._report(error, done)
                 continue
-            # The rows of a copy are the same, which has another path and mtime.
+            # A copy with another path and mtime has the same rows.
             if before and before == shipped._replace(mtime_ns=before.mtime_ns, file=before.file):
                 confirmed.append(shipped)
                 continue
             replaced = {before} if before is not None else set()
-            # As where its first messages were deleted by request: what is left lies within it.
+            # It has another id if its first messages were forgotten; what is left lies within it.
             if same_file is not None and (
                 same_file.start_ns <= shipped.start_ns and shipped.end_ns <= same_file.end_ns
             ):
@@ -381,12 +377,43 @@ class RobotBags:
             yield _BagToShip(bag, shipped, [*replaced])
         self.confirm(confirmed, shipper, done)
 
-    def _made(
+    def _identified_bags(
+        self, bags: Sequence[BagFile], shipper: Shipper, done: Shipped
+    ) -> Iterator[tuple[BagFile, str]]:
+        """Yields the bags that may be in the lake with their ids, the oldest first, each bag once.
+
+        A moment's copy of a bag is left out if the bag itself is there, or in the lake.
+        """
+        ids: set[str] = set()
+        copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
+        for bag in sorted(bags, key=lambda bag: (bag.file in copies, bag.start)):
+            shipper.alive()
+            try:
+                state = self._known_state(bag, shipper.tombstones)
+            except (EpisodicError, OSError, ValueError) as error:
+                self._report(error, done)
+                continue
+            if state.bag_id in ids or (state.bag_id in self.known and bag.file in copies):
+                continue
+            if state.is_forgotten:
+                do = "it is not shipped: delete it, or the messages, with ros2-memory forget"
+                why = f"{bag.file} has messages that were forgotten in the lake; {do}"
+                done.problems.append(f"{self.name}: {why}")
+                continue
+            ids.add(state.bag_id)
+            yield bag, state.bag_id
+
+    def _report(self, error: Exception, done: Shipped) -> None:
+        problem = f"{self.name}: {error}"
+        if problem not in done.problems:  # receipts that cannot be read are so for each bag
+            done.problems.append(problem)
+
+    def _with_rows(
         self, group: Sequence[_BagToShip], waiting: dict[str, Batch], done: Shipped
     ) -> Iterator[_PreparedBags]:
-        """Yields bags with their rows; those of which rows cannot be made are reported.
+        """Yields bags with their rows; a bag whose rows cannot be made is reported.
 
-        `waiting`: what is yet to be stored, by the files of bags.
+        `waiting`: the batches whose columns are not stored yet, by the files of their bags.
         """
         if self.filling is not None:
             self._store(self.filling, [to_ship.file for to_ship in group], waiting)
@@ -401,7 +428,7 @@ class RobotBags:
                 done.problems.append(f"{self.name}: {error}")
                 return
             for alone in group:
-                yield from self._made([alone], waiting, done)
+                yield from self._with_rows([alone], waiting, done)
         else:
             yield _PreparedBags(self, group, rows)
 
@@ -410,9 +437,9 @@ class RobotBags:
         return maker.rows({to_ship.file: to_ship.bag for to_ship in group})
 
     def _store(self, filling: Filling, bags: Sequence[BagFile], waiting: dict[str, Batch]) -> None:
-        """Stores the columns of bags, and of those in the same parts, if they are `waiting`.
+        """Stores the columns of the batches that are `waiting` for these bags.
 
-        Not in memory, which the stores of many robots would fill, nor on a disk that fails.
+        It does not store them in memory, which many robots would fill, nor on a disk that fails.
         """
         if filling.store.path is None or filling.store.is_failing:
             return
@@ -426,13 +453,13 @@ class RobotBags:
                     waiting.pop(stored.file, None)
 
     def _cut_to_share(self, filling: Filling) -> None:
-        """Drops stored columns beyond what they may take; of their bags the rows are made."""
+        """Deletes stored columns beyond their share of the disk."""
         filling.whole_since()
         filling.thin()
         filling.trim()
 
     def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
-        """Returns the bags that change no more; reports the others."""
+        """Returns the closed bags that change no more; counts and reports the others."""
         now = self.memory.clock.now()
         closed = [
             bag
@@ -450,7 +477,7 @@ class RobotBags:
         return bags
 
     def _load_known(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
-        """Asks the lake what it has of the time of new bags.
+        """Reads the rows that the lake has of the time of new bags.
 
         Raises:
             LakeError: the lake cannot be read.
@@ -472,7 +499,7 @@ class RobotBags:
         self.known = {bag.bag_id: bag for bag in shipped}
         self._confirmed.intersection_update(shipped)
 
-    def _identified(self, bag: BagFile, tombstones: Collection[Tombstone]) -> tuple[str, bool]:
+    def _known_state(self, bag: BagFile, tombstones: Collection[Tombstone]) -> _KnownState:
         """Returns a bag's id, and whether it has forgotten messages; reads each state once."""
         state = (bag.size, bag.mtime_ns, bag.sidecar_ns)
         known = self._states.get(bag.file)
@@ -482,25 +509,37 @@ class RobotBags:
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
             bag_id = bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
-            of_robot = [tombstone for tombstone in tombstones if tombstone.robot == self.name]
-            forgotten = any(
-                tombstone.forbids(self.memory.reader, bag, bag_id) for tombstone in of_robot
+            is_forgotten = any(
+                tombstone.forbids(self.memory.reader, bag, bag_id)
+                for tombstone in tombstones
+                if tombstone.robot == self.name
             )
-            known = self._states[bag.file] = _KnownState(state, bag_id, forgotten)
-        return known.bag_id, known.is_forgotten
+            known = self._states[bag.file] = _KnownState(state, bag_id, is_forgotten)
+        return known
 
     def _row_of(
         self, bag: BagFile, bag_id: str, before: ShippedBag | None, made_of: str
     ) -> ShippedBag:
-        """Returns the row that a bag would have in `bags`; its file is hashed where it is new."""
-        is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
-        sha256 = before.sha256 if before is not None and is_read else sha256_of(bag.path)
-        file_columns = self.name_of(bag), bag.size, sha256, bag.mtime_ns
-        day = day_of(bag.start)
-        return ShippedBag(self.name, bag_id, day, *file_columns, made_of, bag.start, bag.end)
+        """Returns the row that a bag would have in `bags`. A file that has changed is hashed."""
+        if before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns):
+            sha256 = before.sha256
+        else:
+            sha256 = sha256_of(bag.path)
+        return ShippedBag(
+            robot=self.name,
+            bag_id=bag_id,
+            day=day_of(bag.start),
+            file=self.name_of(bag),
+            size=bag.size,
+            sha256=sha256,
+            mtime_ns=bag.mtime_ns,
+            made_of=made_of,
+            start_ns=bag.start,
+            end_ns=bag.end,
+        )
 
     def confirm(self, bags: Sequence[ShippedBag], shipper: Shipper, done: Shipped) -> None:
-        """Notes that bags are in the lake; writes receipts for the robot's recorder, if any."""
+        """Remembers that bags are in the lake, and writes receipts if a recorder made them."""
         self.known |= {bag.bag_id: bag for bag in bags}
         new = [bag for bag in bags if bag not in self._confirmed]
         if not (new and has_recorded(self.bag_dir)):
@@ -523,9 +562,9 @@ class RobotBags:
 def _is_cut(
     before: ShippedBag, bag: BagFile, receipts: Callable[[], Mapping[str, Receipt]]
 ) -> bool:
-    """Returns whether only retention took messages out of a bag after it was shipped.
+    """Returns whether retention alone took messages out of a bag after it was shipped.
 
-    The lake keeps those, as it keeps the bags that retention deletes.
+    The lake keeps these messages, as it keeps the bags that retention deletes.
     """
     if before.size == bag.size:
         return False
@@ -533,17 +572,20 @@ def _is_cut(
     return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
 
 
-def _are_made_together(bags: Sequence[_BagToShip], most: int) -> bool:
-    """Returns whether the rows of bags may be made at once: few, small, and close together."""
-    *_, before, last = (to_ship.file for to_ship in bags)
+def _fit_in_group(bags: Sequence[_BagToShip], most: int) -> bool:
+    """Returns whether the rows of bags may be made at once: few, small, and close in time.
+
+    All but the last bag are known to fit.
+    """
+    before, last = bags[-2].file, bags[-1].file
     return (
-        len(bags) <= min(most, _TOGETHER)
+        len(bags) <= min(most, _GROUP)
         and sum(to_ship.file.size for to_ship in bags) <= MOST_BYTES
         and before.start <= last.start <= before.end + PART_NS
     )
 
 
 def _list_one(folder: Path) -> None:
-    """Lists one entry of a folder, which takes as long as its disk does; errors are no matter."""
+    """Lists one entry of a folder; returns when its disk answers, even with an error."""
     with suppress(OSError), os.scandir(folder) as entries:
         next(entries, None)

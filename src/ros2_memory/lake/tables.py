@@ -1,10 +1,11 @@
-"""The Iceberg tables of a lake, as tables.yaml declares them: rows as Arrow tables, and which.
+"""The Iceberg tables of a lake, as tables.yaml declares them: rows as Arrow tables, and conditions.
 
-In the column `packed` are the messages of one channel of a bag: both times and the payload of each.
-Where another channel of the bag has a message of the same log time, their places in the file are
-there, too, which say the order.
-What the bytes are, once decompressed (numbers are little-endian and lie in planes, the lowest byte
-of each first, as they then compress best)::
+The column `packed` has the messages of one channel of a bag: both times and the payload of each
+message. If another channel of the bag has a message of the same log time, it also has the places of
+the messages in the file, for their order.
+
+The decompressed bytes are (numbers are little-endian and lie in planes, the lowest byte of each
+number first, since they compress best like this)::
 
     1       format: 1, or 2 with places
     1       0: times alone; 1: payloads, too
@@ -12,10 +13,10 @@ of each first, as they then compress best)::
     8 n     log times, each since the one before
     8 n     publish times, each since the log time
     8 n     places, each since the one before; only in format 2
-    4 n     the bytes of each payload
-    ...     the payloads, in planes where all have one size, else one after the other
+    4 n     the size of each payload
+    ...     the payloads: in planes if all have one size, else one after the other
 
-This is no derived data that a later version makes again: it is read for as long as the lake is.
+No later version makes these bytes again, so this format is read for ever.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ import yaml
 from pyiceberg import expressions as ex
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import schema_to_pyarrow
-from pyiceberg.partitioning import PartitionField, PartitionSpec
+from pyiceberg.partitioning import PARTITION_FIELD_ID_START, PartitionField, PartitionSpec
 from pyiceberg.schema import Schema as IcebergSchema
 from pyiceberg.table.sorting import SortField, SortOrder
 from pyiceberg.transforms import IdentityTransform
@@ -56,7 +57,7 @@ _PLACED: Final = 2
 _HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
 ROWS_VERSION: Final = 37
-"""Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
+"""The version of the rules that make rows of a bag. A change ships all bags again."""
 
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")
 _PROPERTIES: Final = {
@@ -65,7 +66,8 @@ _PROPERTIES: Final = {
 }
 _PARTITIONED_BY: Final = ("robot", "day")
 _ROW_GROUP: Final = 1 << 17
-_INNER_IDS: Final = 100
+_MAP_IDS: Final = 100
+"""The first field id for keys and values of maps; there are fewer columns."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class LakeTable:
 
     Attributes:
         name: its name in the namespace.
-        row: what a row of it is.
+        row: what a row stands for.
         columns: the type and the meaning of each column, in order.
         order: the columns that rows are sorted by.
         row_group: rows of a row group, so that engines skip those of other topics and labels.
@@ -91,25 +93,34 @@ class LakeTable:
         """Its columns for Iceberg, each with its meaning."""
         fields = []
         for number, (name, (kind, meaning)) in enumerate(self.columns.items(), 1):
-            # Parts of a map have ids that no column has.
-            ids = {"key-id": _INNER_IDS + 2 * number, "value-id": _INNER_IDS + 2 * number + 1}
-            of_map = {"key": "string", "value": kind.removeprefix("map "), "value-required": False}
-            form = {"type": "map", **ids, **of_map} if kind.startswith("map ") else kind
-            field = {"id": number, "name": name, "type": form, "doc": meaning}
+            iceberg_type: object = kind
+            if kind.startswith("map "):
+                iceberg_type = {
+                    "type": "map",
+                    "key-id": _MAP_IDS + 2 * number,
+                    "key": "string",
+                    "value-id": _MAP_IDS + 2 * number + 1,
+                    "value": kind.removeprefix("map "),
+                    "value-required": False,
+                }
+            field = {"id": number, "name": name, "type": iceberg_type, "doc": meaning}
             fields.append({**field, "required": name in KEYS})
         return IcebergSchema.model_validate({"type": "struct", "fields": fields})
 
     @cached_property
     def arrow_schema(self) -> pa.Schema:
         """Its columns for Arrow."""
-        # Without ids: those of a table in a catalogue are others.
+        # Without ids: a catalogue gives a table other ones.
         return schema_to_pyarrow(self.schema, include_field_ids=False)
 
     def create(self, catalog: IcebergCatalog, identifier: str) -> IcebergTable:
         """Creates the table, partitioned by robot and day, in the order that `sorted` makes."""
         ids = {name: self.schema.find_field(name).field_id for name in self.columns}
-        same, keys = IdentityTransform[Any](), enumerate(_PARTITIONED_BY)
-        parts = (PartitionField(ids[name], 1000 + nth, same, name) for nth, name in keys)
+        same = IdentityTransform[Any]()
+        parts = [
+            PartitionField(ids[name], field_id, same, name)
+            for field_id, name in enumerate(_PARTITIONED_BY, PARTITION_FIELD_ID_START)
+        ]
         return catalog.create_table(
             identifier,
             self.schema,
@@ -123,7 +134,7 @@ class LakeTable:
         return rows.sort_by([(name, "ascending") for name in self.order])
 
     def filled(self, rows: Iterable[Row]) -> pa.Table:
-        """Returns rows as Arrow has them; NaN is null, but in maps, which are as recorded."""
+        """Returns rows for Arrow, with `time` and `topic_key`. NaN becomes null, except in maps."""
         first = next((name for name in _FIRST_TIMES if name in self.columns), None)
         whole: list[Row] = []
         for row in rows:
@@ -163,16 +174,16 @@ class ShippedBag(NamedTuple):
     """The columns of `bags` that identify a bag.
 
     Attributes:
-        robot: its name.
+        robot: the name of the robot.
         bag_id: see `rows.bag_id_of`.
-        day: (UTC) of its start.
+        day: the day (UTC) of its first message.
         file: its path below the bag directory.
-        size: of its file (bytes).
-        sha256: of the bytes of its file, in hexadecimal.
-        mtime_ns: of its file.
-        made_of: see `rows.made_of`.
-        start_ns: log time of its first message.
-        end_ns: of its last one.
+        size: the size of its file in bytes.
+        sha256: the hash of its file, in hexadecimal.
+        mtime_ns: the mtime of its file.
+        made_of: see `RowMaker.made_of`.
+        start_ns: the log time of its first message.
+        end_ns: the log time of its last message.
     """
 
     robot: str
@@ -199,7 +210,7 @@ def end_of(day: date) -> Ns:
 
 
 def _encodable(value: object) -> object:
-    """Returns a text, or all texts of rows, as UTF-8 can have them."""
+    """Returns a value whose texts can be encoded in UTF-8."""
     if isinstance(value, str):
         return encodable(value)
     if isinstance(value, dict):
@@ -215,12 +226,12 @@ def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.Bool
 
 
 def of_robots(robots: Collection[str], day: date) -> ex.BooleanExpression:
-    """Returns the condition on rows of one day of some robots."""
+    """Returns the condition for the rows of robots on one day."""
     return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
 
 
 def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
-    """Returns the condition on rows of bags of a robot, of any day.
+    """Returns the condition for the rows of a robot's bags, on any day.
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
@@ -233,7 +244,7 @@ def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
 
 
 def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
-    """Returns the condition on rows of bags, given by robot, day and id."""
+    """Returns the condition for the rows of bags, given by robot, day and id."""
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
@@ -241,16 +252,16 @@ def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
         ex.And(of_robots([robot], day), of_ids(robot, bag_ids))
         for (robot, day), bag_ids in ids.items()
     ]
-    # At once: one after the other they are nested, and years of days deeper than Python allows.
+    # One flat condition: nested ones would be deeper than Python allows after some years of days.
     return ex.Or(ex.AlwaysFalse(), ex.AlwaysFalse(), *days)
 
 
 def overlapping(
     robot: str, columns: tuple[str, str], window: TimeWindow, topics: Collection[str] = ()
 ) -> ex.BooleanExpression:
-    """Returns the condition on rows of a robot whose span reaches into a window.
+    """Returns the condition for the rows of a robot whose span reaches into a window.
 
-    `columns` have its first and last time (inclusive). Where there are `topics`, only their rows.
+    `columns` name its first and last time (inclusive). With `topics`, only their rows are meant.
     """
     first, last = columns
     return ex.And(
@@ -262,7 +273,7 @@ def overlapping(
 
 
 def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
-    """Returns tables by name; makes those that are missing, and adds columns that are new."""
+    """Returns tables by name. Missing tables are created, and new columns are added."""
     catalog.create_namespace_if_not_exists(NAMESPACE)
     tables: dict[str, IcebergTable] = {}
     for name in names:
@@ -284,9 +295,10 @@ def packed_messages(
     payloads: Sequence[bytes] | None,
     places: IntArray | None = None,
 ) -> bytes:
-    """Returns messages in order of their log times as bytes; without payloads where there are none.
+    """Returns messages as bytes, see above.
 
-    `payloads` are of messages in the same order, and so are `places`, if they are needed.
+    The arguments are in order of the log times. Without `payloads` or `places` the bytes do not
+    have them.
     """
     form = _PLAIN if places is None else _PLACED
     parts = [
@@ -307,14 +319,14 @@ def packed_messages(
 
 
 def unpacked_messages(data: bytes, channel: Channel) -> Batch:
-    """Returns the messages that `packed_messages` packed; without payloads all are empty.
+    """Returns the messages that `packed_messages` packed; their payloads are empty if it had none.
 
     Raises:
         ValueError: the bytes are damaged, or of a later format.
     """
     content = decompressed(data)
     try:
-        form, is_whole, count = _HEAD.unpack_from(content)
+        form, has_payloads, count = _HEAD.unpack_from(content)
     except struct.error as error:
         raise ValueError("packed messages are cut short") from error
     if form not in (_PLAIN, _PLACED):
@@ -324,15 +336,16 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
     at = _HEAD.size
 
     def column(width: int) -> IntArray:
+        """Reads the next column, of so many bytes for each number."""
         nonlocal at
-        at += width * count
-        return np.asarray(from_planes(content, at - width * count, count, width), np.int64)
+        begin, at = at, at + width * count
+        return np.asarray(from_planes(content, begin, count, width), np.int64)
 
     logged = np.cumsum(column(8))
     published = logged + column(8)
     places = np.cumsum(column(8)) if form == _PLACED else np.arange(count)
     sizes, payloads = np.zeros(count, np.int64), b""
-    if is_whole:
+    if has_payloads:
         sizes = column(4)
         payloads = content[at:]
         if len(payloads) != sizes.sum():

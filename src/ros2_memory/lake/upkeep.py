@@ -1,14 +1,14 @@
 """Keeps the tables of a lake small, and forgets a time of a robot in them for good.
 
-Closed days are put into few files; old versions and their files go. pyiceberg drops old versions
-from the metadata of tables, but deletes no file. A list of what lies in a store would have files of
-other programs, too, also those that they are about to commit. So only files are deleted that this
-program recorded when it wrote them: those below a table's own location to which no version, branch
-or tag of the table refers.
+Closed days are compacted into few files; old versions and their files are deleted. pyiceberg drops
+old versions from the metadata of tables, but deletes no file. A listing of the store would also
+have files of other programs, even some that are about to be committed. So this program deletes only
+files that it recorded when it wrote them, that lie below a table's location, and to which no
+version, branch or tag of the table refers.
 
-What is forgotten goes with old versions, files, and late copies. Each bag goes as a whole that has
-something of that time, or, where topics are forgotten, something of them: where its file is still
-there without the messages, it is shipped again.
+Forgotten messages go from all versions, files, and copies that are shipped later. A bag with any
+forgotten message goes as a whole. If its file is still there without the messages, it is shipped
+again.
 
 Tombstones lie in the lake's state directory and are kept for ever. Each is written durably before
 anything is deleted, and again as done when all of it is gone.
@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, replace
-from itertools import groupby
-from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
@@ -48,20 +46,19 @@ log = get_logger(__name__)
 TOMBSTONES_FILE: Final = "tombstones.jsonl"
 _DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 FEW_FILES: Final = 3
-"""A day of a robot with more files in a table is put together."""
+"""A day of a robot with more files in a table is compacted."""
 _MOST_BYTES: Final = 128 << 20
-"""Of files that are put together at once: their rows are in memory meanwhile."""
+"""Bytes of files that are compacted at once: their rows are in memory meanwhile."""
 _MOST_ROBOTS: Final = 200
-"""In one condition: with more names Iceberg rules no file out by them."""
+"""Robots in one condition: Iceberg rules out no file by a longer list."""
 
 
 def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: None) -> int:
-    """Puts each closed day of each robot into one file; returns how many were.
+    """Rewrites each closed day of each robot as one file; returns how many days that were.
 
     A day is closed a day after its end. The rows stay the same. One transaction replaces the files
-    of many robots, since each writes the table's list of versions again.
-
-    Each day is a condition of its own: a list of days is compared with every file.
+    of many robots, since each one writes the table's list of versions again. It is of one day,
+    since Iceberg compares a list of days with every file.
 
     Raises:
         LakeError: the lake cannot be read or written.
@@ -79,17 +76,16 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
 
 
 def _to_compact(by_robot: Mapping[str, Days], closed: date) -> Iterator[tuple[date, list[str]]]:
-    """Yields what to put together of the days before `closed`: a day, and some of its robots."""
-    sizes = sorted(
-        (day, robot, size)
-        for robot, days in by_robot.items()
-        for day, files in days.items()
-        if day < closed and len(files) > FEW_FILES
-        if (size := sum(file.size for file in files)) <= _MOST_BYTES
-    )
-    for day, of_day in groupby(sizes, itemgetter(0)):
+    """Yields the days before `closed` that have many files, each with robots to compact at once."""
+    sizes: dict[date, dict[str, int]] = {}
+    for robot, days in sorted(by_robot.items()):
+        for day, files in days.items():
+            size = sum(file.size for file in files)
+            if day < closed and len(files) > FEW_FILES and size <= _MOST_BYTES:
+                sizes.setdefault(day, {})[robot] = size
+    for day, of_day in sorted(sizes.items()):
         robots, total = list[str](), 0
-        for _, robot, size in of_day:
+        for robot, size in of_day.items():
             if total + size > _MOST_BYTES or len(robots) == _MOST_ROBOTS:
                 yield day, robots
                 robots, total = [], 0
@@ -99,9 +95,10 @@ def _to_compact(by_robot: Mapping[str, Days], closed: date) -> Iterator[tuple[da
 
 
 def expire(lake: LakeTables, until: Ns) -> int:
-    """Drops the versions of up to a time, and deletes the files that are left without one.
+    """Drops the versions up to a time, and deletes the files that no version needs any more.
 
-    The newest version stays, and those that a branch or a tag names. Returns how many files.
+    The newest version stays, and so do those that a branch or a tag names. Returns how many files
+    were deleted.
 
     Raises:
         LakeError: the lake cannot be read or written.
@@ -130,7 +127,7 @@ def expire(lake: LakeTables, until: Ns) -> int:
 
 
 def _drop_versions(table: IcebergTable, until: Ns) -> None:
-    """Drops the versions of up to a time, but those that a branch or a tag names."""
+    """Drops the versions up to a time, except those that a branch or a tag names."""
     times = {version.snapshot_id: version.timestamp_ms for version in table.metadata.snapshots}
     old = {version for version, time_ms in times.items() if time_ms * NS_PER_MS <= until}
     old -= {ref.snapshot_id for ref in table.metadata.refs.values()}
@@ -139,27 +136,34 @@ def _drop_versions(table: IcebergTable, until: Ns) -> None:
 
 
 def _unreferenced(table: IcebergTable, files: Sequence[str]) -> Sequence[str]:
-    """Returns those of some files below a table's location that none of its versions refers to."""
+    """Returns the files below a table's location to which none of its versions refers."""
     location = f"{table.location().rstrip('/')}/"
-    below = {file for file in files if file.startswith(location) and ".." not in file}
-    if not below:
+    unreferenced = {file for file in files if file.startswith(location) and ".." not in file}
+    if not unreferenced:
         return ()
     metadata, io, versions = table.metadata, table.io, table.metadata.snapshots
-    below -= {table.metadata_location, *(version.manifest_list for version in versions)}
-    below -= {statistics.statistics_path for statistics in metadata.statistics}
-    manifests = [manifest for version in versions for manifest in version.manifests(io)]
-    for path, manifest in {manifest.manifest_path: manifest for manifest in manifests}.items():
+    unreferenced -= {table.metadata_location, *(version.manifest_list for version in versions)}
+    unreferenced -= {statistics.statistics_path for statistics in metadata.statistics}
+    manifests = {
+        manifest.manifest_path: manifest
+        for version in versions
+        for manifest in version.manifests(io)
+    }
+    for path, manifest in manifests.items():
         entries = manifest.fetch_manifest_entry(io, discard_deleted=True)
-        below -= {path, *(entry.data_file.file_path for entry in entries)}
-    return sorted(below)
+        unreferenced -= {path, *(entry.data_file.file_path for entry in entries)}
+    return sorted(unreferenced)
 
 
 @dataclass(frozen=True, slots=True)
 class Tombstone:
-    """Messages of a robot that were forgotten: those of a window (log times, half-open).
+    """Messages of a robot that were forgotten: those between two log times (half-open).
 
-    Where there are `topics`, only theirs; where there are `bags`, all of these alone, by their ids.
-    `done`: all of it is gone; two that differ in that alone are equal.
+    Attributes:
+        topics: only messages of these topics, if there are any.
+        bags: in place of the messages of the time, all of the bags with these ids, if there are
+            any.
+        done: whether all of it is gone; not compared.
     """
 
     robot: str
@@ -171,41 +175,41 @@ class Tombstone:
 
     @property
     def window(self) -> TimeWindow:
-        """The time that is forgotten."""
+        """The time as a window."""
         return TimeWindow(self.start, self.stop)
 
     @classmethod
     def of(cls, robot: str, forgetting: Forgetting) -> Tombstone:
-        """Returns what a robot's bag directory asks for."""
+        """Returns the tombstone for an entry of a robot's bag directory."""
         ids = [bag_id_of(robot, *astuple(bag)) for bag in forgetting.bags]
         return cls(robot, forgetting.start, forgetting.stop, forgetting.topics, tuple(ids))
 
     def rows(self, first: str, last: str) -> BooleanExpression:
-        """Returns the condition on the rows to delete, by their columns of first and last time."""
+        """Returns the condition for the rows to delete; `first` and `last` are columns of times."""
         if self.bags:
             return of_ids(self.robot, self.bags)
         return overlapping(self.robot, (first, last), self.window, self.topics)
 
     def forbids(self, reader: BagReader, bag: BagFile, bag_id: str) -> bool:
-        """Returns whether a bag of the robot has a message that was forgotten.
+        """Returns whether a bag of the robot has a forgotten message.
 
         Raises:
-            BagError: it cannot be read.
+            BagError: the bag cannot be read.
         """
         if self.bags:
             return bag_id in self.bags
         if not self.window.overlaps(bag.start, bag.end):
             return False
         topics = {topic.topic for topic in bag.summary.topics}
-        wanted = topics.intersection(self.topics or topics)
-        return any(True for _ in reader.records(bag.path, wanted, self.window))
+        forgotten = topics.intersection(self.topics or topics)
+        return next(iter(reader.records(bag.path, forgotten, self.window)), None) is not None
 
 
 TOMBSTONES: Final = JsonLog(TOMBSTONES_FILE, Tombstone)
 
 
 def append_tombstone(state_dir: Path, tombstone: Tombstone, *, done: bool) -> None:
-    """Appends a tombstone durably, or that it is done.
+    """Appends a tombstone durably.
 
     Raises:
         LakeError: it cannot be written.
@@ -218,7 +222,7 @@ def append_tombstone(state_dir: Path, tombstone: Tombstone, *, done: bool) -> No
 
 
 def read_tombstones(state_dir: Path) -> list[Tombstone]:
-    """Returns the tombstones, each once; one is done if any line on it says so.
+    """Returns the tombstones, each once. A tombstone is done if any of its lines is.
 
     Raises:
         LakeError: they cannot be read, or a line is damaged: nothing may be shipped then.
@@ -233,7 +237,10 @@ def read_tombstones(state_dir: Path) -> list[Tombstone]:
 
 
 class Forgotten(NamedTuple):
-    """What is gone: how many bags, and files; `kept_by` names tags and branches that keep some."""
+    """How many bags and files were deleted.
+
+    `kept_by` names the tags and branches that still have forgotten messages.
+    """
 
     bags: int
     files: int
@@ -241,40 +248,46 @@ class Forgotten(NamedTuple):
 
 
 def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
-    """Deletes what a tombstone names, which is written already; killed anywhere, it is done again.
+    """Deletes the rows that a tombstone names, in all versions; the tombstone must be written.
+
+    After a kill it is called again.
 
     Raises:
         LakeError: the lake cannot be read or written.
     """
-    # `channels` has a row of each bag of which anything is in the lake: it is the first to be
-    # committed, and the last from which is deleted.
+    bags = _bags_to_forget(lake, tombstone)
+    # `channels` comes last: while it has a row of a bag, other tables may have some.
+    for name in reversed([*TABLES]):
+        lake.delete(name, of_bags(bags))
+    # Earlier versions still have the rows, so they go whatever their age is.
+    files = expire(lake, MAX_NS)
+    kept_by: list[str] = []
+    for name in TABLES:
+        metadata = lake.current(name).metadata
+        for ref, version in metadata.refs.items():
+            if version.snapshot_id != metadata.current_snapshot_id:
+                kept_by.append(f"{name}: {ref}")
+    append_tombstone(lake.location.state_dir, tombstone, done=True)
+    log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
+    return Forgotten(len(bags), files, tuple(kept_by))
+
+
+def _bags_to_forget(lake: LakeTables, tombstone: Tombstone) -> set[tuple[str, date, str]]:
+    """Returns robot, day and id of the bags that a tombstone names."""
     bags = _bags_where(lake, "channels", tombstone.rows("first_ns", "last_ns"))
-    # In `bags` alone: of which no message counts, and what a killed process was about to replace.
+    # A bag without messages that count has rows in `bags` alone, and so has one that a killed
+    # process was about to replace. Their topics are not known.
     of_any_topic = replace(tombstone, topics=())
     listed = _bags_where(lake, "bags", of_any_topic.rows("start_ns", "end_ns"))
     if tombstone.topics and listed:
-        ids = of_ids(tombstone.robot, {bag_id for *_, bag_id in listed})
+        ids = of_ids(tombstone.robot, {bag_id for _, _, bag_id in listed})
         listed -= _bags_where(lake, "channels", ids)
-    bags |= listed
-    for name in reversed([*TABLES]):
-        lake.delete(name, of_bags(bags))
-    # The versions before have what was deleted, so they go whatever their age, and the clock says.
-    files = expire(lake, MAX_NS)
-    metadata = {name: lake.current(name).metadata for name in TABLES}
-    kept_by = tuple(
-        f"{name}: {ref}"
-        for name, of_table in metadata.items()
-        for ref, version in of_table.refs.items()
-        if version.snapshot_id != of_table.current_snapshot_id
-    )
-    append_tombstone(lake.location.state_dir, tombstone, done=True)
-    log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
-    return Forgotten(len(bags), files, kept_by)
+    return bags | listed
 
 
 def _bags_where(
     lake: LakeTables, name: str, condition: BooleanExpression
 ) -> set[tuple[str, date, str]]:
-    """Returns robot, day and id of the bags that have some rows."""
+    """Returns robot, day and id of the bags with rows in a table that meet a condition."""
     rows = lake.rows(name, condition, ("robot", "day", "bag_id")).to_pylist()
     return {(row["robot"], row["day"], row["bag_id"]) for row in rows}

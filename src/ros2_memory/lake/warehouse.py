@@ -1,16 +1,16 @@
-"""Opens a lake: its Iceberg catalogue and its files, to be written by one at a time.
+"""Opens a lake: its Iceberg catalogue and its files, for one writer.
 
-The catalogue is an SQLite file in the state directory, or a REST service. Whatever goes wrong there
-becomes a `LakeError`, in whose sentence no secret is.
+The catalogue is an SQLite file in the state directory, or a REST service. Its errors become a
+`LakeError` whose sentence has no secret.
 
-Each file is recorded in the state directory before it is written: pyiceberg deletes none, and a
-process that is killed leaves files that no version ever had (`upkeep`).
+Each file is recorded in the state directory before it is written: pyiceberg deletes no file, and a
+killed process leaves files that no version refers to (see `upkeep`).
 
-There is one writer. A commit of pyiceberg compares and swaps, so two writers would not lose a bag,
-nor have it twice. But only one knows what was forgotten, and with the SQLite catalogue of another
-state directory there would be a second lake in the same files. So a lake belongs to one state
-directory, which a file in the warehouse names (`claim`), and that has a lock, which the system
-releases when its holder dies.
+A commit of pyiceberg compares and swaps, so two writers would neither lose nor repeat a bag. But
+only one of them would know what was forgotten, and the SQLite catalogue of another state directory
+would be a second lake in the same files. So a lake belongs to one state directory, which a file in
+the warehouse names (`claim`). The state directory has a lock, which the system releases when its
+holder dies.
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ RECORD: Final = "ros2-memory.written"
 """The setting of a `RecordingFileIO` that names the folder of its record."""
 _MOST_CHARS: Final = 500
 _ATTEMPTS: Final = 5
-"""Of a commit that fails although nothing is wrong; pyiceberg tries some of these again itself."""
+"""Attempts at a commit that conflicts with another one; pyiceberg repeats only some itself."""
 _MASK: Final = "********"
 _EPOCH: Final = date(1970, 1, 1)
 _LAST: Final = "\U0010ffff"
-"""After all ids of bags."""
+"""A text after all ids of bags."""
 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A file, and when (ns) it was about to be written."""
+    """The URI of a file, and the time (ns) at which it was about to be written."""
 
     file: str
     at: Int64
@@ -102,12 +102,12 @@ class LakeLocation:
     """Where a lake is.
 
     Attributes:
-        warehouse: the URI below which its files lie: `file:///...`, `s3://...`.
-        state_dir: the lock of its writer, and the catalogue where that is SQLite.
-        catalog: what lists its tables.
-        uri: of a REST catalogue, or of another database; None for the SQLite file.
-        properties: of the catalogue and of the file store, as pyiceberg names them.
-        secrets: likewise, and never shown.
+        warehouse: the URI of the folder of its files: `file:///...`, `s3://...`.
+        state_dir: the folder of the writer's lock, and of the SQLite catalogue if there is one.
+        catalog: the type of the catalogue.
+        uri: the URI of a REST catalogue, or of another database; None for the SQLite file.
+        properties: settings of the catalogue and of the file store, as pyiceberg names them.
+        secrets: more of these settings, which are never shown.
     """
 
     warehouse: str
@@ -126,7 +126,7 @@ class LakeLocation:
         """Turns the errors of catalogues and stores into `LakeError`s without secrets.
 
         Raises:
-            LakeError: it failed; `what` says what was being done.
+            LakeError: the block failed; `what` says what it was doing.
         """
         try:
             yield
@@ -145,8 +145,8 @@ class LakeLocation:
         Raises:
             LakeError: it cannot be opened.
         """
-        # It logs each file that it opens, at the level of our own events, and warns of deletes that
-        # match no row: most repeat nothing.
+        # pyiceberg logs each file that it opens as info, and warns of deletes that match no row, as
+        # most deletes before a commit do.
         logging.getLogger("pyiceberg").setLevel(logging.WARNING)
         warnings.filterwarnings("ignore", "Delete operation did not match", UserWarning)
         kind = RestCatalog if self.catalog == "rest" else SqlCatalog
@@ -166,7 +166,7 @@ class LakeLocation:
 
     @contextmanager
     def writable(self) -> Iterator[LakeTables]:
-        """Opens the tables, which are made where they are missing.
+        """Opens the tables, and creates missing ones.
 
         Raises:
             LakeError: they cannot be opened.
@@ -177,13 +177,13 @@ class LakeLocation:
             yield LakeTables(self, tables)
 
     def claim(self) -> None:
-        """Makes the lake that of this state directory, unless it is another one's.
+        """Makes this state directory the owner of the lake, unless it has another one.
 
-        A store has no locks, so two that claim it at the same moment may both have it, until each
-        claims it again before its next commit; of two commits at once a table takes only one.
+        A store has no locks, so of two that claim it at the same moment both may succeed, until one
+        fails to claim it again before its next commit. Of two commits at once a table takes one.
 
         Raises:
-            LakeError: it is another one's, which the sentence names, or cannot be reached.
+            LakeError: another state directory owns the lake; or the lake cannot be reached.
         """
         path, own_id = f"{self.warehouse}/{NAMESPACE}/{_OWNER_FILE}", _id_in(self.state_dir)
         folder, host = os.fspath(self.state_dir.absolute()), socket.gethostname()
@@ -201,7 +201,7 @@ class LakeLocation:
             raise LakeError(f"this lake has another writer, with {whose}: {do}; {lost}")
 
     def last_commit(self) -> Ns | None:
-        """Returns when a bag was last committed; None where none was. Makes nothing.
+        """Returns when a bag was last committed; None if none was. Creates no file.
 
         Raises:
             LakeError: the lake cannot be read.
@@ -218,10 +218,10 @@ class LakeLocation:
 
 @dataclass(frozen=True, slots=True)
 class LakeTables:
-    """The tables of an open lake: all of `TABLES`. Each call takes their newest versions.
+    """The tables of an open lake: all of `TABLES`. Each call reads their newest versions.
 
-    A commit is pyiceberg's: it compares and swaps, and what it replaces is one transaction. What it
-    refuses is done again from the newest version.
+    A commit compares and swaps, in one transaction. If it conflicts with another one, it is made
+    again from the newest version.
     """
 
     location: LakeLocation
@@ -233,10 +233,10 @@ class LakeTables:
         return str(self.tables["bags"].metadata.table_uuid)
 
     def current(self, name: str) -> IcebergTable:
-        """Returns a table as it is now.
+        """Returns the newest version of a table.
 
         Raises:
-            LakeError: the lake cannot be read; so do all others.
+            LakeError: the lake cannot be read; all other methods raise it, too.
         """
         with self.location.translated(f"reading the lake's {name}"):
             return self.tables[name].refresh()
@@ -250,7 +250,7 @@ class LakeTables:
     def rows(
         self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
     ) -> pa.Table:
-        """Returns the rows of which a condition is true."""
+        """Returns the rows that meet a condition."""
         table = self.current(name)
         with self.location.translated(f"reading the lake's {name}"):
             return table.scan(condition, selected_fields=columns).to_arrow()
@@ -258,22 +258,25 @@ class LakeTables:
     def replace(
         self, name: str, condition: BooleanExpression, rows: pa.Table | None = None
     ) -> None:
-        """Replaces rows by others, or by the same in few files, in one transaction."""
+        """Replaces the rows that meet a condition, in one transaction.
+
+        Without `rows`, the same rows are written into few files.
+        """
 
         def write(table: IcebergTable) -> None:
-            # Those of the version that is replaced: no row that came since is lost.
+            # Read from the version that is replaced, so that no row is lost.
             whole = table.scan(condition).to_arrow() if rows is None else rows
             table.overwrite(TABLES[name].sorted(whole), overwrite_filter=condition)
 
         self._commit(name, "writing", write)
 
     def delete(self, name: str, condition: BooleanExpression) -> None:
-        """Deletes rows from the newest version; `expire` deletes those before."""
+        """Deletes rows from the newest version; `expire` deletes earlier versions."""
 
         def write(table: IcebergTable) -> None:
             table.delete(condition)
-            # The list of what a version deleted has the bounds of its columns, which are texts of
-            # rows; the next version does not refer to it.
+            # A version lists the files that it deleted, with texts of their rows as bounds. The
+            # next version does not have this list.
             table.append(table.schema().as_arrow().empty_table())
 
         self._commit(name, "deleting from", write)
@@ -285,8 +288,8 @@ class LakeTables:
                 try:
                     write(table)
                 except (CommitFailedException, ValidationException):
-                    # Nothing was committed. Another program did; or threads of pyiceberg, which
-                    # share what says where a manifest's rows are, took one's for another's.
+                    # Nothing was committed. Another program committed; or threads of pyiceberg,
+                    # which share the place of a manifest's rows, mixed up two manifests.
                     if attempt == _ATTEMPTS - 1:
                         raise
                 else:
@@ -294,10 +297,10 @@ class LakeTables:
 
 
 def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:
-    """Returns the URI of a warehouse that may be given as a path, and the state directory.
+    """Returns the URI of a warehouse, which may be given as a path, and the state directory.
 
     Raises:
-        ValueError: the warehouse is on no file system, and there is no state directory.
+        ValueError: the warehouse is in a store, and there is no state directory.
     """
     scheme, colon, rest = warehouse.partition("://")
     if colon and scheme != "file":
@@ -310,10 +313,10 @@ def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:
 
 @contextmanager
 def writing_alone(state_dir: Path) -> Iterator[None]:
-    """Holds the lock of a lake, whose file names this process.
+    """Holds the lock of a lake; the file of the lock names this process.
 
     Raises:
-        LakeError: another process holds it, which the sentence names; or nothing can be locked.
+        LakeError: another process holds the lock; or the file system has no locks.
     """
     path, flags = state_dir / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     with ExitStack() as opened:
@@ -335,7 +338,7 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
 
 
 def _owner_in(store: FileIO, path: str) -> dict[str, object]:
-    """Returns what the file of a lake's owner has; nothing where it is damaged, or not there."""
+    """Returns the content of the owner file; an empty dict if it is missing or damaged."""
     owner: object = None
     file = store.new_input(path)
     if file.exists():
@@ -345,10 +348,10 @@ def _owner_in(store: FileIO, path: str) -> dict[str, object]:
 
 
 def _id_in(state_dir: Path) -> str:
-    """Returns the id of a state directory, which is made with the first call.
+    """Returns the id of a state directory; the first call creates it.
 
     Raises:
-        LakeError: it cannot be read or written.
+        LakeError: the id cannot be read or written.
     """
     path = state_dir / _ID_FILE
     try:
@@ -360,9 +363,9 @@ def _id_in(state_dir: Path) -> str:
 
 
 class LakeFile(NamedTuple):
-    """A Parquet file by its URI, how many rows it has, and its size (bytes).
+    """A Parquet file by its URI, with the number of its rows and its size in bytes.
 
-    No id of a bag in it is before `first`, nor after `last`.
+    The ids of the bags in it are from `first` to `last`.
     """
 
     location: str
@@ -376,35 +379,49 @@ Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
 """The files of one robot in one table by day, in order of the days."""
 
 
+class _PartitionFile(NamedTuple):
+    """A file, and the robot and day whose rows it has."""
+
+    robot: str
+    day: date
+    file: LakeFile
+
+
 class Partitions:
-    """The files of the versions of one table that it was last shown. Not thread-safe."""
+    """The files of one table by robot and day, as of the version read last. Not thread-safe."""
 
     def __init__(self) -> None:
         self._snapshot: int | None = None
-        self._read: dict[str, Sequence[tuple[str, date, LakeFile]]] = {}
+        self._by_manifest: dict[str, Sequence[_PartitionFile]] = {}
         self._robots: dict[str, dict[date, list[LakeFile]]] = {}
 
     def look(self, table: IcebergTable) -> Mapping[str, Days]:
-        """Returns the files of a table's current version, by robot.
+        """Returns the files of a table's current version; known manifests are not read again.
 
         Raises:
-            RefusedError: another program wrote what cannot be read by robot and day.
+            RefusedError: another program wrote files that are not of one robot and day.
         """
         snapshot = table.current_snapshot()
         if snapshot is None or snapshot.snapshot_id == self._snapshot:
             return self._robots
-        read = {}
+        by_manifest: dict[str, Sequence[_PartitionFile]] = {}
         for manifest in snapshot.manifests(table.io):
             path = manifest.manifest_path
-            read[path] = self._read.get(path) or [*_files(table, manifest)]
+            by_manifest[path] = self._by_manifest.get(path) or [*_files_in(manifest, table)]
         robots: dict[str, dict[date, list[LakeFile]]] = {}
-        for robot, day, file in sorted(chain.from_iterable(read.values())):
+        for robot, day, file in sorted(chain.from_iterable(by_manifest.values())):
             robots.setdefault(robot, {}).setdefault(day, []).append(file)
-        self._read, self._robots, self._snapshot = read, robots, snapshot.snapshot_id
+        self._by_manifest, self._robots = by_manifest, robots
+        self._snapshot = snapshot.snapshot_id
         return robots
 
 
-def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, date, LakeFile]]:
+def _files_in(manifest: ManifestFile, table: IcebergTable) -> Iterator[_PartitionFile]:
+    """Yields the data files that a manifest of a table lists.
+
+    Raises:
+        RefusedError: another program wrote delete files, or files of several robots or days.
+    """
     name = f"the lake's table {table.name()[-1]}"
     entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
     if entries and manifest.content is ManifestContent.DELETES:
@@ -421,12 +438,19 @@ def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, d
             why = f"has files that are not of one {column}, which another program wrote"
             raise RefusedError(f"{name} {why}: partition it by robot and day again")
     bag_id = schema.find_field("bag_id").field_id
-    for data in (entry.data_file for entry in entries):
-        day = _EPOCH + timedelta(days=data.partition[positions["day"]])
-        first, last = (
-            bytes((bounds or {}).get(bag_id) or b"").decode()
-            for bounds in (data.lower_bounds, data.upper_bounds)
+    for entry in entries:
+        data = entry.data_file
+        file = LakeFile(
+            data.file_path,
+            data.record_count,
+            data.file_size_in_bytes,
+            first=_bound_of(bag_id, data.lower_bounds),
+            last=_bound_of(bag_id, data.upper_bounds) or _LAST,
         )
-        of_file = data.file_path, data.record_count, data.file_size_in_bytes
-        file = LakeFile(*of_file, first, last or _LAST)
-        yield str(data.partition[positions["robot"]]), day, file
+        day = _EPOCH + timedelta(days=data.partition[positions["day"]])
+        yield _PartitionFile(str(data.partition[positions["robot"]]), day, file)
+
+
+def _bound_of(field_id: int, bounds: Mapping[int, bytes] | None) -> str:
+    """Returns the bound of a column of texts; an empty text if it is not known."""
+    return bytes((bounds or {}).get(field_id) or b"").decode()

@@ -18,7 +18,7 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.lake.engine import Lake
-from ros2_memory.lake.memory import LakeIndex, newest
+from ros2_memory.lake.memory import LakeIndex, newest_days
 from ros2_memory.lake.tables import day_of
 from ros2_memory.lake.warehouse import Days, LakeFile
 from ros2_memory.queries import find_last_match
@@ -214,7 +214,7 @@ def test_the_newest_days_are_as_many_as_fit_and_at_least_those_asked_for(
 ) -> None:
     days, until = days_of(sizes), FIRST + timedelta(days=after)
     known = [day for day in days if day <= until]
-    found, before = newest(days, until, most, fewest)
+    found, before = newest_days(days, until, most, fewest)
     assert [*found] == [day for day in known if before is None or day > before]
     if not found:
         assert not known
