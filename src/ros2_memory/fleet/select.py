@@ -73,11 +73,7 @@ def _answer(
     if not latest:
         raise NoDataError(NoDataReason.EMPTY_MEMORY, "nothing was shipped to the lake", ())
     found = lake.query(
-        select,
-        names,
-        most_rows=limit,
-        most_chars=int(max_chars * _ROOM),
-        deadline=call.deadline,
+        select, names, most_rows=limit, most_chars=int(max_chars * _ROOM), deadline=call.deadline
     )
     # Short texts are names, dates and times.
     rows: list[JsonValue] = [

@@ -130,6 +130,7 @@ class LakeIndex:
         refresh_s: how old the index may be.
         days: how many days are shown at least.
         most_bags: up to so many bags, more days are shown.
+        published: the last snapshot; None before the first.
     """
 
     lake: Lake
@@ -142,12 +143,7 @@ class LakeIndex:
     most_bags: int = MOST_BAGS
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
     _windows: dict[date, _Window] = field(default_factory=dict, init=False)
-    _snapshot: Snapshot | None = field(default=None, init=False)
-
-    @property
-    def published(self) -> Snapshot | None:
-        """The last snapshot; None before the first."""
-        return self._snapshot
+    published: Snapshot | None = field(default=None, init=False)
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
         """Returns the newest days as of at most `refresh_s` ago.
@@ -157,7 +153,7 @@ class LakeIndex:
         Raises:
             RefusedError: the lake cannot be read.
         """
-        current = self._snapshot
+        current = self.published
         if current is not None:
             age = self.clock.now() - current.scanned_at
             # Below 0 the clock was set back, and the age is unknown.
@@ -183,10 +179,10 @@ class LakeIndex:
             timeline = window.timeline
             silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
             topics, now = frozenset(silent.difference(timeline.topics())), self.clock.now()
-            self._snapshot = Snapshot(
+            self.published = Snapshot(
                 timeline, silent_topics=topics, scanned_at=now, older=window.older
             )
-            return self._snapshot
+            return self.published
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: the heartbeat of a robot's recorder is not in a lake."""

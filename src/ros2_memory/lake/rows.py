@@ -108,19 +108,12 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-class _BagEvents(NamedTuple):
-    """The events of a bag as rows, and the topics that may have detections in it."""
-
-    rows: list[Row]
-    topics: list[str]
-
-
 class _Derived(NamedTuple):
-    """What rows of bags that lie close together are made of."""
+    """What rows of bags that lie close together are made of; poses and events by file."""
 
     window: TimeWindow
     poses: Mapping[str, Poses]
-    events: Mapping[str, _BagEvents]
+    events: Mapping[str, Sequence[Row]]
     things: Mapping[BagFile, Sequence[Row]]
     detections: Mapping[BagFile, Mapping[str, Sequence[Rows]]]
 
@@ -181,14 +174,10 @@ class RowMaker:
         window = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
         files = {bag.file for bag in bags}
         pose_rows = scan(self._view, self._view.pose_topic, window, copies=True)
-        events = self._events(window, files)
+        events, files_by_topic = self._events(window, files)
         things: dict[BagFile, list[Row]] = defaultdict(list)
         for bag, frame, sights in self._sight_reader.sights_by_bag([*bags]):
             things[bag] += self._things(frame, sights)
-        files_by_topic: dict[str, set[str]] = defaultdict(set)
-        for file, of_bag in events.items():
-            for topic in of_bag.topics:
-                files_by_topic[topic].add(file)
         detections: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
         for topic, among in files_by_topic.items():
             for rows_of_bags in scan(self._view, topic, window, copies=True):
@@ -205,7 +194,6 @@ class RowMaker:
         map_frame, track = tracks[0] if tracks else (None, empty_track())
         sightings, undecodable = self._sightings(derived.detections.get(bag, {}), map_frame, track)
         driven, stops = self._driven(derived.poses.get(bag.file))
-        events = derived.events.get(bag.file)
         joined = self._memory.index.joined_with(bag.recording)
         of_bag_alone = {
             "recording": bag.recording.name,
@@ -224,7 +212,7 @@ class RowMaker:
             "poses": (row for of_frame in tracks for row in self._poses(*of_frame)),
             "sightings": sightings,
             "things": derived.things.get(bag, ()),
-            "events": (*stops, *(events.rows if events else ())),
+            "events": (*stops, *derived.events.get(bag.file, ())),
             "messages": self._messages(bag),
             "bags": (shipped._asdict() | of_bag_alone,),
         }
@@ -232,26 +220,24 @@ class RowMaker:
     def _tracks(self, bag: BagFile, around: TimeWindow) -> list[tuple[str, RobotTrack]]:
         """Returns the robot's track in the bag with its frame: in the map, and in the poses' frame.
 
-        Other rows take their places from the first track. Only the track of all bags, in the window
-        `around` them, is computed; that of one bag is cut out of it.
+        Other rows take their places from the first track. The track in the window `around` all bags
+        is computed once, and cut; only if it cannot be, that in the bag's own window is.
         """
         window = TimeWindow(bag.start, bag.end + 1)
         places = robot_places(self._view, window)
         if places is None:
             return []
-        tracks = [
-            (frame, cut_track(self._track(frame, around, window), window))
-            for frame in dict.fromkeys((places.map_frame, places.pose_frame))
-        ]
-        return [(frame, track) for frame, track in tracks if len(track.times)]
-
-    def _track(self, frame: str, *windows: TimeWindow) -> RobotTrack:
-        """Returns the track in the first window in which all messages have positions."""
-        reader = TrackReader(self._view, frame)
-        for window in windows:
-            with suppress(InvalidArgumentsError):
-                return reader.track_in(window.aligned(PART_NS)).track
-        return empty_track()
+        tracks: list[tuple[str, RobotTrack]] = []
+        for frame in dict.fromkeys((places.map_frame, places.pose_frame)):
+            reader = TrackReader(self._view, frame)
+            for part in (around, window):
+                # Raised if a message of the part has no position.
+                with suppress(InvalidArgumentsError):
+                    track = cut_track(reader.track_in(part.aligned(PART_NS)).track, window)
+                    if len(track.times):
+                        tracks.append((frame, track))
+                    break
+        return tracks
 
     def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:
         same = {"topic": self._view.pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
@@ -333,10 +319,7 @@ class RowMaker:
             yield messages.row(number, tied)
 
     def _sightings(
-        self,
-        rows_of_topics: Mapping[str, Sequence[Rows]],
-        frame: str | None,
-        track: RobotTrack,
+        self, rows_of_topics: Mapping[str, Sequence[Rows]], frame: str | None, track: RobotTrack
     ) -> tuple[list[Row], int]:
         """Returns the detections in a bag, and how many messages of its topics are undecodable."""
         sightings, undecodable = list[Row](), 0
@@ -407,9 +390,12 @@ class RowMaker:
             yield {"topic": topic, "type": kind, **times, "message": numbers[topic], **value}
             numbers[topic] += 1
 
-    def _events(self, window: TimeWindow, files: Collection[str]) -> dict[str, _BagEvents]:
-        """Returns the events of bags by file."""
-        events_by_file: dict[str, _BagEvents] = {}
+    def _events(
+        self, window: TimeWindow, files: Collection[str]
+    ) -> tuple[dict[str, list[Row]], dict[str, set[str]]]:
+        """Returns the events by file, and by topic the files that may have detections."""
+        rows_by_file: dict[str, list[Row]] = defaultdict(list)
+        files_by_topic: dict[str, set[str]] = defaultdict(set)
         for topic in self._view.timeline.topics():
             types = self._view.timeline.types_of(topic)
             if not any(map(has_events, types)):
@@ -418,12 +404,11 @@ class RowMaker:
             tables = scan(self._view, topic, window, copies=True)
             for file, all_events in events_by_bag(self._view, tables, files).items():
                 events = all_events.limited(MAX_PER_BAG, MAX_PER_BAG)
-                of_bag = events_by_file.setdefault(file, _BagEvents([], []))
-                of_bag.rows.extend(self._events_of(topic, events))
+                rows_by_file[file] += self._events_of(topic, events)
                 # A topic whose events show no detections is not decoded.
                 if may_be_seen and (events.visible.size or events.left_out):
-                    of_bag.topics.append(topic)
-        return events_by_file
+                    files_by_topic[topic].add(file)
+        return rows_by_file, files_by_topic
 
     def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
         for seen in events.visible.intervals():

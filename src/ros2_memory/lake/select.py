@@ -158,10 +158,7 @@ class Select:
         request = pickle.dumps((self, tables, left_s))
         command = [sys.executable, "-P", "-c", _PROGRAM]
         process = subprocess.Popen(  # noqa: S603 - this program
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, **ALLOCATORS},
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **ALLOCATORS}
         )
         with process:
             try:

@@ -18,12 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import pyarrow as pa
 
-from ros2_memory.bag_dir.layout import (
-    FORGOTTEN_FILE,
-    MOMENTS_FOLDER,
-    has_recorded,
-    is_derived,
-)
+from ros2_memory.bag_dir.layout import FORGOTTEN_FILE, MOMENTS_FOLDER, has_recorded, is_derived
 from ros2_memory.bag_dir.state_files import (
     Receipt,
     append_receipts,

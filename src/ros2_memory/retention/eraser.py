@@ -350,12 +350,7 @@ class Eraser:
             if (before.st_dev, before.st_ino) != holder.inode:
                 raise BagError(str(path), "it is another file now; forget again")
             with rewritten(
-                self.bag_dir,
-                path,
-                before,
-                self.writer,
-                takes=erasure.takes,
-                expected=holder.counts,
+                self.bag_dir, path, before, self.writer, takes=erasure.takes, expected=holder.counts
             ) as new:
                 for other in holder.paths[1:]:
                     self._replace_link(new, other, holder.inode)

@@ -143,10 +143,7 @@ class Inventory:
     """
 
     def __init__(
-        self,
-        root: Path,
-        static_topics: Collection[str],
-        own: OwnRecordings | None,
+        self, root: Path, static_topics: Collection[str], own: OwnRecordings | None
     ) -> None:
         self._root = root
         self._own = own

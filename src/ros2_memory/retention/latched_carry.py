@@ -34,11 +34,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_derived
 from ros2_memory.bag_dir.moment_file import HardLinks
-from ros2_memory.core.errors import (
-    BagError,
-    BagVanishedError,
-    UndecodableError,
-)
+from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import Spans, overlaps_any, united
@@ -135,9 +131,7 @@ def latched_message(record: Record, frames: Collection[str]) -> Latched:
 
 
 def worth_carrying(
-    messages: Iterable[Latched],
-    kept: Spans,
-    repeated: Mapping[MessageIdentity, Ns],
+    messages: Iterable[Latched], kept: Spans, repeated: Mapping[MessageIdentity, Ns]
 ) -> set[Latched]:
     """Returns the messages that are still needed when their bags are deleted.
 

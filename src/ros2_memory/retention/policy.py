@@ -71,6 +71,11 @@ class RetentionLimits:
     keeps_foreign: bool = True
     require_shipped: bool = False
 
+    @property
+    def longest_pause_ns(self) -> Ns:
+        """A longer pause parts two periods, and no recording is longer."""
+        return max(self.max_age_ns, SHORTEST_PAUSE_NS)
+
 
 class StoredFile(NamedTuple):
     """One file of a bag, by its inode (device and number); `size` is what the budget counts."""
@@ -403,11 +408,10 @@ _Period: TypeAlias = "list[StoredBag]"
 
 def _periods(contents: DirContents, limits: RetentionLimits) -> list[_Period]:
     """Splits the dated bags where a pause is too long; the last period is the present one."""
-    longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
     periods: list[_Period] = []
     reach = MIN_NS
     for bag in sorted(_credibly_dated(contents, limits), key=attrgetter("start")):
-        if not periods or bag.start - reach > longest:
+        if not periods or bag.start - reach > limits.longest_pause_ns:
             periods.append([])
         periods[-1].append(bag)
         reach = max(reach, bag.end)
@@ -416,8 +420,7 @@ def _periods(contents: DirContents, limits: RetentionLimits) -> list[_Period]:
 
 def _credibly_dated(contents: DirContents, limits: RetentionLimits) -> list[StoredBag]:
     """Returns the bags whose dates are believed."""
-    longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
-    latest = contents.now + FUTURE_NS
+    longest, latest = limits.longest_pause_ns, contents.now + FUTURE_NS
     return [
         bag
         for bag in contents.bags
@@ -506,5 +509,5 @@ def _file_time_key(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns
     """
     if now < FIRST_BAGS_NS:
         return (MAX_NS if bag.written < FIRST_BAGS_NS else bag.written), bag.written
-    longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
-    return (MIN_NS if bag.written > now + longest else bag.written), bag.written
+    is_ahead = bag.written > now + limits.longest_pause_ns
+    return (MIN_NS if is_ahead else bag.written), bag.written

@@ -18,11 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.layout import (
-    HANDOVER_FILE,
-    MOMENTS_FOLDER,
-    is_derived,
-)
+from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER, is_derived
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
     HardLinks,

@@ -64,10 +64,6 @@ class RecordingConditions(NamedTuple):
         """The end, excluded."""
         return MAX_NS if self.end is None else self.end + 1
 
-    def has_clock_of(self, earlier: RecordingConditions) -> bool:
-        """Whether this recording took over from an earlier one, and no clock was set back."""
-        return self.previous == earlier.name and not self.unclear and not earlier.unclear
-
 
 def add_message(
     heard: list[ConditionInterval], time: Ns, holds: bool | None, *, latched: bool, stale: Ns
@@ -197,7 +193,7 @@ def _carried(
     until: Ns | None = None
     for other in others:
         start = other.start
-        if other.has_clock_of(ended):
+        if other.previous == ended.name and not (ended.unclear or other.unclear):
             start = max(since, start)
         if other.start < ended.start:  # the clock was set back
             start, until = other.start, other.start + stale

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.layout import named_start
-from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, RunRecord, TriggerState
+from ros2_memory.bag_dir.state_files import LatchedMark, RunRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
@@ -38,14 +38,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.disk import FailingFiles
 
 if TYPE_CHECKING:
-    from collections.abc import (
-        Callable,
-        Collection,
-        Iterator,
-        Mapping,
-        MutableMapping,
-        Sequence,
-    )
+    from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import SchemaExtractor
@@ -288,9 +281,8 @@ class SplitSearch:
                 useless then.
         """
         for rule in self._rules:
-            record = state.rules.setdefault(rule.name, RuleRecord())
             if not chain.goes_on:
-                record.runs.clear()  # the recorder did not run on
+                state.rules[rule.name].runs.clear()  # the recorder did not run on
         firings: list[Firing] = []
         stopped: Ns | None = None
         previous: Ns | None = None
@@ -339,11 +331,7 @@ class SplitSearch:
                 yield fired
 
     def _test(
-        self,
-        rule: Rule,
-        channel: Channel,
-        value: JsonValue | UndecodableError,
-        state: TriggerState,
+        self, rule: Rule, channel: Channel, value: JsonValue | UndecodableError, state: TriggerState
     ) -> bool | None:
         """Returns whether a value meets a rule's condition.
 

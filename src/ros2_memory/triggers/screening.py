@@ -25,11 +25,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from ros2_memory.analysis.conditions import Equals, leaves
 from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.bag_dir.layout import (
-    SCREENED_FILE,
-    bags_in,
-    split_number,
-)
+from ros2_memory.bag_dir.layout import SCREENED_FILE, bags_in, split_number
 from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
 from ros2_memory.bag_dir.state_files import (
     SCREENED,
@@ -40,12 +36,7 @@ from ros2_memory.bag_dir.state_files import (
     ScreenState,
 )
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary
-from ros2_memory.core.errors import (
-    BagError,
-    EpisodicError,
-    RecorderError,
-    UndecodableError,
-)
+from ros2_memory.core.errors import BagError, EpisodicError, RecorderError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
@@ -367,10 +358,7 @@ class Screening:
         return sentence
 
     def _ready(
-        self,
-        state: ScreenState,
-        unreleased: dict[str, _ClosedFiles],
-        live: Collection[str],
+        self, state: ScreenState, unreleased: dict[str, _ClosedFiles], live: Collection[str]
     ) -> _ClosedFiles:
         """Returns the splits that no later message can affect, and that are not put off."""
         ends = {name: state.recordings[name].end or 0 for name in unreleased}

@@ -19,12 +19,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.moment_file import SaveRequest
-from ros2_memory.bag_dir.state_files import (
-    TRIGGERS,
-    RuleMoment,
-    RuleRecord,
-    TriggerState,
-)
+from ros2_memory.bag_dir.state_files import TRIGGERS, RuleMoment, RuleRecord, TriggerState
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
