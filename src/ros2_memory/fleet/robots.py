@@ -288,8 +288,9 @@ class FanOut:
             own_s = min(limit_s, begun_s + left_s * _OF_ALL - time.monotonic())
             own = replace(call.within(own_s), stages=Stages())
             own.used_active = own.used_thinned = False
-            if refused := self._refused(robot, call, own_s):
+            if refused := self._refusal_of(robot, call, own_s):
                 return refused, own
+            self._is_done.pop(robot.name, None)
             answer = _start_asking(robot, work, own, context.copy())
             try:
                 return answer.result(min(own_s + left_s * _GRACE, threading.TIMEOUT_MAX)), own
@@ -307,7 +308,7 @@ class FanOut:
             call.used_thinned |= own.used_thinned
         return {robot.name: answer for robot, (answer, _) in zip(robots, answers, strict=True)}
 
-    def _refused(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
+    def _refusal_of(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
         """Returns why a robot is not asked: it is stuck, or no time is left."""
         if robot.name in self._is_done and not self._is_done[robot.name]():
             late = "still busy with an earlier question that it did not finish in time"
@@ -315,7 +316,6 @@ class FanOut:
         if own_s <= 0 or call.deadline.expired():
             do = "ask about fewer robots, or a shorter time"
             return QueryTimeoutError(f"not asked: the time of the call was up; {do}")
-        self._is_done.pop(robot.name, None)
         return None
 
 

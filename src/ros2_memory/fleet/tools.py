@@ -52,7 +52,7 @@ from ros2_memory.tools.reply_size import to_json_text
 T = TypeVar("T")
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.tools.declaration import Question, Tool
@@ -437,6 +437,18 @@ class _TimedRow(NamedTuple):
     row: JsonObject
 
 
+def _timed_rows(reply: RobotReply, times: Mapping[str, str], page: Page) -> Iterator[_TimedRow]:
+    """Yields the rows of a reply; `times` has the key of a row's time for each key of rows."""
+    values = _as_rows(reply)
+    for key, time_key in times.items():
+        for row in _objects(values.get(key)):
+            time = row.get(time_key, 0)
+            # A row whose time is null goes on.
+            unix_s = math.inf if time is None else _number(time)
+            order = unix_s if page.oldest_first else -unix_s
+            yield _TimedRow(reply.is_ahead, order, key, {ROBOT_NAME: reply.name, **row})
+
+
 def _merge_rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) -> JsonObject:
     """Returns the rows of all replies in order of time, and what the replies have besides."""
     values = {reply.name: _as_rows(reply) for reply in replies}
@@ -444,16 +456,7 @@ def _merge_rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Pa
     # One robot may have episodes, another one sightings.
     keys = [name for name in times if any(name in value for value in values.values())]
     keys = keys or [*times][:1]
-    order: list[_TimedRow] = []
-    for reply in replies:
-        for key in keys:
-            for row in _objects(values[reply.name].get(key)):
-                time = row.get(times[key], 0)
-                # A row whose time is null goes on.
-                unix_s = math.inf if time is None else _number(time)
-                place = unix_s if page.oldest_first else -unix_s
-                named = {ROBOT_NAME: reply.name, **row}
-                order.append(_TimedRow(reply.is_ahead, place, key, named))
+    order = [timed for reply in replies for timed in _timed_rows(reply, times, page)]
     order.sort(key=attrgetter("is_ahead", "order"))
     # Each robot lists every named place, whatever the limit of visits is.
     shown = order if keys == ["places"] else order[: page.limit]

@@ -33,6 +33,8 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal, remove_bag, remove_emptied
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
@@ -86,22 +88,7 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
         cleared.add_fault(root, error)
         return cleared
     had_bags: dict[Path, bool] = {}
-    begin = len(str(root)) + 1
-
-    def add_fault(error: OSError) -> None:
-        if not _is_left_alone(error.filename[begin:]):
-            cleared.add_fault(error.filename, error)
-
-    for path, entries in directories.walk(root, add_fault):
-        if _is_left_alone(path[begin:]):
-            continue
-        folder = Path(path)
-        is_own = own.judge(path[begin:], known_identity(path)) if own else lambda _: True
-        bags = [
-            folder / entry.name
-            for entry in entries
-            if bag_kind(entry.name) and entry.is_file(follow_symlinks=False) and is_own(entry.name)
-        ]
+    for folder, bags in _bags_by_folder(root, own, cleared):
         for bag in bags:
             cleared.delete(root, bag, device)
         had_bags[folder] = bool(bags)
@@ -117,6 +104,32 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
     return cleared
 
 
+def _bags_by_folder(
+    root: Path, own: OwnRecordings | None, cleared: Cleared
+) -> Iterator[tuple[Path, Sequence[Path]]]:
+    """Yields each folder with its bags that may be deleted; a folder before those in it."""
+    begin = len(str(root)) + 1
+
+    def add_fault(error: OSError) -> None:
+        if not _is_left_alone(error.filename[begin:]):
+            cleared.add_fault(error.filename, error)
+
+    for path, entries in directories.walk(root, add_fault):
+        if _is_left_alone(path[begin:]):
+            continue
+        is_own = own.judge(path[begin:], known_identity(path)) if own else lambda _: True
+        yield (
+            Path(path),
+            [
+                Path(path, entry.name)
+                for entry in entries
+                if bag_kind(entry.name)
+                and entry.is_file(follow_symlinks=False)
+                and is_own(entry.name)
+            ],
+        )
+
+
 def _is_left_alone(name: str) -> bool:
     """Whether a path below the bag directory is hidden, or `lost+found`."""
     return "/." in f"/{name}" or name == LOST_AND_FOUND
@@ -129,10 +142,8 @@ def _remove_emptied(root: Path, folder: Path, *, had_bags: bool) -> None:
         with directories.opened(root, folder) as moment:
             if os.listdir(moment) == [MOMENT_FILE]:  # noqa: PTH208 - a descriptor has no path
                 os.unlink(MOMENT_FILE, dir_fd=moment)
-    if had_bags:
+    if had_bags or moments in (folder, folder.parent):
         remove_emptied(root, folder)
-    elif moments in (folder, folder.parent):
-        folder.rmdir()
 
 
 def refuse_homes(bag_dir: Path) -> None:

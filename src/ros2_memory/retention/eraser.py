@@ -203,10 +203,7 @@ class Eraser:
             OSError: what goes cannot be written down; nothing is changed then.
         """
         if not erasure.files:
-            windows = sum((holder.windows for holder in survey.holders), Counter[_Window]())
-            counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
-            paths = chain.from_iterable(holder.paths for holder in survey.holders)
-            erasure = replace(erasure, files=tuple(map(self._relative, paths)), counts=counts)
+            erasure = self._with_files(erasure, survey)
         ERASING.write(self.bag_dir, erasure)
         kept: list[str] = []
         linked: list[str] = []
@@ -230,6 +227,13 @@ class Eraser:
         except (EpisodicError, OSError) as error:
             kept.append(reason_of(error))
         return ErasureResult((*kept, *linked), tuple(notes))
+
+    def _with_files(self, erasure: Erasure, survey: Survey) -> Erasure:
+        """Returns an erasure with the files that have its messages, and how many these are."""
+        windows = sum((holder.windows for holder in survey.holders), Counter[_Window]())
+        counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
+        paths = chain.from_iterable(holder.paths for holder in survey.holders)
+        return replace(erasure, files=tuple(map(self._relative, paths)), counts=counts)
 
     def _delete_leftovers(self, erasure: Erasure) -> None:
         """Deletes the new files that an interrupted erasure left beside the bags."""

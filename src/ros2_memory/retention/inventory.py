@@ -163,17 +163,16 @@ class Inventory:
         Raises:
             OSError: the bag directory or the list of the recorder's own recordings cannot be read.
         """
-        device = self._root.stat().st_dev
-        if device != self._device:  # a disk may come back under another number
-            self._device, self._settled_bags, self._folders = device, {}, {}
+        self._drop_other_device()
         bags: list[StoredBag] = []
         other_bytes = state_bytes = state_bytes_in(self._root)
         foreign_bytes = 0
         recordings: set[str] = set()
         named = {str(self._root / name) for name in known.named}
+        judge = None
         if self._own is not None:
-            self._own.names()
-        judge = None if self._own is None else cache(self._own.judge_of)
+            self._own.names()  # reads the list anew, or fails
+            judge = cache(self._own.judge_of)
         for state, bag in chain(self._changing(known), self._settled(known)):
             path, recording = bag.path, bag.recording
             if path in deleted:
@@ -195,16 +194,27 @@ class Inventory:
             elif self._counts(state, bag):
                 other_bytes += sum(file.size for file in bag.files)
         other_bytes += sum(self._folder_at(path, known.now).size for path in recordings)
-        with suppress(OSError):
-            device = (self._root / MOMENTS_FOLDER).stat().st_dev
         return DirContents(
             bags,
             known.now,
             other_bytes,
-            saved={(device, stamp.inode): stamp.size for stamp in known.saved.values()},
+            saved=self._saved_sizes(known),
             foreign_bytes=foreign_bytes,
             state_bytes=state_bytes,
         )
+
+    def _drop_other_device(self) -> None:
+        """Drops what is known if the disk came back under another device number."""
+        device = self._root.stat().st_dev
+        if device != self._device:
+            self._device, self._settled_bags, self._folders = device, {}, {}
+
+    def _saved_sizes(self, known: KnownBags) -> dict[tuple[int, int], int]:
+        """Returns the sizes of the files of moments, by device and inode number."""
+        device = self._root.stat().st_dev
+        with suppress(OSError):
+            device = (self._root / MOMENTS_FOLDER).stat().st_dev
+        return {(device, stamp.inode): stamp.size for stamp in known.saved.values()}
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the few bags that may still change: the index has a note on each."""

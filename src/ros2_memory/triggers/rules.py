@@ -163,13 +163,14 @@ class SearchPart(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """What a search fired, in order.
+    """What a search fired, in order, and the log time up to which it came.
 
-    `stopped_at` is the log time at which its time was over; None if all is searched.
+    `is_complete`: whether it searched the whole chain before its time was over.
     """
 
     firings: list[Firing]
-    stopped_at: Ns | None
+    until: Ns
+    is_complete: bool
 
 
 class SearchChain(NamedTuple):
@@ -221,9 +222,9 @@ def chains_to_search(
 
 
 def horizons(ends: Mapping[str, Ns], live: Mapping[str, Ns | None], split_ns: Ns) -> dict[str, Ns]:
-    """Returns the log time before which no more messages can come that affect each recording.
+    """Returns for each recording the log time up to which it is complete.
 
-    It is MAX_NS for a recording that no live one affects.
+    Messages of a live recording may still come, and affect it and the recordings near its end.
 
     Args:
         ends: the last log time in the closed bags of each recording.
@@ -284,7 +285,7 @@ class SplitSearch:
             if not chain.goes_on:
                 state.rules[rule.name].runs.clear()  # the recorder did not run on
         firings: list[Firing] = []
-        stopped: Ns | None = None
+        until, is_complete = max(part.window.stop for part in chain.parts), True
         previous: Ns | None = None
         bags = (
             self._events(bag, part, state)
@@ -297,15 +298,13 @@ class SplitSearch:
                 continue
             # Messages of one log time are searched together: the next search begins after them.
             if previous is not None and event.time > previous and is_over():
-                stopped = event.time
+                until, is_complete = event.time, False
                 break
             previous = event.time
             firings += self._firings_at(event, state)
-        until = max(part.window.stop for part in chain.parts)
-        searched = until if stopped is None else min(stopped, until)
         for rule in self._rules:
-            firings += rule.reach(state.rules[rule.name].runs, searched)
-        return SearchResult(firings, stopped)
+            firings += rule.reach(state.rules[rule.name].runs, until)
+        return SearchResult(firings, until, is_complete)
 
     def _firings_at(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
         """Yields what a message fires; nothing for a repeated latched message."""

@@ -128,16 +128,12 @@ class Triggers:
         deadline = time.monotonic() + LOOK_S
         closed, live = self._closed_bags(snapshot, state)
         for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
-            firings, stopped_at = self.search.search(
-                chain, state, lambda: time.monotonic() > deadline
-            )
-            for firing in firings:
+            found = self.search.search(chain, state, lambda: time.monotonic() > deadline)
+            for firing in found.firings:
                 self._add_firing(firing, state, snapshot)
-            for part in chain.parts:
-                window = part.window
-                stop = window.stop if stopped_at is None else min(window.stop, stopped_at)
-                state.searched[part.recording] = max(stop, window.start)
-            if stopped_at is not None:
+            for recording, window, _ in chain.parts:
+                state.searched[recording] = max(min(window.stop, found.until), window.start)
+            if not found.is_complete:
                 break
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
