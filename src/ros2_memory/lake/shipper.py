@@ -120,6 +120,9 @@ class Shipper:
         alive: called for each bag.
         most_bags: how many bags a commit may have.
         patience_s: a bag directory that takes longer to answer is passed over.
+
+    Attributes:
+        done: what the current pass has done, or the last one.
     """
 
     lake: LakeTables
@@ -134,7 +137,14 @@ class Shipper:
 
     def __post_init__(self) -> None:
         """Forgets what an earlier shipper knew."""
+        self.done = Shipped()
         self.look_again()
+
+    def report(self, robot: RobotBags, problem: object) -> None:
+        """Adds a problem of a robot to the pass, unless it is known."""
+        sentence = f"{robot.name}: {problem}"
+        if sentence not in self.done.problems:
+            self.done.problems.append(sentence)
 
     def look_again(self) -> None:
         """Makes the next pass look at all bags again, in the directories and in the lake."""
@@ -147,20 +157,20 @@ class Shipper:
         Raises:
             LakeError: the lake cannot be read or written; what is not committed is tried again.
         """
-        done = Shipped()
+        self.done = Shipped()
         batch: list[_PreparedBags] = []
         size = bags = 0
-        robots = [robot for robot in self.robots if self._forget(robot, done)]
-        for ready in chain.from_iterable(robot.ready(self, done) for robot in robots):
-            batch.append(ready)
-            bags += len(ready.bags)
-            size += sum(rows.nbytes for rows in ready.rows.values())
+        robots = [robot for robot in self.robots if self._forget(robot)]
+        for prepared in chain.from_iterable(robot.prepare(self) for robot in robots):
+            batch.append(prepared)
+            bags += len(prepared.bags)
+            size += sum(rows.nbytes for rows in prepared.rows.values())
             if bags >= self.most_bags or size >= MOST_BYTES:
-                self._commit(batch, done, is_full=True)
+                self._commit(batch, is_full=True)
                 batch, size, bags = [], 0, 0
         if batch:
-            self._commit(batch, done, is_full=False)
-        return done
+            self._commit(batch, is_full=False)
+        return self.done
 
     def keep_up(self, grace: Ns) -> None:
         """Compacts closed days, and deletes files that no version of `grace` ago or later needs.
@@ -177,7 +187,7 @@ class Shipper:
         compact(self.lake, now, self.alive)
         expire(self.lake, now - grace if grace else MAX_NS)
 
-    def _forget(self, robot: RobotBags, done: Shipped) -> bool:
+    def _forget(self, robot: RobotBags) -> bool:
         """Deletes from the lake what was forgotten in a robot's bag directory.
 
         Returns False if that is not known: then nothing of the robot may be shipped.
@@ -187,32 +197,32 @@ class Shipper:
         """
         if not robot.answers(self.patience_s):
             why = "does not answer: is its disk reachable? Until it does, nothing of it is shipped"
-            done.problems.append(f"{robot.name}: {robot.bag_dir} {why}")
+            self.report(robot, f"{robot.bag_dir} {why}")
             return False
         try:
             wanted = [*map(partial(Tombstone.of, robot.name), read_forgettings(robot.bag_dir))]
         except (OSError, ValueError) as error:
             why = "until it is repaired, since what was forgotten could come back"
-            file = f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}"
-            done.problems.append(f"{file}; nothing of this robot is shipped {why}")
+            file = f"{robot.bag_dir / FORGOTTEN_FILE}: {error}"
+            self.report(robot, f"{file}; nothing of this robot is shipped {why}")
             return False
         new = [tombstone for tombstone in wanted if tombstone not in self.tombstones]
         # Before the tombstone: after a kill it repeats the deletion in the lake, not this one.
-        done.problems += robot.forget([tombstone.window for tombstone in new])
+        self.done.problems += robot.forget([tombstone.window for tombstone in new])
         for tombstone in new:
             append_tombstone(self.lake.location.state_dir, tombstone, done=False)
         for tombstone in new:
             self.alive()
             gone = forget_in_lake(self.lake, tombstone)
-            done.forgotten += gone.bags
-            kept = f"{robot.name}: a branch or tag keeps what was forgotten: "
-            done.problems += [f"{kept}{name}" for name in gone.kept_by]
+            self.done.forgotten += gone.bags
+            for name in gone.kept_by:
+                self.report(robot, f"a branch or tag keeps what was forgotten: {name}")
             self.tombstones.add(tombstone)
         if new:
             self.look_again()
         return True
 
-    def _commit(self, batch: Sequence[_PreparedBags], done: Shipped, *, is_full: bool) -> None:
+    def _commit(self, batch: Sequence[_PreparedBags], *, is_full: bool) -> None:
         """Commits a batch.
 
         Raises:
@@ -231,15 +241,15 @@ class Shipper:
         except LakeError:
             self.look_again()
             raise
-        done.bags += len(to_ship)
-        done.rows += rows
+        self.done.bags += len(to_ship)
+        self.done.rows += rows
         log.info("bags_shipped", bags=len(to_ship), rows=rows)
         for prepared in batch:
             robot = prepared.robot
             for one in prepared.bags:
                 for bag in one.replaced:
                     robot.known.pop(bag.bag_id, None)
-            robot.confirm([one.bag for one in prepared.bags], self, done)
+            robot.confirm([one.bag for one in prepared.bags], self)
 
 
 @dataclass(eq=False, repr=False)
@@ -319,36 +329,34 @@ class RobotBags:
             return [f"{self.name}: {error}"]
         return []
 
-    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBags]:
+    def prepare(self, shipper: Shipper) -> Iterator[_PreparedBags]:
         """Yields the bags to ship, the oldest first, with their rows."""
         snapshot = self.memory.index.refresh()
         if snapshot.problem is not None:
-            done.problems.append(f"{self.name}: {snapshot.problem}")
+            shipper.report(self, snapshot.problem)
             return
-        bags = self._settled(snapshot, done)
+        bags = self._settled(snapshot, shipper)
         self._load_known(bags, shipper.lake)
         batches = [] if self.filling is None else self.filling.batches(snapshot.timeline)
         waiting = {bag.file: batch for batch in batches for bag in batch.bags}
         group: list[_BagToShip] = []
-        for to_ship in self._to_ship(bags, shipper, done):
+        for to_ship in self._to_ship(bags, shipper):
             if group and not _fit_in_group([*group, to_ship], shipper.most_bags):
-                yield from self._with_rows(group, waiting, done)
+                yield from self._with_rows(group, waiting, shipper)
                 group = []
             group.append(to_ship)
         if group:
-            yield from self._with_rows(group, waiting, done)
+            yield from self._with_rows(group, waiting, shipper)
         if self.filling is not None:
             self._cut_to_share(self.filling)
         self._drop_gone(bags)
 
-    def _to_ship(
-        self, bags: Sequence[BagFile], shipper: Shipper, done: Shipped
-    ) -> Iterator[_BagToShip]:
+    def _to_ship(self, bags: Sequence[BagFile], shipper: Shipper) -> Iterator[_BagToShip]:
         """Yields the bags to ship; confirms the bags in the lake at the end."""
         by_file = {shipped.file: shipped for shipped in self.known.values()}
         receipts = cache(partial(read_receipts, self.bag_dir))
         confirmed = list[ShippedBag]()
-        for number, (bag, bag_id) in enumerate(self._identified_bags(bags, shipper, done)):
+        for number, (bag, bag_id) in enumerate(self._identified_bags(bags, shipper)):
             if number % _GROUP == 0:
                 maker = RowMaker(self.memory, self.config, self.messages)
             before, same_file = self.known.get(bag_id), by_file.get(self.name_of(bag))
@@ -357,7 +365,7 @@ class RobotBags:
                     continue
                 shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
             except (EpisodicError, OSError, ValueError) as error:
-                self._report(error, done)
+                shipper.report(self, error)
                 continue
             # A copy with another path and mtime has the same rows.
             if before and before == shipped._replace(mtime_ns=before.mtime_ns, file=before.file):
@@ -370,10 +378,10 @@ class RobotBags:
             ):
                 replaced.add(same_file)
             yield _BagToShip(bag, shipped, [*replaced])
-        self.confirm(confirmed, shipper, done)
+        self.confirm(confirmed, shipper)
 
     def _identified_bags(
-        self, bags: Sequence[BagFile], shipper: Shipper, done: Shipped
+        self, bags: Sequence[BagFile], shipper: Shipper
     ) -> Iterator[tuple[BagFile, str]]:
         """Yields the bags that may be in the lake with their ids, the oldest first, each bag once.
 
@@ -386,25 +394,20 @@ class RobotBags:
             try:
                 state = self._known_state(bag, shipper.tombstones)
             except (EpisodicError, OSError, ValueError) as error:
-                self._report(error, done)
+                shipper.report(self, error)
                 continue
             if state.bag_id in ids or (state.bag_id in self.known and bag.file in copies):
                 continue
             if state.is_forgotten:
                 do = "it is not shipped: delete it, or the messages, with ros2-memory forget"
                 why = f"{bag.file} has messages that were forgotten in the lake; {do}"
-                done.problems.append(f"{self.name}: {why}")
+                shipper.report(self, why)
                 continue
             ids.add(state.bag_id)
             yield bag, state.bag_id
 
-    def _report(self, error: Exception, done: Shipped) -> None:
-        problem = f"{self.name}: {error}"
-        if problem not in done.problems:  # receipts that cannot be read are so for each bag
-            done.problems.append(problem)
-
     def _with_rows(
-        self, group: Sequence[_BagToShip], waiting: dict[str, Batch], done: Shipped
+        self, group: Sequence[_BagToShip], waiting: dict[str, Batch], shipper: Shipper
     ) -> Iterator[_PreparedBags]:
         """Yields bags with their rows; a bag whose rows cannot be made is reported.
 
@@ -420,10 +423,10 @@ class RobotBags:
                 rows = self._rows(group)
         except (EpisodicError, OSError, ValueError) as error:
             if len(group) == 1:
-                done.problems.append(f"{self.name}: {error}")
+                shipper.report(self, error)
                 return
             for alone in group:
-                yield from self._with_rows([alone], waiting, done)
+                yield from self._with_rows([alone], waiting, shipper)
         else:
             yield _PreparedBags(self, group, rows)
 
@@ -453,7 +456,7 @@ class RobotBags:
         filling.thin()
         filling.trim()
 
-    def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
+    def _settled(self, snapshot: Snapshot, shipper: Shipper) -> Sequence[BagFile]:
         """Returns the closed bags that change no more; counts and reports the others."""
         now = self.memory.clock.now()
         closed = [
@@ -463,12 +466,12 @@ class RobotBags:
         ]
         bags = [bag for bag in closed if is_settled(bag, self.bag_dir, now)]
         open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
-        done.waiting += len(closed) - len(bags) + len(open_bags)
-        done.problems += [
-            f"{self.name}: {bag.file} was left open by a crash: ros2-memory recover closes it"
-            for bag in open_bags
-        ]
-        done.problems += [f"{self.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
+        shipper.done.waiting += len(closed) - len(bags) + len(open_bags)
+        for bag in open_bags:
+            why = "was left open by a crash: ros2-memory recover closes it"
+            shipper.report(self, f"{bag.file} {why}")
+        for file in snapshot.damaged:
+            shipper.report(self, f"{file.path}: {file.reason}")
         return bags
 
     def _load_known(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
@@ -533,7 +536,7 @@ class RobotBags:
             end_ns=bag.end,
         )
 
-    def confirm(self, bags: Sequence[ShippedBag], shipper: Shipper, done: Shipped) -> None:
+    def confirm(self, bags: Sequence[ShippedBag], shipper: Shipper) -> None:
         """Remembers that bags are in the lake, and writes receipts if a recorder made them."""
         self.known |= {bag.bag_id: bag for bag in bags}
         new = [bag for bag in bags if bag not in self._confirmed]
@@ -551,7 +554,7 @@ class RobotBags:
             self._confirmed.update(new)
         except OSError as error:
             what = f"no receipts can be written into {self.bag_dir} ({error.strerror or error})"
-            done.problems.append(f"{self.name}: {what}: its recorder cannot wait for shipping")
+            shipper.report(self, f"{what}: its recorder cannot wait for shipping")
 
 
 def _is_cut(
