@@ -48,15 +48,15 @@ def main() -> None:
         folder = Path(name)
         with LakeLocation(folder.as_uri(), folder / "state").writable() as lake:
             for day in range(DAYS):
-                lake.tables[TABLE].append(TABLES[TABLE].filled(rows_of(day)))
+                lake.tables[TABLE].append(TABLES[TABLE].to_arrow(rows_of(day)))
             until = WallClock().now() + NS_PER_S
             expire(lake, until)
             table = lake.current(TABLE)
-            print(f"read: {spent_us(lambda: Partitions().look(table)):.0f} us a file")
+            print(f"read: {spent_us(lambda: Partitions().read(table)):.0f} us a file")
             print(f"look for old ones: {spent_us(lambda: expire(lake, until)):.0f} us a file")
             tracemalloc.start()
             known = Partitions()
-            known.look(table)
+            known.read(table)
             print(f"in memory: {tracemalloc.get_traced_memory()[0] / FILES:.0f} B a file")
             tracemalloc.stop()
             lists = sum(path.stat().st_size for path in folder.rglob("*-m*.avro"))

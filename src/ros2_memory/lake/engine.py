@@ -111,7 +111,7 @@ class Lake:
         """
         with self._looking():
             table = self._loaded_table(name)
-            return {} if table is None else self._partitions[name].look(table)
+            return {} if table is None else self._partitions[name].read(table)
 
     def rows(
         self,

@@ -167,7 +167,7 @@ class RowMaker:
             keys = {name: getattr(shipped, name) for name in KEYS}
             for name, of_table in self._rows_of_bag(bag, shipped, derived).items():
                 rows[name] += ({**keys, **row} for row in of_table)
-        return {name: table.filled(rows[name]) for name, table in TABLES.items()}
+        return {name: table.to_arrow(rows[name]) for name, table in TABLES.items()}
 
     def _derive(self, bags: Collection[BagFile]) -> _Derived:
         """Reads the poses, events, things and detections of all bags at once."""

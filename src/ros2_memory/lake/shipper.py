@@ -35,7 +35,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
 from ros2_memory.lake.rows import RowMaker, bag_id_of, sha256_of
-from ros2_memory.lake.tables import TABLES, ShippedBag, day_of, of_bags, overlapping
+from ros2_memory.lake.tables import TABLES, ShippedBag, bags_condition, day_of, window_condition
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
@@ -231,7 +231,7 @@ class Shipper:
         self.before_commit(is_full)
         to_ship = [to_ship for prepared in batch for to_ship in prepared.bags]
         bags = [bag for one in to_ship for bag in (one.bag, *one.replaced)]
-        condition = of_bags((bag.robot, bag.day, bag.bag_id) for bag in bags)
+        condition = bags_condition((bag.robot, bag.day, bag.bag_id) for bag in bags)
         rows = 0
         try:
             for name in TABLES:
@@ -484,7 +484,7 @@ class RobotBags:
         if new:
             begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
             stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
-            of_time = overlapping(self.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
+            of_time = window_condition(self.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
             for row in lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
                 self.known.setdefault(row["bag_id"], ShippedBag(**row))
 

@@ -114,7 +114,7 @@ class LakeTable:
         return schema_to_pyarrow(self.schema, include_field_ids=False)
 
     def create(self, catalog: IcebergCatalog, identifier: str) -> IcebergTable:
-        """Creates the table, partitioned by robot and day, in the order that `sorted` makes."""
+        """Creates the table, partitioned by robot and day, in the order that `sort` makes."""
         ids = {name: self.schema.find_field(name).field_id for name in self.columns}
         same = IdentityTransform[Any]()
         parts = [
@@ -129,11 +129,11 @@ class LakeTable:
             properties={**_PROPERTIES, "write.parquet.row-group-limit": str(self.row_group)},
         )
 
-    def sorted(self, rows: pa.Table) -> pa.Table:
+    def sort(self, rows: pa.Table) -> pa.Table:
         """Returns rows in the order of the table."""
         return rows.sort_by([(name, "ascending") for name in self.order])
 
-    def filled(self, rows: Iterable[Row]) -> pa.Table:
+    def to_arrow(self, rows: Iterable[Row]) -> pa.Table:
         """Returns rows for Arrow, with `time` and `topic_key`. NaN becomes null, except in maps."""
         first = next((name for name in _FIRST_TIMES if name in self.columns), None)
         whole: list[Row] = []
@@ -225,12 +225,12 @@ def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.Bool
     return cast("Callable[[str, object], ex.BooleanExpression]", kind)(column, value)
 
 
-def of_robots(robots: Collection[str], day: date) -> ex.BooleanExpression:
+def robots_condition(robots: Collection[str], day: date) -> ex.BooleanExpression:
     """Returns the condition for the rows of robots on one day."""
     return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
 
 
-def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
+def ids_condition(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
     """Returns the condition for the rows of a robot's bags, on any day.
 
     The bounds of the ids let Iceberg pass over the files of other times.
@@ -243,20 +243,20 @@ def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
     )
 
 
-def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
+def bags_condition(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
     """Returns the condition for the rows of bags, given by robot, day and id."""
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
     days = [
-        ex.And(of_robots([robot], day), of_ids(robot, bag_ids))
+        ex.And(robots_condition([robot], day), ids_condition(robot, bag_ids))
         for (robot, day), bag_ids in ids.items()
     ]
     # One flat condition: nested ones would be deeper than Python allows after some years of days.
     return ex.Or(ex.AlwaysFalse(), ex.AlwaysFalse(), *days)
 
 
-def overlapping(
+def window_condition(
     robot: str, columns: tuple[str, str], window: TimeWindow, topics: Collection[str] = ()
 ) -> ex.BooleanExpression:
     """Returns the condition for the rows of a robot whose span reaches into a window.

@@ -26,7 +26,14 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.rows import bag_id_of
-from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, overlapping
+from ros2_memory.lake.tables import (
+    TABLES,
+    bags_condition,
+    day_of,
+    ids_condition,
+    robots_condition,
+    window_condition,
+)
 from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 
 if TYPE_CHECKING:
@@ -68,7 +75,7 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     for name in TABLES:
         for day, robots in _to_compact(lake.days(name), closed):
             alive()
-            lake.replace(name, of_robots(robots, day))
+            lake.replace(name, robots_condition(robots, day))
             done += len(robots)
     if done:
         log.info("days_compacted", days=done)
@@ -187,8 +194,8 @@ class Tombstone:
     def rows(self, first: str, last: str) -> BooleanExpression:
         """Returns the condition for the rows to delete; `first` and `last` are columns of times."""
         if self.bags:
-            return of_ids(self.robot, self.bags)
-        return overlapping(self.robot, (first, last), self.window, self.topics)
+            return ids_condition(self.robot, self.bags)
+        return window_condition(self.robot, (first, last), self.window, self.topics)
 
     def forbids(self, reader: BagReader, bag: BagFile, bag_id: str) -> bool:
         """Returns whether a bag of the robot has a forgotten message.
@@ -258,7 +265,7 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     bags = _bags_to_forget(lake, tombstone)
     # `channels` comes last: while it has a row of a bag, other tables may have some.
     for name in reversed([*TABLES]):
-        lake.delete(name, of_bags(bags))
+        lake.delete(name, bags_condition(bags))
     # Earlier versions still have the rows, so they go whatever their age is.
     files = expire(lake, MAX_NS)
     kept_by: list[str] = []
@@ -280,7 +287,7 @@ def _bags_to_forget(lake: LakeTables, tombstone: Tombstone) -> set[tuple[str, da
     of_any_topic = replace(tombstone, topics=())
     listed = _bags_where(lake, "bags", of_any_topic.rows("start_ns", "end_ns"))
     if tombstone.topics and listed:
-        ids = of_ids(tombstone.robot, {bag_id for _, _, bag_id in listed})
+        ids = ids_condition(tombstone.robot, {bag_id for _, _, bag_id in listed})
         listed -= _bags_where(lake, "channels", ids)
     return bags | listed
 

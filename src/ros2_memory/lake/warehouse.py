@@ -245,7 +245,7 @@ class LakeTables:
         """Returns the files of a table by robot; see `Partitions`."""
         table = self.current(name)
         with self.location.translated(f"looking into the lake's {name}"):
-            return Partitions().look(table)
+            return Partitions().read(table)
 
     def rows(
         self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
@@ -266,7 +266,7 @@ class LakeTables:
         def write(table: IcebergTable) -> None:
             # Read from the version that is replaced, so that no row is lost.
             whole = table.scan(condition).to_arrow() if rows is None else rows
-            table.overwrite(TABLES[name].sorted(whole), overwrite_filter=condition)
+            table.overwrite(TABLES[name].sort(whole), overwrite_filter=condition)
 
         self._commit(name, "writing", write)
 
@@ -395,7 +395,7 @@ class Partitions:
         self._by_manifest: dict[str, Sequence[_PartitionFile]] = {}
         self._robots: dict[str, dict[date, list[LakeFile]]] = {}
 
-    def look(self, table: IcebergTable) -> Mapping[str, Days]:
+    def read(self, table: IcebergTable) -> Mapping[str, Days]:
         """Returns the files of a table's current version; known manifests are not read again.
 
         Raises:

@@ -63,7 +63,7 @@ from ros2_memory.recorder.thinning import (
     times_near,
     with_shown_by,
 )
-from ros2_memory.retention.delete import beside
+from ros2_memory.retention.delete import new_file_beside
 from ros2_memory.retention.disk import FailingFiles
 from ros2_memory.storage.base import or_errors
 
@@ -522,7 +522,7 @@ class MemoryDays:
         From then on these bags, and those listed for the day before, no longer count.
         """
         name = f"{MEMORY_FOLDER}/{path.name}"
-        with beside(path) as new:
+        with new_file_beside(path) as new:
             self.writer.write(new, records, dense=True)
             status, known = new.stat(), Superseded()
             with suppress(ValueError):  # a damaged list is replaced

@@ -118,7 +118,7 @@ class _Pass:
     gave_up: bool = False
 
 
-class Outliving(Protocol):
+class DeletedBagMemory(Protocol):
     """What stays of bags that are deleted."""
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
@@ -162,7 +162,7 @@ class GarbageCollector:
     grace_s: float
     measure_free: Callable[[Path], int]
     monotonic: Callable[[], float]
-    memory: Outliving | None
+    memory: DeletedBagMemory | None
     cutter: TopicCutter | None
 
     def __post_init__(self) -> None:
@@ -240,7 +240,9 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
 
-    def _limit_memory(self, memory: Outliving, contents: DirContents, snapshot: Snapshot) -> None:
+    def _limit_memory(
+        self, memory: DeletedBagMemory, contents: DirContents, snapshot: Snapshot
+    ) -> None:
         # As bags do, days age by the newest that is recorded, and by a clock that is right.
         newest = snapshot.latest if contents.synchronised else None
         try:

@@ -32,7 +32,7 @@ def repair_name(name: str) -> str:
 
 
 @contextmanager
-def beside(path: Path) -> Iterator[Path]:
+def new_file_beside(path: Path) -> Iterator[Path]:
     """Yields a path beside a bag for its new content. No file has that path after the block.
 
     Raises:
@@ -99,7 +99,7 @@ def remove_emptied(root: Path, recording: Path) -> None:
             os.rmdir(recording.name, dir_fd=above)
 
 
-def beside_bags(recording: Path) -> int:
+def sidecar_bytes(recording: Path) -> int:
     """Returns the bytes of the files that are deleted with a recording's last bag."""
     size = 0
     with suppress(OSError), os.scandir(recording) as entries:

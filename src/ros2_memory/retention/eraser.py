@@ -50,15 +50,15 @@ from ros2_memory.core.model import COMPRESSED, UNMARKED_KINDS, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.file_state import reason_unread
-from ros2_memory.retention.delete import beside, repair_name
+from ros2_memory.retention.delete import new_file_beside, repair_name
 from ros2_memory.retention.repair import (
     Identity,
     correct_metadata_files,
     open_files,
-    opened_folder,
+    open_folder,
     reason_of,
     replace_file,
-    rewritten,
+    rewrite_without,
 )
 from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
@@ -353,7 +353,7 @@ class Eraser:
             before = os.fstat(old.fileno())
             if (before.st_dev, before.st_ino) != holder.inode:
                 raise BagError(str(path), "it is another file now; forget again")
-            with rewritten(
+            with rewrite_without(
                 self.bag_dir, path, before, self.writer, takes=erasure.takes, expected=holder.counts
             ) as new:
                 for other in holder.paths[1:]:
@@ -373,7 +373,7 @@ class Eraser:
 
     def _replace_link(self, new: Path, path: Path, inode: Identity) -> None:
         """Puts a new file in place of one name of the old one."""
-        with opened_folder(self.bag_dir, path) as here, beside(here) as name:
+        with open_folder(self.bag_dir, path) as here, new_file_beside(here) as name:
             os.link(new, name, follow_symlinks=False)
             replace_file(name, here, inode)
 

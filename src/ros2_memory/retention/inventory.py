@@ -32,7 +32,7 @@ from ros2_memory.core.directories import known_identity
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
-from ros2_memory.retention.delete import beside_bags, size_of
+from ros2_memory.retention.delete import sidecar_bytes, size_of
 from ros2_memory.retention.policy import DirContents, StoredBag, StoredFile
 
 if TYPE_CHECKING:
@@ -284,7 +284,7 @@ class Inventory:
         except OSError:
             return _Folder(0, device=-1, size=0)
         if folder is None or folder.mtime_ns != status.st_mtime_ns:
-            folder = _Folder(status.st_mtime_ns, status.st_dev, beside_bags(Path(path)))
+            folder = _Folder(status.st_mtime_ns, status.st_dev, sidecar_bytes(Path(path)))
             # metadata.yaml is created first and written some moments later.
             if abs(now - status.st_mtime_ns) >= COMPLETE_AFTER_NS:
                 self._folders[path] = folder

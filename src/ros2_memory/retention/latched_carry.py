@@ -39,7 +39,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import Spans, overlaps_any, united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.retention.delete import beside
+from ros2_memory.retention.delete import new_file_beside
 from ros2_memory.retention.disk import FailingFiles
 from ros2_memory.storage.base import or_errors
 
@@ -366,7 +366,7 @@ class Carrier:
             return
         folder.mkdir(exist_ok=True)
         try:
-            with beside(self.path) as new:
+            with new_file_beside(self.path) as new:
                 self.writer.write(new, records)
                 # Listed first: after a kill it would be foreign.
                 self.own.add_bags(folder, [CARRY_FILE])

@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.layout import METADATA_FILE
 from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.retention.delete import beside
+from ros2_memory.retention.delete import new_file_beside
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Repairer:
             BagError: the file cannot be repaired, and is unchanged.
         """
         try:
-            with opened_folder(self.root, path.absolute()) as here:
+            with open_folder(self.root, path.absolute()) as here:
                 return self._rewrite_if_open(here, path)
         except BagError as error:
             # The error has the path below the open directory in /proc.
@@ -106,7 +106,7 @@ class Repairer:
             return Repaired(0)
         if self.reader.closing(path) is Closing.CLOSED:
             return None
-        with beside(here) as new:
+        with new_file_beside(here) as new:
             result = self.writer.rewrite(here, new)
             _give_attributes(new, before, before.st_mtime_ns)
             after = here.lstat()
@@ -118,7 +118,7 @@ class Repairer:
 
 
 @contextmanager
-def opened_folder(root: Path, path: Path) -> Iterator[Path]:
+def open_folder(root: Path, path: Path) -> Iterator[Path]:
     """Yields the path of a file in its open folder, which stays valid if the folder is renamed.
 
     Raises:
@@ -137,7 +137,7 @@ def _give_attributes(new: Path, before: os.stat_result, mtime_ns: Ns) -> None:
 
 
 @contextmanager
-def rewritten(
+def rewrite_without(
     bag_dir: Path,
     path: Path,
     before: os.stat_result,
@@ -164,12 +164,12 @@ def rewritten(
         OSError: the file cannot be rewritten, or is another one now; or it was rewritten, and its
             folder cannot be flushed.
     """
-    with opened_folder(bag_dir, path) as here, here.open("rb") as old:
+    with open_folder(bag_dir, path) as here, here.open("rb") as old:
         try:
             fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)  # `forget` runs beside the recorder
         except BlockingIOError as error:
             raise BagError(str(path), "another program rewrites it; try again") from error
-        with beside(here) as new:
+        with new_file_beside(here) as new:
             if writer.cut(here, new, takes) != expected:
                 raise BagError(str(path), "its contents changed meanwhile")
             # A nanosecond later: nobody may take the new file for the old one.

@@ -28,7 +28,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.policy import DirContents, RetentionLimits, bags_older_than
-from ros2_memory.retention.repair import rewritten
+from ros2_memory.retention.repair import rewrite_without
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -219,7 +219,7 @@ class TopicCutter:
         if receipt is not None and receipt.size != before.st_size:
             receipt = None  # the bag has changed since it was shipped
         try:
-            with rewritten(
+            with rewrite_without(
                 self.bag_dir,
                 path,
                 before,

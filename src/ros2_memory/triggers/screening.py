@@ -43,7 +43,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import reason_of, rewritten
+from ros2_memory.retention.repair import reason_of, rewrite_without
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
     Cut,
@@ -428,7 +428,9 @@ class Screening:
             if split_number(recording, file) is None:
                 raise BagError(str(path), "it is not named as a split of its recording")
             status = path.lstat()
-            with rewritten(self.bag_dir, path, status, self.writer, takes=cut.takes, expected=gone):
+            with rewrite_without(
+                self.bag_dir, path, status, self.writer, takes=cut.takes, expected=gone
+            ):
                 pass
             _log.info("messages_excluded", recording=recording, file=file, messages=gone.total())
         self._excluded_latched -= newest.keys()

@@ -19,7 +19,7 @@ from pyiceberg.types import DateType, NestedField, StringType
 from ros2_memory.core.errors import LakeError, RefusedError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake.engine import Lake
-from ros2_memory.lake.tables import NAMESPACE, TABLES, of_bags, open_tables
+from ros2_memory.lake.tables import NAMESPACE, TABLES, bags_condition, open_tables
 from ros2_memory.lake.warehouse import LakeFile, LakeLocation
 from tests.support.bags import Msg, battery, detections, odom, text, write_mcap
 from tests.support.fleets import NOW, START_S
@@ -40,7 +40,7 @@ def test_rows_are_sorted_and_lie_by_robot_and_day_in_zstd(catalog: SqlCatalog) -
     table = open_tables(catalog, ["events"])["events"]
     row = {**KEYS, "topic": "/wheel/odom", "kind": "stop", "first_ns": 5_000_000_123, "x": 1.5}
     events = TABLES["events"]
-    table.append(events.sorted(events.filled([row, {**row, "first_ns": 1_000_000_000}])))
+    table.append(events.sort(events.to_arrow([row, {**row, "first_ns": 1_000_000_000}])))
     before, found = table.scan().to_arrow().to_pylist()
     assert before["time"].timestamp() == 1.0
     assert {name: found[name] for name in row} == row
@@ -71,14 +71,14 @@ def test_bags_of_years_are_deleted_at_once(catalog: SqlCatalog) -> None:
     table = open_tables(catalog, ["events"])["events"]
     days = [DAY + timedelta(days=nth) for nth in (0, 1, 599, 600)]
     rows = [{**KEYS, "day": day, "topic": "/odom", "first_ns": 0} for day in days]
-    table.append(TABLES["events"].filled(rows))
-    table.delete(of_bags(("hall", days[0] + timedelta(days=nth), "a") for nth in range(600)))
+    table.append(TABLES["events"].to_arrow(rows))
+    table.delete(bags_condition(("hall", days[0] + timedelta(days=nth), "a") for nth in range(600)))
     assert table.scan().to_arrow()["day"].to_pylist() == [days[-1]]
 
 
 def test_lone_surrogates_of_a_hostile_bag_are_escaped() -> None:
     texts = {"value": "bad \udc80", "texts": [("\udc80", "\udc81")]}
-    table = TABLES["messages"].filled([{**KEYS, "topic": "/\udc80", "time_ns": 1, **texts}])
+    table = TABLES["messages"].to_arrow([{**KEYS, "topic": "/\udc80", "time_ns": 1, **texts}])
     assert table["value"].to_pylist() == ["bad \\udc80"]
     assert table["topic_key"].to_pylist() == ["\\udc80"]
     assert table["texts"].to_pylist() == [[("\\udc80", "\\udc81")]]
@@ -88,7 +88,7 @@ def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
     tmp_path: Path,
 ) -> None:
     row = {**KEYS, "topic": "/seen", "first_ns": 0}
-    whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])
+    whole = TABLES["things"].to_arrow([{**row, "label": "cup", "spread_m": 0.1}])
     path = tmp_path / "old.parquet"
     pq.write_table(whole.drop_columns(["spread_m"]), path)
     lake, files = Lake(lake_in(tmp_path)), [LakeFile(path.as_uri())]
