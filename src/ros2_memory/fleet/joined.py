@@ -83,7 +83,7 @@ class JoinedIndex:
     def _joined(self, shipped: Snapshot, own: Snapshot, until: Ns) -> Snapshot:
         """Returns one snapshot of the bags in the lake, and own bags that begin up to `until`.
 
-        Own bags of older days than those of the lake (`Snapshot.older`) are left out.
+        Own bags of days before those that the lake shows (`Snapshot.older`) are left out.
         """
         if own.problem is not None:
             return shipped if shipped.timeline.segments else own
@@ -143,7 +143,7 @@ def _bags_not_in_lake(shipped: Snapshot, own: Timeline, until: Ns) -> list[BagFi
 def _without_shipped_days(
     bags: Sequence[BagFile], shipped: Timeline, deleted: Sequence[Span]
 ) -> list[BagFile]:
-    """Returns the bags without the thinned days of which the lake has all deleted bags.
+    """Returns the bags without the thinned days whose deleted bags are all in the lake.
 
     Days before the oldest of the `deleted` spans stay: whether the lake has their bags is unknown.
     """

@@ -138,7 +138,7 @@ _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
 def fleet_tools(
     tools: Sequence[Tool], fleet: Fleet, max_chars: int, at_once: int = AT_ONCE
 ) -> tuple[Tool, ...]:
-    """Returns the tools of a fleet, without those that write.
+    """Returns the tools of a fleet, without the tools that write.
 
     `max_chars` is how long a reply may be; if it would be longer, rows of whole robots are
     shortened. `at_once`: how many robots are asked at once.

@@ -45,7 +45,7 @@ _MOST_WINDOWS: Final = 6
 _GROUP: Final = 64
 """Bags of a day whose channels are read at once."""
 _NEAR_BYTES: Final = 4 << 20
-"""Packed messages that are read beside those of a bag: so many before it, and so many after."""
+"""Packed messages of so many bytes are read with a bag's, of the bags before it and after it."""
 _LOOKS: Final = 4
 """The lake is looked into anew after this fraction of the time that an index may be old."""
 _GONE: Final = "it is not in the lake any more"
@@ -396,7 +396,7 @@ class LakeReader(BagReader):
                 yield batch if inside.all() else batch.taken(inside)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
-        """Returns the channels of a bag; those of its group are read and cached with it.
+        """Returns the channels of a bag. The channels of its group are read and cached at once.
 
         Raises:
             BagVanishedError: the bag is not in the lake any more.
@@ -444,7 +444,7 @@ class LakeReader(BagReader):
         return packed
 
     def _ids_to_read(self, bag: LakeBag, number: int, topics: int) -> list[str]:
-        """Returns a bag's id, and those of as many bags beside it as `_NEAR_BYTES` may hold.
+        """Returns the ids of a bag and of the bags beside it whose messages fit in `_NEAR_BYTES`.
 
         The size is judged by the channel in bags of the group that were read before. If none was,
         the bag is read alone: the next one may not be asked for.

@@ -73,7 +73,7 @@ _MOST_BYTES: Final = 64 << 20
 _MAP_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"}
 """The map of `messages` that has values of a type."""
 _LARGEST: Final = 1 << 63
-"""The first integer beyond those of Iceberg."""
+"""The first integer that is too large for Iceberg."""
 _NO_SCORE: Final = -1
 _NOWHERE: Final = (math.nan, math.nan)
 _MM: Final = 1000.0
@@ -121,7 +121,7 @@ class _Derived(NamedTuple):
 class RowMaker:
     """Makes the rows of a robot's bags, all as one call sees the memory.
 
-    It keeps what it has read, so a long run takes a new one from time to time.
+    It remembers all that it has read, so a long run makes a new one from time to time.
 
     Args:
         memory: the memory over the bag directory.

@@ -55,7 +55,7 @@ MOST_BAGS: Final = 2_000
 MOST_BYTES: Final = 64 << 20
 """Bytes of one batch, whose rows are in memory until it is committed."""
 _GROUP: Final = 64
-"""Bags whose rows are made at once: what is read around one bag is needed for the next."""
+"""Bags whose rows are made at once: messages read around one bag are needed for the next."""
 PATIENCE_S: Final = 30.0
 """How long a bag directory may take to answer."""
 _BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
@@ -81,7 +81,7 @@ class Shipped:
 
 
 class _KnownState(NamedTuple):
-    """What is known of a bag while its size, mtime and sidecar are the same.
+    """The id of a bag, while its size, mtime and sidecar are the same.
 
     `is_forgotten`: whether it has messages that were forgotten.
     """
@@ -115,7 +115,7 @@ class Shipper:
         lake: the tables of the lake.
         robots: the robots whose bags are shipped.
         clock: dates the receipts.
-        tombstones: what was forgotten; a bag with forgotten messages is not shipped.
+        tombstones: the forgotten times; a bag with a forgotten message is not shipped.
         before_commit: called with whether the batch is full; may wait with a small batch.
         alive: called for each bag.
         most_bags: how many bags a commit may have.
@@ -152,10 +152,10 @@ class Shipper:
             robot.look_again()
 
     def run(self) -> Shipped:
-        """Ships what is new: one pass over all robots.
+        """Ships all new bags, in one pass over all robots.
 
         Raises:
-            LakeError: the lake cannot be read or written; what is not committed is tried again.
+            LakeError: the lake cannot be read or written; the next pass tries again.
         """
         self.done = Shipped()
         batch: list[_PreparedBags] = []
@@ -188,9 +188,9 @@ class Shipper:
         expire(self.lake, now - grace if grace else MAX_NS)
 
     def _forget(self, robot: RobotBags) -> bool:
-        """Deletes from the lake what was forgotten in a robot's bag directory.
+        """Deletes from the lake the messages that were forgotten in a robot's bag directory.
 
-        Returns False if that is not known: then nothing of the robot may be shipped.
+        Returns False if these are not known: then nothing of the robot may be shipped.
 
         Raises:
             LakeError: the lake cannot be written; it is finished when the lake is opened again.
@@ -265,8 +265,8 @@ class RobotBags:
         reader: reads whole files, also messages that count in another recording.
         config: names the settings that rows depend on.
         messages: the topics whose messages are shipped whole.
-        filling: stores the columns of bags, of which their rows are made; None: the bags are read
-            for each kind of row anew.
+        filling: stores the columns of bags, from which rows are made; None: each kind of row reads
+            the bags anew.
     """
 
     name: str
@@ -299,7 +299,7 @@ class RobotBags:
         return relative(bag.file, str(self.bag_dir))
 
     def look_again(self) -> None:
-        """Drops what is known of the bags."""
+        """Forgets the states and rows of all bags."""
         self._states: dict[str, _KnownState] = {}
         self.known: dict[str, ShippedBag] = {}
         self._confirmed: set[ShippedBag] = set()
@@ -489,7 +489,7 @@ class RobotBags:
                 self.known.setdefault(row["bag_id"], ShippedBag(**row))
 
     def _drop_gone(self, bags: Sequence[BagFile]) -> None:
-        """Drops what is known of bags that the robot has no longer."""
+        """Forgets the states and rows of bags that the robot no longer has."""
         names = {bag.file: self.name_of(bag) for bag in bags}
         self._states = {file: state for file, state in self._states.items() if file in names}
         ids, present = {state.bag_id for state in self._states.values()}, {*names.values()}

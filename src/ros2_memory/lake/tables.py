@@ -79,7 +79,7 @@ class LakeTable:
         row: what a row stands for.
         columns: the type and the meaning of each column, in order.
         order: the columns that rows are sorted by.
-        row_group: rows of a row group, so that engines skip those of other topics and labels.
+        row_group: how many rows a row group has: engines skip groups of other topics and labels.
     """
 
     name: str
@@ -221,7 +221,7 @@ def _encodable(value: object) -> object:
 
 
 def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.BooleanExpression:
-    # The constructors are not those that Pydantic's plugin for mypy takes them to have.
+    # Pydantic's plugin for mypy takes the constructors to have other parameters.
     return cast("Callable[[str, object], ex.BooleanExpression]", kind)(column, value)
 
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
 _FIRST_LOST: Final = 8
-"""One in so many bags is deleted first where what stays of them cannot be written."""
+"""One in so many bags is deleted first if the memory of them cannot be written."""
 
 _log = get_logger(__name__)
 
@@ -99,7 +99,7 @@ class _Pass:
         waiting: the remaining bags that can be deleted some moments later.
         saved: deleted bags whose files are saved in moments.
         unshipped: deleted bags that had to be shipped, in the order of deletion.
-        gave_up: whether bags were deleted though what stays of them could not be written.
+        gave_up: whether bags were deleted though the memory of them could not be written.
     """
 
     known: KnownBags
@@ -119,21 +119,21 @@ class _Pass:
 
 
 class DeletedBagMemory(Protocol):
-    """What stays of bags that are deleted."""
+    """The memory of deleted bags: a part of their messages, in fewer bytes."""
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
-        """Makes durable what stays of the bags.
+        """Stores the memory of bags durably, before they are deleted.
 
         Raises:
-            EpisodicError: a bag cannot be read, or what stays of it not be written.
+            EpisodicError: a bag cannot be read, or its memory not be written.
             OSError: the disk fails.
         """
 
     def limit(self, now: Ns | None) -> None:
-        """Deletes what is too old, or too much. `now` is what age counts from; None: nothing ages.
+        """Deletes days that are too old, or too many. Age counts from `now`; None: nothing ages.
 
         Raises:
-            OSError: it cannot be deleted.
+            OSError: a day cannot be deleted.
         """
 
 
@@ -144,8 +144,8 @@ class GarbageCollector:
     Args:
         recorded: how long was recorded after each recording.
         grace_s: how long latched messages are carried before their bag is deleted.
-        memory: what stays of deleted bags; None where nothing does.
-        cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
+        memory: the memory of deleted bags; None if nothing is remembered.
+        cutter: cuts topics with a shorter life out of bags that stay; None if there are none.
 
     Attributes:
         emptied: recordings that go with the next pass if no bag is left of them.
@@ -166,7 +166,7 @@ class GarbageCollector:
     cutter: TopicCutter | None
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Starts with nothing known."""
         self._memory_fails_since: float | None = None
         self._inventory = Inventory(
             self.bag_dir, self.static_topics, self.own if self.limits.keeps_foreign else None
@@ -222,7 +222,7 @@ class GarbageCollector:
         """Deletes bags until the limits are kept; returns what is left, and the last plan."""
         while True:
             contents = self._contents(run)
-            # Whole hours, so that what stays of an hour is written once.
+            # Whole hours, so that the memory of an hour is written once.
             plan = plan_deletions(contents, run.limits, whole_hours=self.memory is not None)
             going = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
             if going:
@@ -258,7 +258,7 @@ class GarbageCollector:
             _log.error("topics_not_cut", reason=error.strerror or str(error))
 
     def _contents(self, run: _Pass) -> DirContents:
-        """Returns what is stored, how long was recorded after it, and where the clock was right."""
+        """Returns the bags with all that the plan needs; counts those that the clock holds."""
         contents = self._inventory.contents(run.known, deleted=run.deleted, remaining=run.remaining)
         root = f"{self.bag_dir}{os.sep}"
         names = {bag.recording: self.own.name_of(bag.recording) for bag in contents.bags}
@@ -317,7 +317,7 @@ class GarbageCollector:
     def _bags_with_memory(
         self, going: list[StoredBag], contents: DirContents, run: _Pass
     ) -> list[StoredBag]:
-        """Writes what stays of bags; returns the bags that may be deleted now."""
+        """Writes the memory of bags; returns the bags that may be deleted now."""
         if self.memory is None:
             return going
         try:
@@ -331,7 +331,7 @@ class GarbageCollector:
     def _bags_that_must_go(
         self, going: list[StoredBag], contents: DirContents, run: _Pass, reason: str
     ) -> list[StoredBag]:
-        """Returns the bags to delete though what stays of them cannot be written; others remain.
+        """Returns the bags to delete though their memory cannot be written; the others remain.
 
         For a day, only the limits delete such bags, not their age. No bag goes only since others of
         its hour do. The first time in a pass few are returned: without them the disk may have room
@@ -399,7 +399,7 @@ class GarbageCollector:
         run.result.bytes += size
 
     def _remove_emptied(self, run: _Pass) -> None:
-        """Deletes what is left of recordings without a bag, except those being written."""
+        """Deletes the directories of recordings without a bag that are not being written."""
         self.emptied |= {Path(path).parent for path in run.deleted}
         for recording in self.emptied - {self.bag_dir / name for name in run.known.named}:
             try:

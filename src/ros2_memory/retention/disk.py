@@ -31,7 +31,7 @@ def free_bytes(directory: Path) -> int:
 
 
 def device_of(directory: Path) -> int:
-    """Returns the device of a directory; if it does not exist, that of its nearest parent.
+    """Returns the device of a directory, or of its nearest parent that exists.
 
     Raises:
         OSError: the directory cannot be looked at.

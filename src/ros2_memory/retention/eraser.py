@@ -255,7 +255,7 @@ class Eraser:
         append_losses(self.bag_dir, [loss for loss in losses if loss not in known])
 
     def _forget_silences(self, erasure: Erasure) -> None:
-        """Deletes the silences of forgotten topics and windows from what is known of deleted bags.
+        """Deletes the silences of forgotten topics and windows from the memory of deleted bags.
 
         Raises:
             BagError: the file is damaged, or a recorder runs, which alone may write it.

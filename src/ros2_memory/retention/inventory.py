@@ -204,7 +204,7 @@ class Inventory:
         )
 
     def _drop_other_device(self) -> None:
-        """Drops what is known if the disk came back under another device number."""
+        """Forgets bags and folders if the disk came back under another device number."""
         device = self._root.stat().st_dev
         if device != self._device:
             self._device, self._settled_bags, self._folders = device, {}, {}
@@ -292,7 +292,7 @@ class Inventory:
 
 
 def state_bytes_in(bag_dir: Path) -> int:
-    """Returns the size of what is stored beside the bags, columns and logs, in bytes."""
+    """Returns the bytes of the files beside the bags: state files, columns and logs."""
     paths = [bag_dir / name for name in (*OWN_FILES, LOCK_FILE)]
     moments = _entries(bag_dir / MOMENTS_FOLDER)
     paths += (moment / MOMENT_FILE for moment in moments if not moment.is_symlink())

@@ -82,7 +82,7 @@ def with_origin(record: Record, origin: Origin) -> Record:
 
 
 def origin_of(channel: Channel) -> Origin | None:
-    """Returns the origin of a carried message; None where its channel names none."""
+    """Returns the origin of a carried message; None if its channel names none."""
     metadata = dict(channel.metadata)
     try:
         recordings = json.loads(metadata.get(_RECORDINGS, "null"))
@@ -181,7 +181,7 @@ class Carrier:
     monotonic: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Starts with nothing known."""
         self.path = self.bag_dir / CARRY_FOLDER / CARRY_FILE
         self._static_topics = frozenset(self.static_topics)
         self._failing = FailingFiles(self.monotonic)

@@ -5,7 +5,7 @@ count; else the monotonic clock does: a bag is too old when more than `max_age_n
 after it. A bag that only its dates make too old is held. Where the clock was not known to be right
 when a bag was recorded, its dates never make it old: the monotonic clock alone does.
 
-Nor does age delete what rules may still need, or, where bags must be shipped, what is in no lake.
+Age deletes no bag that rules may still need, nor, if bags must be shipped, one that is in no lake.
 The budget and the disk do, the oldest first as ever.
 
 By dates, age counts from the newest recorded data, not from the wall clock: a robot that was
@@ -18,7 +18,7 @@ switched off does not erase itself when it wakes. Clocks step, so not every date
 - Where no bag is believed, as in simulated time, all are dated by their files.
 - Nothing is older than what was recorded before it: a bag that is dated before the newest of an
   earlier recording has a wrong date, and counts as recorded with the next that has a right one.
-  Likewise no more was recorded after a recording than after any that was listed before it.
+  In the same way, no more was recorded after a recording than after one that was listed before it.
 
 The budget deletes the oldest first. The recorder's recordings are in the order in which they were
 listed as they began, whatever their dates. Bags that were adopted lie between them by dates: a
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
 SMALL_BUDGET_GB: Final = 0.1
-"""Of a smaller budget, what is stored beside the bags may take a large part."""
+"""The files beside the bags may take a large part of a smaller budget."""
 GB: Final = 10**9
 """Bytes of a gigabyte, as configuration keys that end in `_gb` count them."""
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
@@ -135,8 +135,8 @@ class DirContents:
     """Everything that this program wrote to the bag directory.
 
     Attributes:
-        bags: those that may be deleted.
-        other_bytes: all else that counts: open bags, and what goes with a recording's last bag.
+        bags: the bags that may be deleted.
+        other_bytes: the bytes of all else that counts: open bags, and files beside bags.
         free_bytes: free disk space; None if that does not count.
         saved: the sizes of the files of moments, by inode (device and number), which are never
             deleted; bags may be other names of them.
@@ -145,8 +145,8 @@ class DirContents:
         doubtful: the recordings whose dates are not known to be right.
         foreign_bytes: the size of bags of other programs, which no limit counts.
         state_bytes: how much of `other_bytes` is no recording: `.episodic` and logs.
-        places: the place of each recording in the list of those that the recorder made; one that
-            is missing was adopted, and its order is unknown.
+        places: the place of each recording in the list of the recorder's own; a missing recording
+            was adopted, and its order is unknown.
         needed: bags that rules may still need; no age deletes them.
         unshipped: bags that must be shipped, and are in no lake; no age deletes them.
     """
@@ -287,7 +287,7 @@ def _aged_in_whole_hours(
 def _rest_of_hours(
     going: set[str], hours: Sequence[_Period], contents: DirContents, newest: str
 ) -> set[str]:
-    """Returns all bags of the hours from which bags go to make room, but not those that stay."""
+    """Returns the bags that go with others of their hour, which go to make room."""
     rest: set[str] = set()
     for hour in hours:
         paths = {bag.path for bag in hour}

@@ -75,7 +75,7 @@ class RecordedTime:
         """Counts the time since the last call, if recordings grew in it.
 
         Args:
-            recordings: those that are being written.
+            recordings: the recordings that are being written.
             bytes_written: how much all recordings wrote since the recorder started.
             monotonic_s: the monotonic clock, in seconds.
             now: the wall clock.

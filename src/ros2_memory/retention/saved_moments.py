@@ -165,7 +165,7 @@ class MomentKeeper:
     rule_bytes: Mapping[str, int]
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Starts with nothing known."""
         self._queue = RequestQueue(self.bag_dir)
         self._links = HardLinks(self.bag_dir)
         self._refused: set[Path] = set()  # moments of which the disk refused a link
@@ -404,7 +404,7 @@ class MomentKeeper:
 
 
 def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
-    """Whether what was recorded in one window may lie in the other; yes if unknown."""
+    """Whether messages of a window may lie in another one; yes if the first is unknown."""
     return recorded is None or not recorded.intersect(window).empty
 
 

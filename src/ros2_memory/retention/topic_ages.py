@@ -122,7 +122,7 @@ class TopicCutter:
     monotonic: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Starts with nothing known."""
         self._done: dict[str, tuple[Ns, frozenset[str]]] = {}
         self._waits_since_s: float | None = None
 

@@ -92,9 +92,10 @@ def add_message(
 def excluded_intervals(
     rule: ExclusionRule, recordings: Sequence[RecordingConditions]
 ) -> list[Excluded]:
-    """Returns the intervals to cut out, with the margin: those that held, then the unknown ones.
+    """Returns the intervals to cut out, margins included.
 
-    The two kinds may overlap. Recordings come in the order in which they began. A recording that
+    First come the intervals in which the condition held, then those in which it was unknown; the
+    two kinds may overlap. Recordings come in the order in which they began. A recording that
     begins before the one before it follows a clock that was set back, and learns from that one only
     that the condition held.
     """

@@ -90,7 +90,7 @@ class Rule:
     max_per_hour: int
 
     def window(self, first: Ns, fired: Ns) -> TimeWindow:
-        """Returns what is kept of a match that began at `first` and made the rule fire."""
+        """Returns the window to save for a match that began at `first` and made the rule fire."""
         return TimeWindow(max(first - self.before, MIN_NS + 1), min(fired + self.after, MAX_NS - 1))
 
     def take(
@@ -266,7 +266,7 @@ class SplitSearch:
     monotonic: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Starts with nothing known."""
         self._failing = FailingFiles(self.monotonic)
         self._rules = [rule for rule in self.rules if rule.kind != "recorder_restart"]
         self._watching: dict[str, tuple[Rule, ...]] = {}

@@ -116,7 +116,7 @@ class Screening:
     monotonic: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Starts with nothing known."""
         self._retry_s: dict[Path, float] = {}
         self._failing = FailingFiles(self.monotonic)
         self._split = ns_from_unix(self.split_duration_s)
@@ -181,7 +181,7 @@ class Screening:
         return self._excluded_latched.difference(rule.topic for rule in self.rules)
 
     def _run_step(self, names: Sequence[str], live: Collection[str]) -> None:
-        """Reads closed files, and releases those that can be released.
+        """Reads new closed splits, and releases the splits that no later message can affect.
 
         Raises:
             BagUnreachableError: the disk fails to read a bag, and may recover; the next step tries

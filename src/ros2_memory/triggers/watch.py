@@ -72,7 +72,7 @@ class Triggers:
     is_recorded: Callable[[str], bool]
 
     def __post_init__(self) -> None:
-        """Sets what is known at the beginning."""
+        """Starts with nothing known."""
         self._rules = {rule.name: rule for rule in self.rules}
         self._split = ns_from_unix(self.split_duration_s)
         self._state: TriggerState | None = None
@@ -88,7 +88,7 @@ class Triggers:
             self.restarts.append((first, at))
 
     def look(self, snapshot: Snapshot) -> None:
-        """Searches what was closed since the last look. Nothing may be deleted meanwhile.
+        """Searches the bags that were closed since the last look. Nothing may be deleted meanwhile.
 
         Raises:
             EpisodicError: the disk fails while bags are read; the next look tries again.
@@ -137,7 +137,7 @@ class Triggers:
                 break
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
-        """Returns the bags that are not searched, and those of the time before that rules save."""
+        """Returns the bags that are not searched, and those before that a match may save."""
         state = self._current_state(snapshot)
         before = max((rule.before for rule in self._rules.values()), default=0)
         reached = next(reversed(state.searched.values()), None)
