@@ -147,7 +147,7 @@ class Inventory:
     ) -> None:
         self._root = root
         self._own = own
-        self._static_topics = frozenset(static_topics)
+        self._static_topics = static_topics
         self._device: int | None = None
         self._settled_bags: dict[str, StoredBag] = {}
         self._folders: dict[str, _Folder] = {}

@@ -183,7 +183,6 @@ class Carrier:
     def __post_init__(self) -> None:
         """Starts with nothing known."""
         self.path = self.bag_dir / CARRY_FOLDER / CARRY_FILE
-        self._static_topics = frozenset(self.static_topics)
         self._failing = FailingFiles(self.monotonic)
         self._late: _LateMessages = {}
 
@@ -243,7 +242,7 @@ class Carrier:
         return tuple(
             topic
             for topic in snapshot.timeline.topics()
-            if topic in self._static_topics or snapshot.timeline.is_transient_state(topic)
+            if topic in self.static_topics or snapshot.timeline.is_transient_state(topic)
         )
 
     def _latched_in(
@@ -266,7 +265,7 @@ class Carrier:
 
     def _is_frequent(self, snapshot: Snapshot, topic: str, recording: Path) -> bool:
         """Whether a recording has frequent messages of a topic; never if they are transforms."""
-        if topic in self._static_topics or any(map(_is_tf, snapshot.timeline.types_of(topic))):
+        if topic in self.static_topics or any(map(_is_tf, snapshot.timeline.types_of(topic))):
             return False
         return not snapshot.timeline.pace(topic, recording).is_rare
 

@@ -221,9 +221,10 @@ def plan_deletions(
     order = _oldest_first(contents, dated, limits, periods[-1] if periods else [])
     newest = _newest_path(order, contents, periods)
     hours = _split_by_hour(order)
+    needed = contents.needed | contents.unshipped
     order = [bag for bag in order if bag.path != newest]
     if whole_hours:
-        aged = _aged_in_whole_hours(aged, hours, contents, newest)
+        aged = _aged_in_whole_hours(aged, hours, needed | {newest})
     left.delete_until_fits(order, aged, limits)
     most_free = None
     if left.free is not None and left.free < limits.min_free_bytes:
@@ -232,7 +233,7 @@ def plan_deletions(
         left.delete_until_fits(order, aged, limits)
     going = left.deleted
     if whole_hours:
-        going = going | _rest_of_hours(going - aged, hours, contents, newest)
+        going = going | (_rest_of_hours(going - aged, hours, newest) - needed)
     return DeletionPlan(
         tuple(bag for bag in order if bag.path in going),
         total,
@@ -272,28 +273,25 @@ def _split_by_hour(order: Sequence[StoredBag]) -> list[_Period]:
 
 
 def _aged_in_whole_hours(
-    aged: frozenset[str], hours: Sequence[_Period], contents: DirContents, newest: str
+    aged: frozenset[str], hours: Sequence[_Period], ageless: frozenset[str]
 ) -> frozenset[str]:
-    """Returns the aged bags of hours in which every bag is aged, or stays at any age."""
-    ignored = contents.needed | contents.unshipped | {newest}
+    """Returns the aged bags of hours in which all other bags are ageless."""
     whole: set[str] = set()
     for hour in hours:
         paths = {bag.path for bag in hour}
-        if paths <= aged | ignored:
+        if paths <= aged | ageless:
             whole |= paths & aged
     return frozenset(whole)
 
 
-def _rest_of_hours(
-    going: set[str], hours: Sequence[_Period], contents: DirContents, newest: str
-) -> set[str]:
-    """Returns the bags that go with others of their hour, which go to make room."""
+def _rest_of_hours(going: set[str], hours: Sequence[_Period], newest: str) -> set[str]:
+    """Returns all bags of the hours from which bags go, except for the hour of the newest bag."""
     rest: set[str] = set()
     for hour in hours:
         paths = {bag.path for bag in hour}
         if newest not in paths and not going.isdisjoint(paths):
             rest |= paths
-    return rest - contents.needed - contents.unshipped
+    return rest
 
 
 class _Remaining:

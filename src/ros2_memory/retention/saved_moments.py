@@ -313,7 +313,7 @@ class MomentKeeper:
             else:
                 reason = "nothing was recorded then: ask for a time at which something was"
             raise _MomentRefusedError(reason)
-        share = self._share_of(wanted, group)
+        share = self._share_of(wanted, stored)
         files = filter(None, (_file_of(bag.path) for bag in need.bags))
         if refused := share.refusal(files, sum(map(size_of, need.open_files))):
             raise _MomentRefusedError(refused)
@@ -327,7 +327,7 @@ class MomentKeeper:
         If the disk refuses a link, for example because it is full, the moment waits.
         """
         need = needed_bags(before.moment.request, snapshot, self.clock.now())
-        share = self._share_of(before.moment, self._group(before.moment, stored))
+        share = self._share_of(before.moment, stored)
         try:
             links = self._link_bags(before.folder, need.bags, share)
         except OSError as error:
@@ -359,13 +359,15 @@ class MomentKeeper:
     def _rule_of(self, moment: SavedMoment) -> str | None:
         return moment.rule if moment.rule in self.rule_bytes else None
 
-    def _share_of(self, moment: SavedMoment, group: Sequence[StoredMoment]) -> Share:
-        """Returns the share of a moment; `group` are the stored moments of this share."""
-        stored = {inode: size for other in group for inode, size in other.files.items()}
+    def _share_of(self, moment: SavedMoment, stored: Mapping[str, StoredMoment]) -> Share:
+        """Returns the share of a moment, with the files of the stored moments that use it."""
+        files: dict[int, int] = {}
+        for other in self._group(moment, stored):
+            files.update(other.files)
         rule = self._rule_of(moment)
         if rule is not None:
-            return Share(self.rule_bytes[rule], f"max_gb of the rule {rule}", stored)
-        return Share(max(self.share_bytes - sum(self.rule_bytes.values()), 0), _SHARE, stored)
+            return Share(self.rule_bytes[rule], f"max_gb of the rule {rule}", files)
+        return Share(max(self.share_bytes - sum(self.rule_bytes.values()), 0), _SHARE, files)
 
     def _link_bags(self, folder: Path, bags: Sequence[BagFile], share: Share) -> _Links:
         """Links bags into a moment's folder, as far as the share has room for them.
