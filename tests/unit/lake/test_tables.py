@@ -129,7 +129,7 @@ def test_rows_of_a_bag_are_the_same_whatever_bags_they_are_made_with(
     ROBOTS["twin"](tmp_path / "twin")
     found = []
     for together in (1, 3, 0):
-        monkeypatch.setattr("ros2_memory.lake.shipper._TOGETHER", together or 64)
+        monkeypatch.setattr("ros2_memory.lake.shipper._GROUP", together or 64)
         lake, robot = tmp_path / f"lake_{together}", robot_bags("twin", tmp_path / "twin")
         if not together:
             robot = replace(robot, memory=memory_of(tmp_path / "twin"), filling=None)
