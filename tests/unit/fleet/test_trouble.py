@@ -23,8 +23,8 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.timebase import Deadline
+from ros2_memory.fleet.replies import Page, RobotReply, merge_replies
 from ros2_memory.fleet.robots import FanOut, Fleet, Robot
-from ros2_memory.fleet.tools import Page, RobotReply, merge_replies
 from ros2_memory.history.context import Call
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.declaration import Tool
