@@ -275,4 +275,4 @@ class BagDirReader(BagReader):
 def _counted_batch(rule: FileRule, batch: Batch) -> Batch:
     """Returns the messages of a batch that count."""
     counts = [rule.counts(batch.record(nth)) for nth in range(batch.sizes.size)]
-    return batch if all(counts) else batch.taken(np.array(counts, np.bool_))
+    return batch if all(counts) else batch.select(np.array(counts, np.bool_))

@@ -50,8 +50,8 @@ from ros2_memory.storage.base import (
     IntArray,
     Mask,
     Schema,
-    or_errors,
-    unless_error,
+    errors_as_items,
+    raise_if_error,
 )
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def undecoded(
             or (kind.is_hashed and channel.topic not in alone)
         }
         group = Group(reader, skip_undecodable)
-        for batch in or_errors(reader.batches(path, wanted, window, bare=bare)):
+        for batch in errors_as_items(reader.batches(path, wanted, window, bare=bare)):
             if isinstance(batch, BagError):
                 yield batch
             elif batch.sizes.size:
@@ -171,7 +171,7 @@ def undecoded(
             yield group
 
     # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-    return map(unless_error, read())
+    return map(raise_if_error, read())
 
 
 @dataclass(slots=True)
@@ -404,7 +404,7 @@ def _pieces_of(batch: Batch) -> Iterator[Batch]:
         return
     numbers = np.cumsum(batch.sizes) // BATCH_BYTES
     for rows in np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers)) + 1):
-        yield batch.taken(rows)
+        yield batch.select(rows)
 
 
 def _as_one(
@@ -430,7 +430,7 @@ def _as_one(
     order = order_of(batch.log_times, bags, batch.places)
     if order is None:
         return batch, bags, is_hashed
-    return batch.taken(order), bags[order], is_hashed[order]
+    return batch.select(order), bags[order], is_hashed[order]
 
 
 def _joined_alike(parts: Sequence[Table]) -> list[Table]:

@@ -393,7 +393,7 @@ class LakeReader(BagReader):
                 raise BagError(bag.file.file, f"{topic} in the lake: {error}") from error
             inside = (batch.log_times >= window.start) & (batch.log_times < window.stop)
             if inside.any():
-                yield batch if inside.all() else batch.taken(inside)
+                yield batch if inside.all() else batch.select(inside)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
         """Returns the channels of a bag. The channels of its group are read and cached at once.

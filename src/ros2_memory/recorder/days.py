@@ -65,7 +65,7 @@ from ros2_memory.recorder.thinning import (
 )
 from ros2_memory.retention.delete import new_file_beside
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.storage.base import or_errors
+from ros2_memory.storage.base import errors_as_items
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -424,7 +424,7 @@ class MemoryDays:
         Raises:
             BagError: the disk fails to read the bag, and may recover.
         """
-        for record in or_errors(self.reader.records(path, topics, _EVERYTHING)):
+        for record in errors_as_items(self.reader.records(path, topics, _EVERYTHING)):
             if not isinstance(record, BagError):
                 yield record
             elif self._failing.may_recover(path, record):
@@ -436,7 +436,7 @@ class MemoryDays:
         Raises:
             BagUnreachableError: the disk fails to read the bag, and may recover.
         """
-        for group in or_errors(undecoded(self.reader, path, skip_undecodable=True)):
+        for group in errors_as_items(undecoded(self.reader, path, skip_undecodable=True)):
             if not isinstance(group, BagError):
                 yield from group.tables()
             elif self._failing.may_recover(path, group):

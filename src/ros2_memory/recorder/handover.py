@@ -50,7 +50,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import enclosing
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.recorder.policies import ClockReading, set_back
-from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
+from ros2_memory.storage.base import BagReader, Closing, Record, errors_as_items
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -643,7 +643,7 @@ def _readable_records(records: Iterator[Record]) -> Iterator[Record]:
     Raises:
         BagUnreachableError: the disk fails.
     """
-    for record in or_errors(records):
+    for record in errors_as_items(records):
         if isinstance(record, BagUnreachableError):
             raise record
         if not isinstance(record, BagError):

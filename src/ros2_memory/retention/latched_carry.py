@@ -41,7 +41,7 @@ from ros2_memory.core.spans import Spans, overlaps_any, united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.delete import new_file_beside
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.storage.base import or_errors
+from ros2_memory.storage.base import errors_as_items
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -282,7 +282,7 @@ class Carrier:
                 it must not be replaced by a bag without them.
             BagUnreachableError: the disk fails to read a bag, and may recover.
         """
-        for record in or_errors(self.reader.records(path, topics, TimeWindow.everything())):
+        for record in errors_as_items(self.reader.records(path, topics, TimeWindow.everything())):
             if not isinstance(record, BagError):
                 yield record
             elif isinstance(record, BagVanishedError):

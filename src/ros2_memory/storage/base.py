@@ -134,8 +134,8 @@ class Batch:
         log_time, publish_time = int(self.log_times[nth]), int(self.publish_times[nth])
         return Record(self.channel, log_time, publish_time, self.payload(nth))
 
-    def taken(self, rows: IntArray | Mask) -> Batch:
-        """Returns some of the messages, by their positions or by a mask, in the same buffer."""
+    def select(self, rows: IntArray | Mask) -> Batch:
+        """Returns the messages at these positions, or where the mask is set, in the same buffer."""
         return replace(
             self,
             log_times=self.log_times[rows],
@@ -155,8 +155,9 @@ class Field(NamedTuple):
 
     Attributes:
         name: as in the definition.
-        kind: a primitive type of ROS (`float64`, `string`), or that of a nested message.
-        length: None for a single value; of a fixed array its elements; else `SEQUENCE`.
+        kind: a primitive type of ROS (`float64`, `string`), or the definition of a nested message.
+        length: None for a single value, the number of elements for a fixed array, `SEQUENCE` for a
+            sequence.
     """
 
     name: str
@@ -166,44 +167,47 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Definition:
-    """The fields of a message type, with those of nested types, as its payloads have them.
+    """The fields of a message type and of its nested types.
 
-    Nested types that are the same are the same object: spelled out, a definition of some lines can
-    have more fields than there is memory for.
+    Equal nested types are one object: a definition of a few lines can nest so deep that its
+    spelled-out fields would not fit into memory.
     """
 
     type: str
     fields: tuple[Field, ...]
 
     def text(self) -> str:
-        """Returns it as `.msg` files, with those of nested types, as rosbag2 concatenates them.
+        """Returns the definition as rosbag2 writes it: `.msg` files, one after the other.
 
-        Constants and bounds are not in it: payloads do not have them.
+        The nested types follow the type itself. Constants and bounds are missing: payloads do not
+        have them.
         """
-        sections: dict[str, str] = {}
+        text = ""
+        written: set[str] = set()
         waiting = [self]
         while waiting:
             definition = waiting.pop()
-            if definition.type not in sections:
-                sections[definition.type] = "".join(map(_msg_line, definition.fields))
-                waiting += [
-                    field.kind for field in definition.fields if isinstance(field.kind, Definition)
-                ]
-        nested = [
-            f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n{lines}"
-            for name, lines in sections.items()
-            if name != self.type
-        ]
-        return "".join((sections[self.type], *nested))
+            if definition.type in written:
+                continue
+            written.add(definition.type)
+            if definition is not self:
+                text += f"{'=' * 80}\nMSG: {definition.type.replace('/msg/', '/')}\n"
+            for field in definition.fields:
+                text += _msg_line(field)
+                if isinstance(field.kind, Definition):
+                    waiting.append(field.kind)
+        return text
 
 
 def _msg_line(field: Field) -> str:
-    """Returns a field as a line of a `.msg` file."""
+    """Returns the line of a `.msg` file that declares a field."""
     kind = field.kind
     if isinstance(kind, Definition):
         kind = kind.type.replace("/msg/", "/")
+    if field.length is None:
+        return f"{kind} {field.name}\n"
     length = "" if field.length == SEQUENCE else field.length
-    return f"{kind} {field.name}\n" if length is None else f"{kind}[{length}] {field.name}\n"
+    return f"{kind}[{length}] {field.name}\n"
 
 
 class BagReader(ABC):
@@ -281,23 +285,23 @@ class BagReader(ABC):
     ) -> Iterator[Batch]:
         """Yields the messages of `records(path, topics, window)`, many at once, in any order.
 
-        Those of one buffer follow each other, one batch for each channel. No buffer has more than
-        64 MiB or one chunk, and this keeps none of them. Lazy: nothing is opened before the
-        first item is requested.
+        A buffer is shared by one batch for each channel, and these batches follow each other. A
+        buffer has at most 64 MiB or one chunk, and the reader keeps none. Lazy: nothing is opened
+        before the first item is requested.
 
         Args:
             path: the file.
             topics: as for `records`.
             window: as for `records`.
             bare: topics whose payloads are not needed. Where that saves reading a chunk, their
-                messages come as if their payloads were empty and published when they were logged;
-                then their times are those of the file's indexes, which nothing was compared with.
+                messages come with empty payloads and the log time as publish time. Their times are
+                then taken from the file's indexes and were not compared with the messages.
 
         Raises:
             BagVanishedError: the file is not there.
-            BagError: as by `records`: with `lost`, the iterator continues behind it. Where indexes
-                are found to contradict the messages (`BagContradictionError`), the messages that
-                were not yielded yet follow, and none is lost.
+            BagError: as by `records`: with `lost`, the iterator continues behind it.
+            BagContradictionError: the indexes contradict the messages. The iterator continues with
+                the messages that it has not yielded yet, and none is lost.
         """
 
     @abstractmethod
@@ -343,7 +347,7 @@ class BagReader(ABC):
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of a channel's messages; None if it is not CDR or has no definition.
 
-        It is the same object for the same channel while the reader remembers it.
+        While the reader remembers a channel, it returns the same object for it.
         """
         del channel
         return None
@@ -351,53 +355,56 @@ class BagReader(ABC):
 
 BATCH_BYTES: Final = 16 << 20
 """Payloads are joined in one buffer up to this size; a larger payload has one of its own."""
+MESSAGE_BYTES: Final = 200
+"""About how much memory a waiting message takes besides its payload."""
 
 
 def batched(items: Iterable[tuple[int, Record | T]]) -> Iterator[Batch | T]:
     """Yields messages in batches, with their payloads copied into common buffers.
 
     Args:
-        items: a place and a message, or a place and an error, which is passed on behind the
-            messages before it.
+        items: messages with their places in the file. Anything else among them, such as an error,
+            is yielded as it is, after the messages before it.
     """
-    waiting: list[tuple[int, Record]] = []
+    places: list[int] = []
+    records: list[Record] = []
     size = 0
     for place, item in items:
         if not isinstance(item, Record):
-            yield from _joined(waiting)
-            waiting, size = [], 0
+            yield from _batch_by_channel(places, records)
+            places, records, size = [], [], 0
             yield item
             continue
-        if waiting and size + len(item.payload) > BATCH_BYTES:
-            yield from _joined(waiting)
-            waiting, size = [], 0
-        waiting.append((place, item))
+        if records and size + len(item.payload) > BATCH_BYTES:
+            yield from _batch_by_channel(places, records)
+            places, records, size = [], [], 0
+        places.append(place)
+        records.append(item)
         size += len(item.payload) + MESSAGE_BYTES
-    yield from _joined(waiting)
+    yield from _batch_by_channel(places, records)
 
 
-MESSAGE_BYTES: Final = 200
-"""What a waiting message takes besides its payload, about."""
-
-
-def _joined(waiting: list[tuple[int, Record]]) -> Iterator[Batch]:
-    """Yields a batch for each channel."""
-    buffer = b"".join([record.payload for _, record in waiting])
-    sizes = np.array([len(record.payload) for _, record in waiting], np.int64)
+def _batch_by_channel(places: list[int], records: list[Record]) -> Iterator[Batch]:
+    """Yields a batch for each channel of the messages; all share one buffer."""
+    buffer = b"".join([record.payload for record in records])
+    sizes = np.array([len(record.payload) for record in records], np.int64)
+    log_times = np.array([record.log_time for record in records], np.int64)
+    publish_times = np.array([record.publish_time for record in records], np.int64)
     starts = np.cumsum(sizes) - sizes
-    channels: dict[int, tuple[Channel, list[int]]] = {}
-    for nth, (_, record) in enumerate(waiting):
-        channels.setdefault(id(record.channel), (record.channel, []))[1].append(nth)
-    log_times = np.array([record.log_time for _, record in waiting], np.int64)
-    publish_times = np.array([record.publish_time for _, record in waiting], np.int64)
-    places = np.array([place for place, _ in waiting], np.int64)
-    for channel, rows in channels.values():
-        whole = Batch(channel, log_times, publish_times, places, buffer, starts, sizes)
-        yield whole.taken(np.array(rows, np.int64))
+    # By identity: to hash a channel hashes the text of its definition.
+    rows_by_channel: dict[int, list[int]] = {}
+    for row, record in enumerate(records):
+        rows_by_channel.setdefault(id(record.channel), []).append(row)
+    for rows in rows_by_channel.values():
+        channel = records[rows[0]].channel
+        whole = Batch(
+            channel, log_times, publish_times, np.array(places, np.int64), buffer, starts, sizes
+        )
+        yield whole.select(np.array(rows, np.int64))
 
 
-def or_errors(items: Iterator[T]) -> Iterator[T | BagError]:
-    """Yields the items, and in place of those that are lost the errors that `next` raises."""
+def errors_as_items(items: Iterator[T]) -> Iterator[T | BagError]:
+    """Yields the items of a reader's iterator, and each `BagError` in place of what it lost."""
     while True:
         try:
             item = next(items)
@@ -410,8 +417,8 @@ def or_errors(items: Iterator[T]) -> Iterator[T | BagError]:
         del item  # and its buffer, before the next is read
 
 
-def unless_error(item: T | BagError) -> T:
-    """Returns the item; raises it where it is an error that `or_errors` has yielded."""
+def raise_if_error(item: T | BagError) -> T:
+    """Returns an item of `errors_as_items`; raises it if it is an error."""
     if isinstance(item, BagError):
         raise item
     return item
@@ -423,10 +430,10 @@ class Rewritten:
 
     Attributes:
         messages: how many were written.
-        lost_bytes: bytes of the source that made no whole record; how many messages never reached
-            the disk is unknown.
+        lost_bytes: bytes of the source that made no whole record. Nobody knows how many messages
+            never reached the disk.
         notes: sentences on what was lost.
-        last: log time of the newest message; None without one.
+        last: log time of the newest message; None without messages.
     """
 
     messages: int
@@ -436,20 +443,20 @@ class Rewritten:
 
     def describe_loss(self) -> str:
         """Returns a sentence on what was lost."""
-        kept = "no message reached the disk"
-        if self.last is not None:
-            kept = (
+        if self.last is None:
+            newest = "no message reached the disk"
+        else:
+            newest = (
                 f"the newest message is of {unix_from_ns(self.last):.3f}; later ones that had not "
                 "reached the disk are lost"
             )
-        return f"{kept}, and {counted(self.lost_bytes, 'byte')} of the file made no whole message"
+        return f"{newest}, and {counted(self.lost_bytes, 'byte')} of the file made no whole message"
 
 
 class BagWriter(ABC):
     """Writes closed, indexed bag files.
 
-    Every failure is raised as a `BagError` about the file to be written, with the
-    `reason`, and nothing is left of that file.
+    Every failure is raised as a `BagError` about the new file, and nothing is left of that file.
     """
 
     @abstractmethod
@@ -474,12 +481,12 @@ class BagWriter(ABC):
 
     @abstractmethod
     def rewrite(self, source: Path, target: Path) -> Rewritten:
-        """Writes all that can be read of a file that was cut short into one that is whole.
+        """Writes all that can be read of a file that was cut short into a whole file.
 
-        Schemas, channels, metadata, attachments, both times and sequence numbers are unchanged,
-        as is the order; incomplete records are left out. The target was read back and
-        compared with the source, and is on the disk, when this returns. There must be no file of
-        its name; the source is only read.
+        Schemas, channels, metadata, attachments, both times, sequence numbers and the order are
+        unchanged; incomplete records are left out. When this returns, the target was read back,
+        compared with the source and synced. There must be no file of its name; the source is only
+        read.
 
         Raises:
             BagVanishedError: the source is not there.
@@ -492,18 +499,18 @@ class BagWriter(ABC):
         self,
         source: Path,
         target: Path,
-        takes: Callable[[str, Ns, Ns], bool],
+        leaves_out: Callable[[str, Ns, Ns], bool],
     ) -> Counter[str]:
-        """Writes a whole file again, of any kind but compressed ones, without some messages.
+        """Copies a whole, uncompressed file without some messages.
 
-        All else is unchanged, as by `rewrite`, but for the metadata.yaml that rosbag2 embeds, which
-        counts messages: it is left out. The target was read back and compared, and is on the disk,
-        when this returns. There must be no file of its name; the source is only read.
+        All else is unchanged, as by `rewrite`. Only the metadata.yaml that rosbag2 embeds is left
+        out, since it counts messages. When this returns, the target was read back, compared and
+        synced. There must be no file of its name; the source is only read.
 
         Args:
             source: a file that its writer finished.
-            target: the new one.
-            takes: whether a message is left out, by topic, log time and publish time.
+            target: the new file.
+            leaves_out: whether a message is left out, by topic, log time and publish time.
 
         Returns:
             How many messages of each topic were left out.
