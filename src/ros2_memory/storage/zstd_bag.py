@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import threading
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -34,8 +35,15 @@ Uncompressed: TypeAlias = "Callable[[Channel, bytes], bytes]"
 
 FRAME_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _SKIPPABLE: Final = b"\x2a\x4d\x18"
+"""The magic of a skippable frame, behind its first byte, which is 0x50 to 0x5F."""
+_SKIPPABLE_HEADER: Final = struct.Struct("<II")
+"""Magic and size of a skippable frame."""
 _HEADER_BYTES: Final = 18
+"""The longest header of a frame."""
+_BLOCK_HEADER_BYTES: Final = 3
+_CHECKSUM_BYTES: Final = 4
 _RLE_BLOCK: Final = 1
+"""The kind of a block that is one byte, repeated as often as its size says."""
 _MAX_BLOCK_BYTES: Final = 128 << 10
 _MIN_BLOCK_BYTES: Final = 4
 _MAX_FRAMES: Final = 10_000
@@ -100,14 +108,14 @@ def _decompress_into(path: Path, target: Path, reserve: Callable[[int], None]) -
             out.write(piece)
 
 
-class _Own(threading.local):
+class _ThreadLocal(threading.local):
     """One decompressor a thread: a shared one corrupts data, a new one costs more than a chunk."""
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor()
 
 
-_OWN: Final = _Own()
+_THREAD: Final = _ThreadLocal()
 
 
 def decompress_zstd(compressed: bytes | memoryview, limit: SizeLimit) -> bytes:
@@ -117,34 +125,35 @@ def decompress_zstd(compressed: bytes | memoryview, limit: SizeLimit) -> bytes:
         UnreadableError: it decompresses to more than the limit, or states more than its blocks can
             decompress to.
     """
-    max_bytes, take_turn = limit
-    stated = zstandard.frame_content_size(compressed)
-    if stated > max_bytes:
-        raise UnreadableError(too_large("compressed data", max_bytes))
+    stated = zstandard.frame_content_size(compressed)  # negative where the frame does not state it
+    if stated > limit.max_bytes:
+        raise UnreadableError(too_large("compressed data", limit.max_bytes))
     # zstandard allocates the stated size, so it must be possible: no block takes fewer bytes, or
     # decompresses to more (RFC 8878, 3.1.1.2).
     if stated > (len(compressed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
         raise UnreadableError("damaged: compressed data states more than it can hold")
     if stated >= 0:
         if stated > LARGE_BYTES:
-            take_turn()
-        return _OWN.decompressor.decompress(compressed)
-    data = in_turn(partial(zstd_front, compressed), limit)
-    if len(data) > max_bytes:
-        raise UnreadableError(too_large("compressed data", max_bytes))
+            limit.take_turn()
+        return _THREAD.decompressor.decompress(compressed)
+    data = decompress_front(partial(zstd_front, compressed), limit)
+    if len(data) > limit.max_bytes:
+        raise UnreadableError(too_large("compressed data", limit.max_bytes))
     return data
 
 
-def in_turn(front: Callable[[int], bytes], limit: SizeLimit) -> bytes:
+def decompress_front(front: Callable[[int], bytes], limit: SizeLimit) -> bytes:
     """Returns at most one byte more than allowed, so that the caller sees the excess.
 
-    `front` decompresses so many bytes; it does so again, in its turn, where they are many.
+    Args:
+        front: decompresses the first bytes, at most as many as it is given. Data of more than
+            `LARGE_BYTES` is decompressed twice: the second time after `limit.take_turn`.
+        limit: the most that may be returned.
     """
-    max_bytes, take_turn = limit
-    data = front(min(LARGE_BYTES, max_bytes) + 1)
-    if LARGE_BYTES < len(data) <= max_bytes:
-        take_turn()
-        data = front(max_bytes + 1)
+    data = front(min(LARGE_BYTES, limit.max_bytes) + 1)
+    if LARGE_BYTES < len(data) <= limit.max_bytes:
+        limit.take_turn()
+        data = front(limit.max_bytes + 1)
     return data
 
 
@@ -155,7 +164,7 @@ def zstd_front(compressed: bytes | memoryview, size: int) -> bytes:
 
 
 def uncompressed_payload(channel: Channel, payload: bytes, limit: SizeLimit) -> bytes:
-    """Returns a serialized message as it was before rosbag2's message compression.
+    """Undoes rosbag2's message compression of a payload, if it is compressed.
 
     Nothing but the magic of the frame marks a compressed payload; no CDR message begins with it. A
     payload that cannot be decompressed, or not within the limit, is returned as it is: decoding
@@ -170,8 +179,8 @@ def uncompressed_payload(channel: Channel, payload: bytes, limit: SizeLimit) -> 
 
 
 def starts_as_zstd(file: OpenFile) -> bool:
-    """Returns whether it begins with the magic of a frame, as far as the file reaches."""
-    head = file.read(0, min(file.size, 4))
+    """Returns whether the file begins with the magic of a frame, as far as it reaches."""
+    head = file.read(0, min(file.size, len(FRAME_MAGIC)))
     return FRAME_MAGIC.startswith(head) or _is_skippable(head)
 
 
@@ -193,30 +202,30 @@ def ends_whole(file: OpenFile) -> bool:
     return position > 0
 
 
-def _is_skippable(head: bytes) -> bool:
-    return len(head) == 4 and head[0] & 0xF0 == 0x50 and head[1:] == _SKIPPABLE
+def _is_skippable(magic: bytes) -> bool:
+    """Returns whether four bytes are the magic of a skippable frame (RFC 8878, 3.1.2)."""
+    return len(magic) == 4 and magic[0] & 0xF0 == 0x50 and magic[1:] == _SKIPPABLE
 
 
 def _frame_end(file: OpenFile, start: int) -> int | None:
     """Returns where the frame at `start` ends; None if the file ends before that is known."""
     head = file.read(start, min(_HEADER_BYTES, file.size - start))
     if _is_skippable(head[:4]):
-        if len(head) < 8:
+        if len(head) < _SKIPPABLE_HEADER.size:
             return None
-        return start + 8 + int.from_bytes(head[4:8], "little")
+        _, size = _SKIPPABLE_HEADER.unpack_from(head)
+        return start + _SKIPPABLE_HEADER.size + int(size)
     try:
         position = start + zstandard.frame_header_size(head)
-        checksum = 4 if zstandard.get_frame_parameters(head).has_checksum else 0
+        has_checksum = zstandard.get_frame_parameters(head).has_checksum
     except zstandard.ZstdError:
         return None
-    blocks = 0
-    while position + 3 <= file.size:
-        blocks += 1
-        if blocks > _MAX_BLOCKS:
-            raise UnreadableError(f"damaged: it is made of more than {_MAX_BLOCKS} blocks")
-        header = int.from_bytes(file.read(position, 3), "little")
-        last, kind, size = header & 1, header >> 1 & 3, header >> 3
-        position += 3 + (1 if kind == _RLE_BLOCK else size)
-        if last:
-            return position + checksum
-    return None
+    for _ in range(_MAX_BLOCKS):
+        if position + _BLOCK_HEADER_BYTES > file.size:
+            return None
+        header = int.from_bytes(file.read(position, _BLOCK_HEADER_BYTES), "little")
+        is_last, kind, size = header & 1, header >> 1 & 3, header >> 3
+        position += _BLOCK_HEADER_BYTES + (1 if kind == _RLE_BLOCK else size)
+        if is_last:
+            return position + (_CHECKSUM_BYTES if has_checksum else 0)
+    raise UnreadableError(f"damaged: it is made of more than {_MAX_BLOCKS} blocks")

@@ -24,7 +24,7 @@ from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import UnreadableError, reading
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap.bulk import ReadChunks
-from ros2_memory.storage.mcap.chunk import Pairs
+from ros2_memory.storage.mcap.chunk import MessageTable
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, boolean, definition, odom, text, write_mcap
@@ -228,9 +228,9 @@ def test_of_a_damaged_file_batches_hold_what_records_do(seed: int, how: McapLayo
 
 def test_a_place_past_all_that_can_be_counted_is_damage() -> None:
     content = ReadChunks((), bytes(200), [100, 100])
-    pairs = Pairs(*np.array([[1], [0], [2**63 - 1], [1]]))
+    messages = MessageTable(*np.array([[1], [0], [2**63 - 1], [1]]))
     with pytest.raises(UnreadableError, match="a message is not where its index says"):
-        bulk.compared(content, pairs)
+        bulk.message_heads(content, messages)
 
 
 def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:

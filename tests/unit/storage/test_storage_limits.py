@@ -141,7 +141,7 @@ def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into
 
 def test_a_chunk_of_more_messages_than_are_kept_in_mind_is_refused() -> None:
     one = message(1, 5, b"").data
-    assert walk_chunk(one * 10).messages == 10
+    assert walk_chunk(one * 10).message_count == 10
     with pytest.raises(UnreadableError, match=f"more than {MAX_CHUNK_MESSAGES} messages"):
         walk_chunk(one * (MAX_CHUNK_MESSAGES + 40_000))
 

@@ -44,22 +44,23 @@ from ros2_memory.storage.mcap.bulk import (
     ReadChunks,
     bare_batches,
     batches_of,
-    compared,
+    message_heads,
     read_groups,
     require_declared,
 )
 from ros2_memory.storage.mcap.chunk import (
     Chunk,
-    Pairs,
-    believed_pairs,
+    MessageTable,
     chunk_data,
-    pairs_in,
+    read_indexes,
+    read_trusted_index,
     walk_chunk,
 )
 from ros2_memory.storage.mcap.index import (
     DoubtError,
     McapIndex,
-    index_from_summary,
+    checked_index,
+    trusted_index,
 )
 from ros2_memory.storage.mcap.merge import RunRows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
@@ -75,12 +76,14 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.storage.mcap.records import Declarations
 
 _LARGE_BYTES: Final = 8 << 20
 _VERIFIED_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to verify their message indexes."""
 _MOST_VERDICTS: Final = 100_000
-_NEXT_BUT_ONE: Final = 2
+_TABLE_BYTES: Final = 600
+"""About what a cached table of messages takes besides its columns."""
 _EVERYTHING: Final = TimeWindow.everything()
 
 
@@ -116,17 +119,17 @@ class McapBags:
         self.limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
         # Many programs write chunks of 4 MiB.
         self.chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) * 3 // 4)
-        self.indexes: ByteLru[McapIndex | Pairs] = ByteLru((cache_mb << 20) // 4)
-        # How the indexes of files were found wrong, "" where they are right: by the hashes of their
-        # keys, since to fill a store each file of a history is read twice.
+        self.indexes: ByteLru[McapIndex | MessageTable] = ByteLru((cache_mb << 20) // 4)
+        # By hashes of file keys, which are small: to fill a store each file of a history is read
+        # twice.
         self._verdicts: dict[int, str] = {}
 
     def verdict(self, file: OpenFile) -> str | None:
-        """Returns how the indexes of a file were found wrong; None if nothing is known."""
+        """Returns how the indexes of a file are wrong; "" if right, None if they were not read."""
         return self._verdicts.get(hash(file.key))
 
-    def judge(self, file: OpenFile, verdict: str = "") -> None:
-        """Remembers how the indexes of a file were found wrong, or that they are right."""
+    def set_verdict(self, file: OpenFile, verdict: str) -> None:
+        """Remembers how the indexes of a file are wrong; "" means that they are right."""
         if len(self._verdicts) >= _MOST_VERDICTS:
             self._verdicts.clear()
         self._verdicts[hash(file.key)] = verdict
@@ -139,7 +142,7 @@ class McapBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with OpenFile(path, at_once=True) as file:
-            index = _Reading(self, file, has_totals=True).verified()
+            index = _Reading(self, file, has_totals=True).verified_index()
         return index.contents.summary(index.channels, index.notes, complete=index.complete)
 
     def channels(self, path: Path) -> Sequence[Channel]:
@@ -196,70 +199,72 @@ class _Reading:
             return index
         verdict = bags.verdict(file)
         if verdict:
-            return self._index_without_indexes(verdict)
+            return self._scan_contradicted(verdict)
         if not is_finished(file):
-            return self._remembered(index_by_scan(file, bags.limit))
+            return self._cache(index_by_scan(file, bags.limit))
         try:
-            index = index_from_summary(file, is_sound=not has_totals and verdict is not None)
-            bags.judge(file)
+            is_checked = verdict is not None
+            index = trusted_index(file) if is_checked and not has_totals else checked_index(file)
         except DoubtError as doubt:
             index = index_by_scan(file, bags.limit, str(doubt))
         except UnreadableError as error:
-            return self._without_indexes(error)
-        return self._remembered(index)
+            return self._index_without(error)
+        else:
+            bags.set_verdict(file, "")
+        return self._cache(index)
 
-    def _remembered(self, index: McapIndex) -> McapIndex:
+    def _cache(self, index: McapIndex) -> McapIndex:
+        """Caches the index of the file, and returns it."""
         self._bags.indexes.put(self._file.key, index, index.memory_bytes)
         return index
 
-    def _without_indexes(self, error: UnreadableError) -> McapIndex:
-        """Returns an index of the messages themselves, in place of one that was found wrong."""
-        reason = f"{error}; {READ_WITHOUT_INDEXES}"
-        # Kept apart from the index: not every read that follows would find it out again.
-        self._bags.judge(self._file, reason)
-        return self._index_without_indexes(reason)
+    def _index_without(self, error: UnreadableError) -> McapIndex:
+        """Returns an index of the messages themselves, after an error in the file's own indexes."""
+        contradiction = f"{error}; {READ_WITHOUT_INDEXES}"
+        # Not in the cached index alone: when that is gone, not every read finds it out again.
+        self._bags.set_verdict(self._file, contradiction)
+        return self._scan_contradicted(contradiction)
 
-    def _index_without_indexes(self, reason: str) -> McapIndex:
-        index = index_by_scan(self._file, self._bags.limit, reason)
-        return self._remembered(index._replace(contradiction=reason))
+    def _scan_contradicted(self, contradiction: str) -> McapIndex:
+        """Scans a file whose indexes are wrong, and returns the index of its messages."""
+        index = index_by_scan(self._file, self._bags.limit, contradiction)
+        return self._cache(index._replace(contradiction=contradiction))
 
-    def verified(self) -> McapIndex:
-        """Returns the index if its first and last times agree with the messages; else another.
+    def verified_index(self) -> McapIndex:
+        """Compares the index with the chunks at the first and last times of channels.
 
         A bag is chosen for a question by these times: a wrong one would hide its messages.
+
+        Returns:
+            The index, or an index of the messages themselves if it is wrong.
         """
-        index, declared = self.index, self.index.declared
-        if declared is None:  # it was made of the messages
-            return index
-        totals = index.contents.totals.values()
-        ends = sorted({end for total in totals for end in (total.first, total.last)})
-        odd = (*index.chunks[:1], *index.chunks[-1:], *_out_of_order(index.chunks))
-        looked_at = {chunk.offset for chunk in odd}
-        left = _VERIFIED_BYTES
-        chosen: list[Chunk] = []
-        for chunk in index.chunks:
-            nth = bisect_left(ends, chunk.start)
-            is_end = nth < len(ends) and ends[nth] <= chunk.end
-            if not (is_end or chunk.offset in looked_at):
-                continue
-            left -= chunk.length
-            if left < 0:
-                break
-            chosen.append(chunk)
-        for group in read_groups(self._file, chosen, self._bags.limit):
+        declared = self.index.declared
+        if declared is None:  # the index comes from the messages themselves
+            return self.index
+        chunks = _chunks_to_verify(self.index)
+        for group in read_groups(self._file, chunks, self._bags.limit):
             try:
                 require_declared(group, declared)
             except UnreadableError:
-                for chunk in group.chunks:
-                    try:
-                        content = self._content(chunk)
-                    except UnreadableError:
-                        continue
-                    try:
-                        require_declared(content, declared)
-                    except UnreadableError as error:
-                        return self._without_indexes(error)
-        return index
+                fault = self._first_fault(group.chunks, declared)
+                if fault is not None:
+                    return self._index_without(fault)
+        return self.index
+
+    def _first_fault(
+        self, chunks: Sequence[Chunk], declared: Declarations
+    ) -> UnreadableError | None:
+        """Returns how the indexes of a chunk are wrong; None if they are right, or unreadable."""
+        for chunk in chunks:
+            try:
+                content = self._read_chunk(chunk)
+            except UnreadableError:
+                continue  # its messages are lost, which says nothing about the indexes
+            try:
+                require_declared(content, declared)
+            except UnreadableError as error:
+                return error
+        return None
 
     def records(self, *, newest_first: bool) -> Iterator[Record | LostError]:
         """Yields the messages in order, and errors where some are lost."""
@@ -268,28 +273,27 @@ class _Reading:
         try:
             yield from merged(self._runs(newest_first=newest_first), newest_first=newest_first)
         except _ContradictedError as error:
-            # Raised in place of a run: what was yielded lies before all that the run can hold.
-            believed, self.index = self.index, self._without_indexes(error)
+            # Raised in place of a run: what was yielded lies before all messages of the run.
+            wrong, self.index = self.index, self._index_without(error)
             yield self._contradiction()
-            self._window, passed = _split_window(
-                self._window, error.chunk, newest_first=newest_first
-            )
-            if overlooked := _overlooked(believed, self.index, self._wanted, passed):
-                yield LostError(str(error), *overlooked)
+            self._window, read = _split_window(self._window, error.chunk, newest_first=newest_first)
+            missed = _missed_span(wrong, self.index, self._wanted, read)
+            if missed is not None:
+                yield LostError(str(error), *missed)
             yield from merged(self._runs(newest_first=newest_first), newest_first=newest_first)
 
     def batches(self, bare: Collection[str]) -> Iterator[Batch | LostError]:
         """Yields the messages many at once, and errors where some are lost."""
         if self.index.contradiction:
             yield self._contradiction()
-        passed: dict[int, Chunk] = {}
+        yielded: dict[int, Chunk] = {}
         try:
-            yield from self._batches(bare, passed)
+            yield from self._batches(bare, yielded)
         except _ContradictedError as error:
-            self.index = self._without_indexes(error)
+            self.index = self._index_without(error)
             yield self._contradiction()
-            for chunk in _with_any(self.index, self._wanted, self._window):
-                yield from self._batches_of_chunk(chunk, passed.get(chunk.offset))
+            for chunk in _chunks_of(self.index, self._wanted, self._window):
+                yield from self._batches_of_chunk(chunk, yielded.get(chunk.offset))
 
     def _contradiction(self) -> ContradictionError:
         return ContradictionError(
@@ -298,7 +302,7 @@ class _Reading:
 
     @property
     def _wanted(self) -> dict[int, Channel]:
-        """The channels of the topics that have messages."""
+        """The channels of the topics that have messages, by number."""
         used = self.index.used
         return {
             number: channel
@@ -307,78 +311,84 @@ class _Reading:
         }
 
     def _batches(
-        self, bare: Collection[str], passed: dict[int, Chunk]
+        self, bare: Collection[str], yielded: dict[int, Chunk]
     ) -> Iterator[Batch | LostError]:
-        """Yields the messages of chunks, and adds these to `passed`.
+        """Yields the messages of all chunks.
 
-        Chunks that have only `bare` topics of those wanted are known by their indexes alone.
+        Args:
+            bare: topics whose payloads are not needed: a chunk that is wanted for them alone is
+                not read, only its indexes.
+            yielded: receives each chunk when its messages were yielded, by offset.
 
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records.
         """
         file, wanted, window = self._file, self._wanted, self._window
-        read = {number for number, channel in wanted.items() if channel.topic not in bare}
-        chunks = [*_with_any(self.index, wanted, window)]
-        indexed = [chunk for chunk in chunks if chunk.index_places is not None]
-        together = [chunk for chunk in indexed if not chunk.channels.isdisjoint(read)]
-        if wanted:
-            # Those of which all is wanted are compared when they are read.
-            self._require_beside(
-                {chunk.offset for chunk in together if chunk.channels <= wanted.keys()}
-            )
-        for group in read_groups(file, together, self._bags.limit):
-            yield from self._batches_of_group(group, passed)
-            del group  # before the next is read
-        for chunk in chunks:
+        with_payload = {number for number, channel in wanted.items() if channel.topic not in bare}
+        unindexed: list[Chunk] = []
+        read: list[Chunk] = []
+        unread: list[Chunk] = []
+        for chunk in _chunks_of(self.index, wanted, window):
             if chunk.index_places is None:
-                yield from self._batches_of_chunk(chunk)
-        unread = [chunk for chunk in indexed if chunk.channels.isdisjoint(read)]
+                unindexed.append(chunk)
+            elif chunk.channels.isdisjoint(with_payload):
+                unread.append(chunk)
+            else:
+                read.append(chunk)
+        if wanted:
+            # If all channels of a chunk are wanted, it is compared when it is read.
+            self._verify_beside({chunk.offset for chunk in read if chunk.channels <= wanted.keys()})
+        for group in read_groups(file, read, self._bags.limit):
+            yield from self._batches_of_group(group, yielded)
+            del group  # before the next is read
+        for chunk in unindexed:
+            yield from self._batches_of_chunk(chunk)
         yield from bare_batches(file, unread, wanted, window)
-        passed.update({chunk.offset: chunk for chunk in unread})
+        yielded.update({chunk.offset: chunk for chunk in unread})
 
     def _batches_of_group(
-        self, group: ReadChunks, passed: dict[int, Chunk]
+        self, group: ReadChunks, yielded: dict[int, Chunk]
     ) -> Iterator[Batch | LostError]:
         """Yields the messages of chunks that were read together; if that failed, one by one."""
         if group.buffer:
             with suppress(UnreadableError, ValueError, IndexError):
-                pairs = pairs_in(group.chunks, group.indexes, self._wanted)
-                batches = self._batches_of(group, pairs)
-                passed.update({chunk.offset: chunk for chunk in group.chunks})
+                messages = read_indexes(group.chunks, group.indexes, self._wanted)
+                batches = self._batches_of(group, messages)
+                yielded.update({chunk.offset: chunk for chunk in group.chunks})
                 yield from batches
                 return
         for chunk in group.chunks:
             yield from self._batches_of_chunk(chunk)
-            passed[chunk.offset] = chunk
+            yielded[chunk.offset] = chunk
 
     def _batches_of_chunk(
-        self, chunk: Chunk, before: Chunk | None = None
+        self, chunk: Chunk, yielded: Chunk | None = None
     ) -> Iterator[Batch | LostError]:
-        """Yields the messages of one chunk, but for those that `before` had in its indexes.
+        """Yields the messages of one chunk, without those in the indexes of `yielded`.
 
         Raises:
             _ContradictedError: the indexes of the chunk do not agree with its records; then nothing
                 was yielded.
         """
         try:
-            content = self._content(chunk)
+            content = self._read_chunk(chunk)
         except UnreadableError as error:
-            lost = self._lost(chunk, str(error))
+            lost = self._lost_with(chunk, str(error))
             if lost is not None:
                 yield lost
             return
-        pairs = self._pairs(content)
-        pairs = pairs.taken(np.isin(pairs.channels, [*self._wanted]))
-        if before is not None:
-            known = self._believed(before, before.channels).offsets
-            pairs = pairs.taken(~np.isin(pairs.offsets, known))
-        yield from self._batches_of(content, pairs)
+        messages = self._verified_messages(content)
+        messages = messages.select(np.isin(messages.channels, [*self._wanted]))
+        if yielded is not None:
+            offsets = self._trusted_messages(yielded, yielded.channels).offsets
+            messages = messages.select(~np.isin(messages.offsets, offsets))
+        yield from self._batches_of(content, messages)
 
-    def _batches_of(self, content: ReadChunks, pairs: Pairs) -> Iterator[Batch]:
-        return batches_of(content, pairs, self._wanted, self._window, self._uncompressed)
+    def _batches_of(self, content: ReadChunks, messages: MessageTable) -> Iterator[Batch]:
+        return batches_of(content, messages, self._wanted, self._window, self._uncompressed)
 
     def _runs(self, *, newest_first: bool) -> Iterator[SortedRun[Record | LostError]]:
-        """Yields a run for each chunk with messages of the topics, and one for all loose messages.
+        """Yields a run for each chunk with messages of the topics.
 
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records; also raised
@@ -387,79 +397,93 @@ class _Reading:
         wanted = self._wanted
         # Of large chunks only the last used stays decompressed: all that overlap in time would
         # otherwise be in memory at once.
-        last_used = lru_cache(1)(self._content)
+        read_chunk = lru_cache(1)(self._read_chunk)
 
-        def rows_of(chunk: Chunk) -> RunRows[Record | LostError] | None:
-            last_used.cache_clear()  # before the next is decompressed
+        def read_rows(chunk: Chunk) -> RunRows[Record | LostError] | None:
+            read_chunk.cache_clear()  # before the next is decompressed
             try:
-                content = last_used(chunk)
+                content = read_chunk(chunk)
             except UnreadableError as error:
-                # Only what is wanted by the chunk's index is lost.
-                lost = self._lost(chunk, str(error))
+                lost = self._lost_with(chunk, str(error))
                 if lost is None:
                     return None
                 at = lost.last if newest_first else lost.first
                 return RunRows([at], [0], lambda _place, _time: lost)
-            column = self._inside(self._pairs(content, wanted), wanted)
-            times, places = (part[:: -1 if newest_first else 1].tolist() for part in column)
-            if not times:
+            messages = self._verified_messages(content, wanted)
+            times, places = self._wanted_inside(messages, wanted)
+            if not times.size:
                 return None
+            if newest_first:
+                times, places = times[::-1], places[::-1]
             if len(content.buffer) <= _LARGE_BYTES:
-                return RunRows(times, places, partial(self._record, content.buffer, wanted))
-            del content
-            return RunRows(
-                times, places, lambda *at: self._record(last_used(chunk).buffer, wanted, *at)
-            )
+                fetch = partial(self._record, content.buffer, wanted)
+                return RunRows(times.tolist(), places.tolist(), fetch)
+
+            def fetch_again(place: int, time: Ns) -> Record:
+                return self._record(read_chunk(chunk).buffer, wanted, place, time)
+
+            return RunRows(times.tolist(), places.tolist(), fetch_again)
 
         if wanted:
-            self._require_beside()
-        for chunk in _with_any(self.index, wanted, self._window):
-            yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
+            self._verify_beside()
+        for chunk in _chunks_of(self.index, wanted, self._window):
+            yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(read_rows, chunk))
 
-    def _inside(self, pairs: Pairs, wanted: Collection[int]) -> tuple[IntArray, IntArray]:
+    def _wanted_inside(
+        self, messages: MessageTable, wanted: Collection[int]
+    ) -> tuple[IntArray, IntArray]:
         """Returns log times and offsets of the wanted messages inside the window, in order."""
-        channels, numbers = pairs.channels, [*wanted]
-        # One alone, as in most questions, is compared in a tenth of the time.
+        channels, numbers = messages.channels, [*wanted]
+        # One channel, as in most questions, is compared in a tenth of the time.
         is_wanted = channels == numbers[0] if len(numbers) == 1 else np.isin(channels, numbers)
-        times, places = pairs.times[is_wanted], pairs.offsets[is_wanted]
+        times, offsets = messages.times[is_wanted], messages.offsets[is_wanted]
         if (times[1:] <= times[:-1]).any():
-            order = np.lexsort((places, times))
-            times, places = times[order], places[order]
+            order = np.lexsort((offsets, times))
+            times, offsets = times[order], offsets[order]
         first, last = times.searchsorted((self._window.start, min(self._window.stop, MAX_NS)))
-        return times[first:last], places[first:last]
+        return times[first:last], offsets[first:last]
 
-    def _lost(self, chunk: Chunk, reason: str) -> LostError | None:
-        """Returns what of the window is lost with a chunk that cannot be read; None if nothing."""
+    def _lost_with(self, chunk: Chunk, reason: str) -> LostError | None:
+        """Returns the error for a chunk that cannot be read; None if it has no wanted message."""
         window = self._window
         first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
         with suppress(UnreadableError), as_unreadable():
-            times, _ = self._inside(self._believed(chunk, self._wanted), self._wanted)
+            messages = self._trusted_messages(chunk, self._wanted)
+            times, _ = self._wanted_inside(messages, self._wanted)
             if not times.size:
                 return None
             first, last = int(times[0]), int(times[-1])
         return LostError(reason, first, last)
 
-    def _require_beside(self, passed: Collection[int] = ()) -> None:
+    def _verify_beside(self, verified: Collection[int] = ()) -> None:
         """Compares the chunks beside the window with their records, each once.
 
-        Not those at the offsets `passed`, which are compared anyway.
+        Args:
+            verified: offsets of chunks that are compared anyway.
 
         Raises:
             _ContradictedError: the indexes of one of them do not agree with its records.
         """
-        for chunk in _beside(self.index, self._window):
-            if chunk.index_places is not None and chunk.offset not in passed:
-                try:
-                    self._pairs(self._content(chunk))
-                except _ContradictedError as error:
-                    raise _ContradictedError(str(error)) from error
-                except UnreadableError:
-                    continue
+        for chunk in _chunks_beside(self.index, self._window):
+            if chunk.index_places is None or chunk.offset in verified:
+                continue
+            try:
+                self._verified_messages(self._read_chunk(chunk))
+            except _ContradictedError as error:
+                # Without the chunk: nothing was yielded, so all of the window is left to read.
+                raise _ContradictedError(str(error)) from error
+            except UnreadableError:
+                continue
 
-    def _pairs(self, content: ReadChunks, wanted: Collection[int] | None = None) -> Pairs:
-        """Returns the messages of a chunk, compared with its decompressed records.
+    def _verified_messages(
+        self, content: ReadChunks, wanted: Collection[int] | None = None
+    ) -> MessageTable:
+        """Returns the messages of one chunk, compared with its decompressed records.
 
-        Those of all channels, or at least of the `wanted` ones.
+        Args:
+            content: the chunk.
+            wanted: the channels that are needed; None for all. Of a chunk without message indexes
+                all are returned.
 
         Raises:
             _ContradictedError: the indexes do not agree with the records.
@@ -468,21 +492,22 @@ class _Reading:
         [chunk] = content.chunks
         channels = chunk.channels if wanted is None else chunk.channels.intersection(wanted)
         key = (self._file.key, chunk.offset, channels)
-        pairs = self._bags.indexes.get(key)
-        if isinstance(pairs, Pairs):
-            return pairs
+        messages = self._bags.indexes.get(key)
+        if isinstance(messages, MessageTable):
+            return messages
         if chunk.index_places is None:
-            pairs = walk_chunk(content.buffer).pairs
+            messages = walk_chunk(content.buffer).messages
         else:
             try:
-                pairs = believed_pairs(chunk, content.indexes[0], channels)
-                compared(content, pairs)
+                messages = read_trusted_index(chunk, content.indexes[0], channels)
+                message_heads(content, messages)
             except (UnreadableError, ValueError, IndexError, struct.error) as error:
                 raise _ContradictedError(reason_of(error), chunk) from error
-        self._bags.indexes.put(key, pairs, 4 * pairs.times.nbytes + 600)
-        return pairs
+        columns_bytes = sum(column.nbytes for column in messages)
+        self._bags.indexes.put(key, messages, columns_bytes + _TABLE_BYTES)
+        return messages
 
-    def _content(self, chunk: Chunk) -> ReadChunks:
+    def _read_chunk(self, chunk: Chunk) -> ReadChunks:
         """Returns a chunk, decompressed, with its message indexes.
 
         Raises:
@@ -494,16 +519,16 @@ class _Reading:
             with as_unreadable():
                 data = chunk_data(self._file, chunk, self._bags.limit)
             self._bags.chunks.put(key, data, len(data))
-        return ReadChunks([chunk], data, [len(data)], [self._index_of(chunk)])
+        return ReadChunks([chunk], data, [len(data)], [self._index_bytes(chunk)])
 
-    def _index_of(self, chunk: Chunk) -> bytes:
+    def _index_bytes(self, chunk: Chunk) -> bytes:
         return self._file.read(chunk.offset + chunk.length, chunk.index_length)
 
-    def _believed(self, chunk: Chunk, wanted: Collection[int]) -> Pairs:
-        return believed_pairs(chunk, self._index_of(chunk), wanted)
+    def _trusted_messages(self, chunk: Chunk, wanted: Collection[int]) -> MessageTable:
+        return read_trusted_index(chunk, self._index_bytes(chunk), wanted)
 
     def _record(self, data: bytes, channels: Mapping[int, Channel], place: int, time: Ns) -> Record:
-        """Returns a message of a decompressed chunk, whose place was compared with its records."""
+        """Returns the message at a verified place of a decompressed chunk."""
         _, length, number, _, _, published = MESSAGE.unpack_from(data, place)
         channel = channels[number]
         payload = data[place + MESSAGE.size : place + RECORD.size + length]
@@ -512,67 +537,105 @@ class _Reading:
         return Record(channel, time, published if 0 < published < MAX_NS else time, payload)
 
 
-def _with_any(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
+def _chunks_to_verify(index: McapIndex) -> list[Chunk]:
+    """Returns the chunks that decide about first and last times, up to `_VERIFIED_BYTES`.
+
+    These are the first and the last chunk, chunks out of order, and each chunk with the first or
+    last message of a channel.
+    """
+    ends: set[Ns] = set()
+    for total in index.contents.totals.values():
+        ends.update((total.first, total.last))
+    sorted_ends = sorted(ends)
+    odd = {chunk.offset for chunk in (*index.chunks[:1], *index.chunks[-1:])}
+    for before, after in pairwise(sorted(index.chunks, key=attrgetter("offset"))):
+        if after.end < before.start:
+            odd.update((before.offset, after.offset))
+    chunks: list[Chunk] = []
+    size = 0
+    for chunk in index.chunks:
+        nth = bisect_left(sorted_ends, chunk.start)
+        has_end = nth < len(sorted_ends) and sorted_ends[nth] <= chunk.end
+        if not has_end and chunk.offset not in odd:
+            continue
+        size += chunk.length
+        if size > _VERIFIED_BYTES:
+            break
+        chunks.append(chunk)
+    return chunks
+
+
+def _chunks_of(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
     """Yields the chunks that overlap the window and have messages of one of the channels."""
     for chunk in index.chunks:
         if window.overlaps(chunk.start, chunk.end) and not chunk.channels.isdisjoint(wanted):
             yield chunk
 
 
-def _beside(index: McapIndex, window: TimeWindow) -> list[Chunk]:
-    """Returns the chunks that may hold messages of a window of which their indexes know nothing.
+def _chunks_beside(index: McapIndex, window: TimeWindow) -> list[Chunk]:
+    """Returns the chunks whose indexes may hide messages of a window.
 
     In the order of the file the times of chunks ascend, mostly, and one follows the other. Where
-    all indexes of a chunk agree on wrong times, no chunk has the times of its messages: such a
-    hole is looked for at both ends of the window, and between two chunks that overlap it. Where
-    neighbours agree on it, no hole need be there, but the times of the file do not go on.
+    all indexes of a chunk agree on wrong times, no chunk has the times of its messages. Such a hole
+    is looked for at both ends of the window, and between two chunks that overlap it. Where
+    neighbours agree on wrong times there may be no hole, but a seam.
     """
     chunks, start, last = index.chunks, window.start, window.stop - 1
-    inside = [n for n, chunk in enumerate(chunks) if chunk.start <= last and chunk.end >= start]
-    beside = {n + 1 for n, following in pairwise(inside) if following - n == _NEXT_BUT_ONE}
+    inside = [nth for nth, chunk in enumerate(chunks) if window.overlaps(chunk.start, chunk.end)]
+    beside: set[int] = set()
+    for before, after in pairwise(inside):
+        between = range(before + 1, after)
+        if len(between) == 1:
+            beside.update(between)
     for seam in index.seams:
-        if seam.first <= last and seam.last >= start:
+        if window.overlaps(seam.first, seam.last):
             beside.update((seam.nth, seam.nth + 1))
     for at in (start, last):
-        if not any(chunks[n].start <= at <= chunks[n].end for n in inside):
-            before = [(chunk.end, n) for n, chunk in enumerate(chunks) if chunk.end < at]
-            nth = max(before)[1] if before else -1
-            beside.update((nth, nth + 1))
-    return [chunks[n] for n in sorted(beside) if 0 <= n < len(chunks)]
+        if any(chunks[nth].start <= at <= chunks[nth].end for nth in inside):
+            continue
+        earlier = [(chunk.end, nth) for nth, chunk in enumerate(chunks) if chunk.end < at]
+        _, nth = max(earlier, default=(0, -1))
+        beside.update((nth, nth + 1))
+    return [chunks[nth] for nth in sorted(beside) if 0 <= nth < len(chunks)]
 
 
 def _split_window(
     window: TimeWindow, chunk: Chunk | None, *, newest_first: bool
 ) -> tuple[TimeWindow, TimeWindow]:
-    """Splits a window at a chunk: what is left to read, and what was read before it."""
-    at = window.stop if newest_first else window.start
-    if chunk is not None:
-        at = chunk.end + 1 if newest_first else chunk.start
-        at = min(max(at, window.start), window.stop)
+    """Splits a window at a chunk that is in doubt: the part left to read, and the part read."""
+    if newest_first:
+        at = window.stop if chunk is None else chunk.end + 1
+    else:
+        at = window.start if chunk is None else chunk.start
+    at = min(max(at, window.start), window.stop)
     before, behind = TimeWindow(window.start, at), TimeWindow(at, window.stop)
     return (before, behind) if newest_first else (behind, before)
 
 
-def _overlooked(
-    believed: McapIndex, index: McapIndex, wanted: Collection[int], passed: TimeWindow
+def _missed_span(
+    wrong: McapIndex, right: McapIndex, wanted: Collection[int], read: TimeWindow
 ) -> Span | None:
-    """Returns between which log times messages were missed, in a part read by wrong indexes."""
-    believed_at = {chunk.offset: chunk for chunk in believed.chunks}
-    chunks = [
-        chunk
-        for chunk in _with_any(index, wanted, passed)
-        if (known := believed_at.get(chunk.offset)) is None
-        or not (known.start <= chunk.start and chunk.end <= known.end)
-        or not chunk.channels <= known.channels
-    ]
-    if not chunks:
+    """Returns the log times between which a read by the wrong index missed messages, if any.
+
+    Args:
+        wrong: the index that was used.
+        right: the index of the messages themselves.
+        wanted: the channels.
+        read: the part of the window that was read by the wrong index.
+    """
+    stated = {chunk.offset: chunk for chunk in wrong.chunks}
+    missed: list[Chunk] = []
+    for chunk in _chunks_of(right, wanted, read):
+        known = stated.get(chunk.offset)
+        if (
+            known is None
+            or chunk.start < known.start
+            or chunk.end > known.end
+            or not chunk.channels <= known.channels
+        ):
+            missed.append(chunk)
+    if not missed:
         return None
-    first = max(min(chunk.start for chunk in chunks), passed.start)
-    return first, min(max(chunk.end for chunk in chunks), passed.stop - 1)
-
-
-def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
-    """Yields chunks that follow each other in the file, and whose times are the other way round."""
-    for before, after in pairwise(sorted(chunks, key=attrgetter("offset"))):
-        if after.end < before.start:
-            yield from (before, after)
+    first = min(chunk.start for chunk in missed)
+    last = max(chunk.end for chunk in missed)
+    return max(first, read.start), min(last, read.stop - 1)

@@ -1,9 +1,9 @@
 """Reads the messages of many chunks at once, with numpy, as `BagReader.batches` yields them.
 
-The message indexes of all chunks of a group are read, compared with the records and cut into
-channels by a handful of array operations: chunk by chunk and channel by channel, a bag of 10 s has
-some 200 indexes of a few messages each, and takes three times as long. Whatever does not fit raises
-`UnreadableError`; `McapBags` then reads the same chunks one by one, and finds out which is damaged.
+A handful of array operations reads the message indexes of a group of chunks, compares them with the
+records and splits them by channel. One chunk and channel at a time takes three times as long: a bag
+of 10 s has some 200 indexes of a few messages each. Whatever does not fit raises `UnreadableError`;
+`McapBags` then reads the same chunks one by one, and finds out which is damaged.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.mcap.chunk import (
     Chunk,
-    Pairs,
+    MessageTable,
     decompressed_chunk,
     index_groups,
-    pairs_in,
+    read_indexes,
     walk_chunk,
 )
 from ros2_memory.storage.mcap.index import OTHER_DECLARED
@@ -43,14 +43,13 @@ MAX_GROUP_CHUNKS: Final = 4096
 _UINT32: Final = np.dtype("<u4")
 _MAGIC: Final = int.from_bytes(FRAME_MAGIC, "little")
 _CHUNK_STEP: Final = 5
+"""Two chunks begin at least 1 << 5 = 32 bytes apart in their file."""
 _PLACE_BITS: Final = 29
+"""Offsets in a decompressed chunk have at most so many bits: it has 512 MiB or less."""
 
 
-def place_of(chunk: Chunk) -> int:
-    """Returns what is added to offsets in a chunk, so that places are in the order of the file.
-
-    Two chunks, or parts as such, begin 32 bytes apart or more; a chunk has at most 512 MiB.
-    """
+def first_place(chunk: Chunk) -> int:
+    """Returns the place in the file order of a message at the offset 0 in the chunk."""
     return chunk.offset >> _CHUNK_STEP << _PLACE_BITS
 
 
@@ -59,9 +58,9 @@ class ReadChunks(NamedTuple):
 
     Attributes:
         chunks: at least one.
-        buffer: their decompressed records; empty if one of them cannot be read.
+        buffer: their decompressed records; empty if they cannot be read.
         sizes: how many bytes of the buffer each chunk has.
-        indexes: the bytes of the message indexes behind each.
+        indexes: the bytes of the message indexes behind each chunk.
     """
 
     chunks: Sequence[Chunk]
@@ -71,41 +70,47 @@ class ReadChunks(NamedTuple):
 
 
 def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> Iterator[ReadChunks]:
-    """Yields chunks, decompressed in groups of up to `BATCH_BYTES`; a larger one comes alone.
+    """Yields chunks, decompressed in groups of up to `BATCH_BYTES`.
+
+    A larger chunk comes alone, and so does one that cannot be read.
 
     Raises:
         OSError, MemoryError: the disk or the machine fails.
-        EpisodicError: what `limit.take_turn` raises, which groups call likewise.
+        EpisodicError: as `limit.take_turn` raises it; large groups call that.
     """
     begin = 0
     while begin < len(chunks):
-        parts: list[bytes] = []
-        indexes: list[bytes] = []
-        left = BATCH_BYTES
-        end = begin
-        # Chunks that fail are read again one by one, which reports the reason.
-        with suppress(UnreadableError), as_unreadable():
-            while end < len(chunks) and left > 0 and len(parts) < MAX_GROUP_CHUNKS:
-                chunk = chunks[end]
-                record = file.read(chunk.offset, chunk.length + chunk.index_length)
-                body = record[RECORD.size : chunk.length]
-                if parts and CHUNK.unpack_from(body)[2] > left:
-                    break
-                end += 1
-                parts.append(decompressed_chunk(body, limit))
-                indexes.append(record[chunk.length :])
-                left -= len(parts[-1])
-                if BATCH_BYTES - left > LARGE_BYTES:
-                    limit.take_turn()
-            del record, body
-        end = max(end, begin + 1)
-        sizes = [len(part) for part in parts]
-        is_whole = len(parts) == end - begin
-        buffer = (parts[0] if len(parts) == 1 else b"".join(parts)) if is_whole else b""
-        parts.clear()
-        yield ReadChunks(chunks[begin:end], buffer, sizes, indexes if is_whole else ())
-        del buffer
-        begin = end
+        group = _read_group(file, chunks[begin : begin + MAX_GROUP_CHUNKS], limit)
+        begin += len(group.chunks)
+        yield group
+        del group  # before the next is read
+
+
+def _read_group(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> ReadChunks:
+    """Reads the first of some chunks, up to `BATCH_BYTES` or a chunk that cannot be read."""
+    parts: list[bytes] = []
+    indexes: list[bytes] = []
+    size = 0
+    # The caller reads a chunk that fails again, which reports the reason.
+    with suppress(UnreadableError), as_unreadable():
+        for chunk in chunks:
+            record = file.read(chunk.offset, chunk.length + chunk.index_length)
+            body = record[RECORD.size : chunk.length]
+            _, _, stated_size, _, _ = CHUNK.unpack_from(body)
+            if parts and size + stated_size > BATCH_BYTES:
+                break
+            part = decompressed_chunk(body, limit)
+            size += len(part)
+            if size > LARGE_BYTES:
+                limit.take_turn()
+            parts.append(part)
+            indexes.append(record[chunk.length :])
+            if size >= BATCH_BYTES:
+                break
+    if not parts:
+        return ReadChunks(chunks[:1], b"", ())
+    buffer = parts[0] if len(parts) == 1 else b"".join(parts)
+    return ReadChunks(chunks[: len(parts)], buffer, [len(part) for part in parts], indexes)
 
 
 _MESSAGE: Final = int(Opcode.MESSAGE)
@@ -124,29 +129,36 @@ _HEAD: Final = np.dtype(
 _NOT_THERE: Final = "damaged: a message is not where its index says"
 
 
-def compared(
-    content: ReadChunks, pairs: Pairs
+def message_heads(
+    content: ReadChunks, messages: MessageTable
 ) -> tuple[IntArray, np.ndarray[tuple[int], np.dtype[np.void]]]:
     """Returns where messages begin in the buffer of decompressed chunks, and their heads.
 
-    Together with the number of messages, which `mcap.index` compares with the statistics, this
-    proves that all messages of these channels are there: checksums protect the records.
+    Compares each message with its record. Together with the number of messages, which `mcap.index`
+    compares with the statistics, this proves that all messages of these channels are there:
+    checksums protect the records.
 
     Raises:
         UnreadableError: a message is not there, has another channel or log time, ends past its
             chunk, or is there twice.
     """
-    buffer, sizes = content.buffer, np.array(content.sizes)
-    chunk_ends = np.cumsum(sizes)
-    at, last = pairs.offsets + (chunk_ends - sizes)[pairs.chunks], len(buffer) - _HEAD.itemsize
-    # A sum may have wrapped.
-    if at.size and (pairs.offsets.min() < 0 or max(pairs.offsets.max(), at.max()) > last):
+    chunk_ends = np.cumsum(np.array(content.sizes))
+    chunk_begins = chunk_ends - np.array(content.sizes)
+    at = messages.offsets + chunk_begins[messages.chunks]
+    last = len(content.buffer) - _HEAD.itemsize
+    # Offsets are checked, too: their sum with the begin of the chunk may have wrapped.
+    offsets = messages.offsets
+    if at.size and (offsets.min() < 0 or max(offsets.max(), at.max()) > last):
         raise UnreadableError(_NOT_THERE)
-    heads, room = gathered(buffer, _HEAD, at), chunk_ends[pairs.chunks] - at - RECORD.size
-    is_other = heads["opcode"] != _MESSAGE
-    is_other |= (heads["channel"] != pairs.channels) | (heads["log_time"] != pairs.times)
-    is_other |= (heads["length"] < MESSAGE_FIELDS) | (heads["length"] > room)
-    if is_other.any():
+    heads = gathered(content.buffer, _HEAD, at)
+    longest = chunk_ends[messages.chunks] - at - RECORD.size
+    if (
+        (heads["opcode"] != _MESSAGE).any()
+        or (heads["channel"] != messages.channels).any()
+        or (heads["log_time"] != messages.times).any()
+        or (heads["length"] < MESSAGE_FIELDS).any()
+        or (heads["length"] > longest).any()
+    ):
         raise UnreadableError(_NOT_THERE)
     ordered = np.sort(at)
     if (ordered[1:] == ordered[:-1]).any():
@@ -155,19 +167,19 @@ def compared(
 
 
 def require_declared(content: ReadChunks, declared: Declarations) -> None:
-    """Checks that chunks have no other messages, and declare no other channels, than is known.
+    """Checks that the indexes have all messages of chunks, and the summary section all channels.
 
     Only the bytes between messages are walked.
 
     Args:
         content: the chunks.
-        declared: what the summary section declares.
+        declared: the schemas and channels of the summary section.
 
     Raises:
-        UnreadableError: they do.
+        UnreadableError: a message or a declaration is missing there.
     """
     with as_unreadable():
-        at, heads = compared(content, pairs_in(content.chunks, content.indexes))
+        at, heads = message_heads(content, read_indexes(content.chunks, content.indexes))
         chunk_ends = np.cumsum(content.sizes)
         begins = np.concatenate([[0], chunk_ends[:-1], at + RECORD.size + heads["length"]])
         ends = np.concatenate([at, chunk_ends])
@@ -175,20 +187,28 @@ def require_declared(content: ReadChunks, declared: Declarations) -> None:
         ends.sort()
         if (begins > ends).any():
             raise UnreadableError(_NOT_THERE)
-        has_content = begins < ends
-        for begin, end in zip(
-            begins[has_content].tolist(), ends[has_content].tolist(), strict=True
-        ):
+        is_gap = begins < ends
+        for begin, end in zip(begins[is_gap].tolist(), ends[is_gap].tolist(), strict=True):
             walked = walk_chunk(content.buffer[begin:end])
-            if walked.messages:
+            if walked.message_count:
                 raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
-            if not all(declared.agrees(*declaration) for declaration in walked.declarations):
-                raise UnreadableError(OTHER_DECLARED)
+            for opcode, body in walked.declarations:
+                if not declared.agrees(opcode, body):
+                    raise UnreadableError(OTHER_DECLARED)
+
+
+class _Payloads(NamedTuple):
+    """Publish times and payloads of messages; the fields are those of `Batch`."""
+
+    publish_times: IntArray
+    buffer: bytes
+    starts: IntArray
+    sizes: IntArray
 
 
 def batches_of(
     content: ReadChunks,
-    pairs: Pairs,
+    messages: MessageTable,
     channels: Mapping[int, Channel],
     window: TimeWindow,
     uncompressed: Uncompressed,
@@ -197,77 +217,76 @@ def batches_of(
 
     Args:
         content: the chunks.
-        pairs: all of their messages of these channels.
+        messages: all messages of these channels in the chunks.
         channels: the wanted channels by their number.
         window: of log time.
-        uncompressed: decompresses messages.
+        uncompressed: undoes the compression of single messages.
 
     Raises:
         UnreadableError: a message is not in the records, or ends past its chunk.
     """
-    buffer = content.buffer
-    if not pairs.times.size:
+    if not messages.times.size:
         return iter(())
-    at, heads = compared(content, pairs)
-    stops = at + RECORD.size + heads["length"]
-    order = _in_window(pairs, window)
-    stated, logged = heads["publish_time"][order], pairs.times[order]
+    at, heads = message_heads(content, messages)
+    order = _by_channel(messages, window)
+    stated, logged = heads["publish_time"][order], messages.times[order]
     # An unsigned time past the signed range has become negative. Some writers write 0 for unknown.
     published = np.where((stated <= 0) | (stated == MAX_NS), logged, stated)
-    starts = at[order] + MESSAGE.size
-    sizes = stops[order] - starts
-    batches = _by_channel(
-        pairs, order, content.chunks, channels, (published, buffer, starts, sizes)
+    payloads = _Payloads(
+        published,
+        content.buffer,
+        at[order] + MESSAGE.size,
+        heads["length"][order] - MESSAGE_FIELDS,
     )
-    if not _are_frames(buffer, starts, sizes).any():
+    batches = _batch_by_channel(messages, order, content.chunks, channels, payloads)
+    if not _are_frames(payloads.buffer, payloads.starts, payloads.sizes).any():
         return batches
-    return chain.from_iterable(_decompressed(framed, uncompressed) for framed in batches)
+    return chain.from_iterable(_uncompressed(batch, uncompressed) for batch in batches)
 
 
-def _by_channel(
-    pairs: Pairs,
+def _batch_by_channel(
+    messages: MessageTable,
     order: IntArray,
     chunks: Sequence[Chunk],
     channels: Mapping[int, Channel],
-    payloads: tuple[IntArray, bytes, IntArray, IntArray],
+    payloads: _Payloads,
 ) -> Iterator[Batch]:
-    """Returns a batch for each channel of messages.
+    """Yields a batch for each channel.
 
     Args:
-        pairs: the messages, and others.
-        order: their positions among these, channel by channel.
-        chunks: that these are in.
-        channels: by their number.
-        payloads: their publish times, and buffer, starts and sizes of a `Batch`.
+        messages: the messages of the chunks.
+        order: which rows of `messages` are wanted, channel by channel.
+        chunks: the chunks.
+        channels: the channels by number.
+        payloads: the payloads of the wanted messages, in this order.
     """
-    numbers, times = pairs.channels[order], pairs.times[order]
-    steps = np.array([place_of(chunk) for chunk in chunks])[pairs.chunks[order]]
-    places = pairs.offsets[order] + steps
-    published, buffer, starts, sizes = payloads
+    numbers, times = messages.channels[order], messages.times[order]
+    first_places = np.array([first_place(chunk) for chunk in chunks])
+    places = messages.offsets[order] + first_places[messages.chunks[order]]
     for first, last in pairwise([*run_starts(numbers).tolist(), numbers.size]):
         rows = slice(first, last)
         yield Batch(
             channels[int(numbers[first])],
             times[rows],
-            published[rows],
+            payloads.publish_times[rows],
             places[rows],
-            buffer,
-            starts[rows],
-            sizes[rows],
+            payloads.buffer,
+            payloads.starts[rows],
+            payloads.sizes[rows],
         )
 
 
-def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
-    """Returns the positions of the messages inside a window, channel by channel."""
-    order: IntArray = np.argsort(pairs.channels, kind="stable")
-    is_inside = (pairs.times >= window.start) & (pairs.times < window.stop)
+def _by_channel(messages: MessageTable, window: TimeWindow) -> IntArray:
+    """Returns the rows of the messages inside a window, channel by channel."""
+    order: IntArray = np.argsort(messages.channels, kind="stable")
+    is_inside = (messages.times >= window.start) & (messages.times < window.stop)
     return order if is_inside.all() else order[is_inside[order]]
 
 
-def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
-    """Yields a batch; or several where rosbag2 compressed each message."""
-    compressed = _are_frames(batch.buffer, batch.starts, batch.sizes)
-    if batch.channel.encoding != "cdr" or not compressed.any():
+def _uncompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
+    """Yields a batch, or several if rosbag2 compressed its messages."""
+    are_frames = _are_frames(batch.buffer, batch.starts, batch.sizes)
+    if batch.channel.encoding != "cdr" or not are_frames.any():
         yield batch
         return
     records = map(batch.record, range(batch.sizes.size))
@@ -278,26 +297,24 @@ def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
 
 
 def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
-    """Returns which payloads begin as zstd does."""
+    """Returns a mask of the payloads that begin with the magic of a zstd frame."""
     is_long = sizes >= len(FRAME_MAGIC)
-    if not is_long.all():
-        starts = starts[is_long]
     are_frames = np.zeros(is_long.size, np.bool_)
-    are_frames[is_long] = gathered(buffer, _UINT32, starts) == _MAGIC
+    are_frames[is_long] = gathered(buffer, _UINT32, starts[is_long]) == _MAGIC
     return are_frames
 
 
 def bare_batches(
     file: OpenFile, chunks: Sequence[Chunk], channels: Mapping[int, Channel], window: TimeWindow
 ) -> Iterator[Batch]:
-    """Yields messages of chunks that are not read, by their message indexes alone.
+    """Yields messages with empty payloads, by the message indexes alone; reads no chunk.
 
     Raises:
         UnreadableError: the indexes are not those that the chunk indexes name.
     """
     for group, indexes in index_groups(file, chunks):
-        pairs = pairs_in(group, indexes, channels)
-        order = _in_window(pairs, window)
-        none = np.zeros(order.size, np.int64)
-        payloads = pairs.times[order], b"", none, none
-        yield from _by_channel(pairs, order, group, channels, payloads)
+        messages = read_indexes(group, indexes, channels)
+        order = _by_channel(messages, window)
+        zeros = np.zeros(order.size, np.int64)
+        payloads = _Payloads(messages.times[order], b"", zeros, zeros)
+        yield from _batch_by_channel(messages, order, group, channels, payloads)

@@ -40,7 +40,7 @@ from ros2_memory.storage.mcap.records import (
     UINT64,
     FileRecord,
 )
-from ros2_memory.storage.zstd_bag import decompress_zstd, in_turn, zstd_front
+from ros2_memory.storage.zstd_bag import decompress_front, decompress_zstd, zstd_front
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -57,28 +57,31 @@ INDEX_OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
 _INDEX: Final = np.dtype(
     [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")], align=False
 )
-"""A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
+"""A message index up to its entries: opcode, length, channel, and the bytes of the entries."""
+_INDEX_FIELDS: Final = 6
+"""Bytes that the length of a message index counts besides its entries: channel and size."""
 _INDEX_SIZE: Final = struct.Struct("<I")
 _INDEX_PLACE: Final = struct.Struct("<HQ")
-_PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
+_ENTRY: Final = np.dtype([("time", "<i8"), ("offset", "<i8")])
+"""An entry of a message index: a log time, and an offset in the decompressed chunk."""
 
 
 class Chunk(NamedTuple):
-    """One chunk of a file (a tuple: indexing a week makes millions).
+    """One chunk of a file, or a part of a file with messages outside chunks (`is_unchunked`).
 
-    Or a part of a file that has messages outside chunks: `is_unchunked`.
+    A tuple: indexing a week makes millions.
 
     Attributes:
-        offset: where its record begins in the file.
-        length: bytes of its record.
-        start: the earliest log time in it.
-        end: the latest log time in it, inclusive.
-        channels: the channels that have messages in it.
+        offset: where the chunk record begins in the file.
+        length: bytes of the record.
+        start: the earliest log time in the chunk.
+        end: the latest log time in the chunk, inclusive.
+        channels: the channels that have messages in the chunk.
         index_places: the offsets of its message indexes, as they are written in the file; None if
             there are none to rely on.
-        index_length: bytes of its message indexes, which follow it.
+        index_length: bytes of its message indexes, which follow the chunk.
         usable: how many of its decompressed bytes are whole records, if the file ends inside it.
-        is_unchunked: whether its messages are in no chunk; they are found from its first byte on.
+        is_unchunked: whether this is no chunk: its message records begin at `offset` in the file.
     """
 
     offset: int
@@ -92,8 +95,8 @@ class Chunk(NamedTuple):
     is_unchunked: bool = False
 
 
-class Pairs(NamedTuple):
-    """Messages: for each its channel, log time, offset in its chunk, and the chunk's position."""
+class MessageTable(NamedTuple):
+    """Messages as columns: channel, log time, offset in the chunk, and position of the chunk."""
 
     channels: IntArray
     times: IntArray
@@ -101,110 +104,147 @@ class Pairs(NamedTuple):
     chunks: IntArray
 
     @classmethod
-    def of(cls, numbers: array[int], times: array[int], offsets: array[int]) -> Pairs:
-        """Returns messages in file order, without (unsigned) log times that no clock shows."""
+    def of_chunk(cls, channels: array[int], times: array[int], offsets: array[int]) -> MessageTable:
+        """Returns the messages of one chunk, without those whose log time is past `MAX_NS`."""
         unsigned = np.array(times, np.uint64)
         is_possible = unsigned < MAX_NS
-        places, channels = (
-            np.array(column, np.int64)[is_possible] for column in (offsets, numbers)
+        return cls(
+            np.array(channels, np.int64)[is_possible],
+            unsigned[is_possible].astype(np.int64),
+            np.array(offsets, np.int64)[is_possible],
+            np.zeros(np.count_nonzero(is_possible), np.int64),
         )
-        return cls(channels, unsigned[is_possible].astype(np.int64), places, np.zeros_like(places))
 
-    def taken(self, rows: Mask) -> Pairs:
-        """Returns some of the messages."""
-        return Pairs(*(column[rows] for column in self))
+    def select(self, rows: Mask) -> MessageTable:
+        """Returns the messages where the mask is set."""
+        return MessageTable(*(column[rows] for column in self))
 
 
-def pairs_in(
+class _Indexes(NamedTuple):
+    """Message indexes as columns.
+
+    Attributes:
+        channels: the channel of each index.
+        chunks: the position of its chunk.
+        entries_at: where its entries begin in the bytes of all indexes.
+        counts: how many entries it has.
+    """
+
+    channels: IntArray
+    chunks: IntArray
+    entries_at: IntArray
+    counts: IntArray
+
+
+def read_indexes(
     chunks: Sequence[Chunk], indexes: Sequence[bytes], wanted: Collection[int] | None = None
-) -> Pairs:
-    """Returns the messages of the `wanted` channels, or of all, by the indexes of these chunks.
+) -> MessageTable:
+    """Returns the messages of the `wanted` channels, or of all, by the message indexes of chunks.
+
+    Args:
+        chunks: at least one.
+        indexes: for each chunk the bytes of its message indexes.
+        wanted: the numbers of channels; None for all.
 
     Raises:
         UnreadableError: the indexes are not those that the chunk indexes name, or have other times.
     """
     region = b"".join(indexes)
+    channels, chunk_of, entries_at, counts = _checked_indexes(chunks, indexes, region)
+    is_wanted = counts > 0
+    if wanted is not None:
+        is_wanted &= np.isin(channels, np.array(sorted(wanted), np.int64), kind="sort")
+    counts = counts[is_wanted]
+    nth = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    places = np.repeat(entries_at[is_wanted], counts) + nth * _ENTRY.itemsize
+    entries = gathered(region, _ENTRY, places)
+    messages = MessageTable(
+        np.repeat(channels[is_wanted], counts),
+        np.ascontiguousarray(entries["time"]),
+        np.ascontiguousarray(entries["offset"]),
+        np.repeat(chunk_of[is_wanted], counts),
+    )
+    times = messages.times
+    starts = np.array([chunk.start for chunk in chunks])[messages.chunks]
+    ends = np.array([chunk.end for chunk in chunks])[messages.chunks]
+    if ((times < starts) | (times > ends) | (times < 0) | (times >= MAX_NS)).any():
+        raise UnreadableError(OUTSIDE)
+    return messages
+
+
+def _checked_indexes(chunks: Sequence[Chunk], indexes: Sequence[bytes], region: bytes) -> _Indexes:
+    """Finds the message indexes of chunks in their joined bytes, the `region`.
+
+    Raises:
+        UnreadableError: they are not those that the chunk indexes name.
+    """
     stated = np.frombuffer(b"".join([chunk.index_places or b"" for chunk in chunks]), INDEX_OFFSET)
     if not stated.size:
         raise UnreadableError(_OTHER_INDEX)
-    places = [len(chunk.index_places or b"") // INDEX_OFFSET.itemsize for chunk in chunks]
-    number = np.repeat(np.arange(len(chunks)), places)
+    indexes_of_chunk = [len(chunk.index_places or b"") // INDEX_OFFSET.itemsize for chunk in chunks]
+    chunk_of = np.repeat(np.arange(len(chunks)), indexes_of_chunk)
     ends = np.cumsum([len(index) for index in indexes])
     begins = ends - [len(index) for index in indexes]
-    behind = np.array([chunk.offset + chunk.length for chunk in chunks])
-    at = stated["at"] - (behind - begins)[number]
+    in_file = np.array([chunk.offset + chunk.length for chunk in chunks])
+    at = stated["at"] - (in_file - begins)[chunk_of]
     if at.min() < 0 or at.max() + _INDEX.itemsize > len(region):
         raise UnreadableError(_OTHER_INDEX)
     heads = gathered(region, _INDEX, at)
     sizes = heads["size"].astype(np.int64)
-    after = at + _INDEX.itemsize + sizes
+    entries_at = at + _INDEX.itemsize
     if (
         (heads["opcode"] != _INDEX_OPCODE).any()
         or (heads["channel"] != stated["channel"]).any()
-        or (heads["length"] != sizes + 6).any()
-        or (sizes % _PAIR.itemsize).any()
-        or sizes.max() > MAX_CHUNK_MESSAGES * _PAIR.itemsize
-        or (at < begins[number]).any()
-        or (after > ends[number]).any()
-        or not _fill(at, after, len(region))
+        or (heads["length"] != sizes + _INDEX_FIELDS).any()
+        or (sizes % _ENTRY.itemsize).any()
+        or sizes.max() > MAX_CHUNK_MESSAGES * _ENTRY.itemsize
+        or (at < begins[chunk_of]).any()
+        or (entries_at + sizes > ends[chunk_of]).any()
+        or not _cover(at, entries_at + sizes, len(region))
     ):
         raise UnreadableError(_OTHER_INDEX)
     channels = heads["channel"].astype(np.int64)
-    is_kept = sizes > 0
-    if wanted is not None:
-        is_kept &= np.isin(channels, np.array(sorted(wanted), np.int64), kind="sort")
-    counts = sizes[is_kept] // _PAIR.itemsize
-    total = int(counts.sum())
-    before = np.cumsum(counts) - counts
-    pairs_at = np.repeat(at[is_kept] + _INDEX.itemsize - before * _PAIR.itemsize, counts)
-    pairs_at += np.arange(total) * _PAIR.itemsize
-    pairs = gathered(region, _PAIR, pairs_at)
-    times = np.ascontiguousarray(pairs["time"])
-    chunk_of = np.repeat(number[is_kept], counts)
-    starts = np.array([chunk.start for chunk in chunks])[chunk_of]
-    stops = np.array([chunk.end for chunk in chunks])[chunk_of]
-    if total and ((times < starts) | (times > stops) | (times < 0) | (times >= MAX_NS)).any():
-        raise UnreadableError(OUTSIDE)
-    return Pairs(
-        np.repeat(channels[is_kept], counts), times, np.ascontiguousarray(pairs["place"]), chunk_of
-    )
+    return _Indexes(channels, chunk_of, entries_at, sizes // _ENTRY.itemsize)
 
 
-def believed_pairs(chunk: Chunk, region: bytes, wanted: Collection[int]) -> Pairs:
-    """Returns the messages of the `wanted` channels of a chunk, by the indexes behind it.
-
-    These are believed: `pairs_in` found all indexes of the file right when the file was indexed. To
-    check them once more takes longer than all else that a chunk takes.
-
-    Raises:
-        ValueError, struct.error: they have changed.
-    """
-    base = chunk.offset + chunk.length
-    numbers: list[int] = []
-    columns = [np.zeros(0, _PAIR)]
-    for number, place in _INDEX_PLACE.iter_unpack(chunk.index_places or b""):
-        if number in wanted:
-            at = place - base + _INDEX.itemsize
-            (size,) = _INDEX_SIZE.unpack_from(region, at - _INDEX_SIZE.size)
-            numbers.append(number)
-            columns.append(np.frombuffer(region, _PAIR, size // _PAIR.itemsize, at))
-    pairs = columns[1] if len(numbers) == 1 else np.concatenate(columns)
-    times, offsets = (np.ascontiguousarray(pairs[name]) for name in ("time", "place"))
-    sizes = [column.size for column in columns[1:]]
-    channels = np.repeat(np.array(numbers, np.int64), sizes)
-    return Pairs(channels, times, offsets, np.zeros(channels.size, np.int64))
-
-
-def _fill(begins: IntArray, ends: IntArray, size: int) -> bool:
-    """Returns whether records follow each other from the begin of a region to its end."""
+def _cover(begins: IntArray, ends: IntArray, size: int) -> bool:
+    """Returns whether records cover a region of `size` bytes without gaps or overlaps."""
     order = np.argsort(begins)
     begins, ends = begins[order], ends[order]
     return bool(begins[0] == 0 and ends[-1] == size and (begins[1:] == ends[:-1]).all())
 
 
+def read_trusted_index(chunk: Chunk, index: bytes, wanted: Collection[int]) -> MessageTable:
+    """Returns the messages of the `wanted` channels of a chunk, by the indexes behind it.
+
+    `read_indexes` has checked all indexes of the file when the file was indexed. To check them
+    again takes longer than all else that a chunk takes.
+
+    Raises:
+        ValueError, struct.error: they have changed since.
+    """
+    base = chunk.offset + chunk.length
+    numbers: list[int] = []
+    entries = [np.zeros(0, _ENTRY)]
+    for number, place in _INDEX_PLACE.iter_unpack(chunk.index_places or b""):
+        if number in wanted:
+            at = place - base + _INDEX.itemsize
+            (size,) = _INDEX_SIZE.unpack_from(index, at - _INDEX_SIZE.size)
+            numbers.append(number)
+            entries.append(np.frombuffer(index, _ENTRY, size // _ENTRY.itemsize, at))
+    joined = entries[1] if len(numbers) == 1 else np.concatenate(entries)
+    counts = [part.size for part in entries[1:]]
+    return MessageTable(
+        np.repeat(np.array(numbers, np.int64), counts),
+        np.ascontiguousarray(joined["time"]),
+        np.ascontiguousarray(joined["offset"]),
+        np.zeros(joined.size, np.int64),
+    )
+
+
 def index_bytes(indexes: int, messages: int) -> int:
-    """Returns the bytes of so many message indexes with so many messages in all."""
-    return indexes * _INDEX.itemsize + messages * _PAIR.itemsize
+    """Returns how many bytes message indexes take that list so many messages in all."""
+    return indexes * _INDEX.itemsize + messages * _ENTRY.itemsize
 
 
 def index_groups(
@@ -215,33 +255,35 @@ def index_groups(
     Raises:
         UnreadableError: an index is larger than it can be.
     """
-    begin = size = 0
-    for nth, chunk in enumerate(chunks):
+    group: list[Chunk] = []
+    indexes: list[bytes] = []
+    size = 0
+    for chunk in chunks:
         if chunk.index_length > index_bytes(MAX_CHANNELS, MAX_CHUNK_MESSAGES):
             raise UnreadableError(_OTHER_INDEX)
+        group.append(chunk)
+        indexes.append(file.read(chunk.offset + chunk.length, chunk.index_length))
         size += chunk.index_length
-        if size > LARGE_BYTES or nth == len(chunks) - 1:
-            group = chunks[begin : nth + 1]
-            yield (
-                group,
-                [file.read(member.offset + member.length, member.index_length) for member in group],
-            )
-            begin, size = nth + 1, 0
+        if size > LARGE_BYTES:
+            yield group, indexes
+            group, indexes, size = [], [], 0
+    if group:
+        yield group, indexes
 
 
 class ChunkContent(NamedTuple):
     """The content of a decompressed chunk.
 
     Attributes:
-        pairs: the messages.
+        messages: the messages with possible log times.
         usable: how many of its bytes are whole records.
-        messages: how many there are, with those of impossible log times.
+        message_count: how many messages it has, also with impossible log times.
         declarations: opcode and body of its schema and channel records.
     """
 
-    pairs: Pairs
+    messages: MessageTable
     usable: int
-    messages: int
+    message_count: int
     declarations: list[tuple[int, bytes]]
 
 
@@ -251,31 +293,29 @@ def walk_chunk(data: bytes) -> ChunkContent:
     Raises:
         UnreadableError: it has more messages or declarations than are indexed.
     """
-    channels, times, places = array("H"), array("Q"), array("q")
+    channels, times, offsets = array("H"), array("Q"), array("q")
     declarations: list[tuple[int, bytes]] = []
     position, end = 0, len(data)
-    record, message = RECORD.unpack_from, MESSAGE.unpack_from
     while position + RECORD.size <= end:
-        opcode, length = record(data, position)
+        opcode, length = RECORD.unpack_from(data, position)
         following = position + RECORD.size + length
-        if following > end or opcode == 0:
+        is_cut_message = opcode == Opcode.MESSAGE and length < MESSAGE_FIELDS
+        if following > end or opcode == 0 or is_cut_message:
             break
         if opcode == Opcode.MESSAGE:
-            if length < MESSAGE_FIELDS:
-                break
-            _, _, channel, _, log_time, _ = message(data, position)
+            _, _, channel, _, log_time, _ = MESSAGE.unpack_from(data, position)
             channels.append(channel)
             times.append(log_time)
-            places.append(position)
-            if len(times) > MAX_CHUNK_MESSAGES:
-                raise UnreadableError(f"a chunk holds more than {MAX_CHUNK_MESSAGES} messages")
+            offsets.append(position)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             declarations.append((opcode, data[position + RECORD.size : following]))
-            if len(declarations) > MAX_CHUNK_DECLARATIONS:
-                raise UnreadableError(f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things")
+        if len(times) > MAX_CHUNK_MESSAGES:
+            raise UnreadableError(f"a chunk holds more than {MAX_CHUNK_MESSAGES} messages")
+        if len(declarations) > MAX_CHUNK_DECLARATIONS:
+            raise UnreadableError(f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things")
         position = following
-    pairs = Pairs.of(channels, times, places)
-    return ChunkContent(pairs, position, len(times), declarations)
+    messages = MessageTable.of_chunk(channels, times, offsets)
+    return ChunkContent(messages, position, len(times), declarations)
 
 
 class ChunkHead(NamedTuple):
@@ -292,7 +332,7 @@ _HEAD_BYTES: Final = 96
 
 
 def chunk_body(file: OpenFile, at: int, size: int, limit: SizeLimit) -> bytes:
-    """Returns the body of a chunk record, or so much of it that a too large one is recognised."""
+    """Returns the body of a chunk record; of one above the limit, enough to recognise that."""
     return file.read(at, min(size, limit.max_bytes + _HEAD_BYTES))
 
 
@@ -313,29 +353,30 @@ def chunk_head(body: bytes) -> ChunkHead:
 
 
 def decompressed_chunk(body: bytes, limit: SizeLimit, *, is_whole: bool = True) -> bytes:
-    """Decompresses a chunk, and verifies its checksum if it has one; or its front, if it is cut.
+    """Decompresses the body of a chunk record, and verifies its checksum if it has one.
 
-    Nothing is allocated by the size that the chunk states.
+    Of a body that is not `is_whole`, the front is decompressed, as far as it is there. Nothing is
+    allocated by the size that the chunk states.
 
     Raises:
         UnreadableError: it is damaged, larger than allowed, or its compression is unknown.
     """
-    crc, compression, size, at = chunk_head(body)
-    compressed = memoryview(body)[at : at + size]
-    if size > limit.max_bytes:
+    head = chunk_head(body)
+    compressed = memoryview(body)[head.data_at : head.data_at + head.data_size]
+    if head.data_size > limit.max_bytes:
         raise UnreadableError(too_large("a chunk", limit.max_bytes))
     if not is_whole:
-        if compression == "zstd":
-            data = in_turn(partial(zstd_front, compressed), limit)
+        if head.compression == "zstd":
+            data = decompress_front(partial(zstd_front, compressed), limit)
         else:
-            data = _decompressed(compression, compressed, limit)
+            data = _decompress(head.compression, compressed, limit)
         return data[: limit.max_bytes]
-    if len(compressed) != size:
+    if len(compressed) != head.data_size:
         raise UnreadableError("damaged: a chunk is shorter than it states")
-    data = _decompressed(compression, compressed, limit)
+    data = _decompress(head.compression, compressed, limit)
     if len(data) > limit.max_bytes:
         raise UnreadableError(too_large("a chunk", limit.max_bytes))
-    if crc and zlib.crc32(data) != crc:
+    if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableError("damaged: a chunk does not match its checksum")
     return data
 
@@ -354,7 +395,7 @@ def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
     return decompressed_chunk(body, limit, is_whole=chunk.usable is None)[: chunk.usable]
 
 
-def _decompressed(compression: str, compressed: memoryview, limit: SizeLimit) -> bytes:
+def _decompress(compression: str, compressed: memoryview, limit: SizeLimit) -> bytes:
     """Returns at most one byte more than allowed, so that the caller sees the excess."""
     if not compression:
         if len(compressed) > LARGE_BYTES:
@@ -363,7 +404,7 @@ def _decompressed(compression: str, compressed: memoryview, limit: SizeLimit) ->
     if compression == "zstd":
         return decompress_zstd(compressed, limit)
     if compression == "lz4":
-        return in_turn(partial(_lz4_front, compressed), limit)
+        return decompress_front(partial(_lz4_front, compressed), limit)
     raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")
 
 
@@ -375,9 +416,9 @@ class OpenedChunk(NamedTuple):
     """A chunk of a file, decompressed as far as the file reaches.
 
     Attributes:
-        data: the decompressed records; only the first `content.usable` bytes are whole records.
-        content: what the records hold.
-        is_compressed: whether it was.
+        data: the decompressed bytes; the first `content.usable` of them are whole records.
+        content: the messages and declarations in these records.
+        is_compressed: whether the chunk is compressed in the file.
     """
 
     data: bytes
@@ -386,9 +427,9 @@ class OpenedChunk(NamedTuple):
 
 
 class ChunkOpener:
-    """Decompresses the chunks of one file, and stops where they come to more than a robot's do.
+    """Decompresses the chunks of one file, up to `MAX_CHUNKS` and `MAX_COMPRESSION_RATIO`.
 
-    A file of some MB can hold chunks that decompress to terabytes.
+    Without these limits a file of some MB could decompress to terabytes.
     """
 
     def __init__(self, file: OpenFile, limit: SizeLimit) -> None:
@@ -398,10 +439,10 @@ class ChunkOpener:
         self._chunks = 0
 
     def open(self, record: FileRecord) -> OpenedChunk:
-        """Decompresses a chunk; one that the file ends in, as far as the file reaches.
+        """Decompresses a chunk, as far as the file reaches.
 
         Raises:
-            UnreadableError: the chunk is damaged or too large, or the chunks before it were.
+            UnreadableError: the chunk is damaged or too large, or a limit of the file is reached.
         """
         if self._chunks >= MAX_CHUNKS:
             raise UnreadableError(f"it has more than {MAX_CHUNKS} chunks")
@@ -416,6 +457,6 @@ class ChunkOpener:
             data = decompressed_chunk(body, self._limit, is_whole=is_whole)
             self._bytes += len(data)
             content = walk_chunk(data)
-        self._bytes += MESSAGE_BYTES * content.messages
+        self._bytes += MESSAGE_BYTES * content.message_count
         self._chunks += 1
         return OpenedChunk(data, content, bool(chunk_head(body).compression))

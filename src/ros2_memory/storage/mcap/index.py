@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from contextlib import contextmanager
 from functools import lru_cache
 from itertools import pairwise
 from operator import attrgetter, le
@@ -36,7 +37,7 @@ from ros2_memory.storage.mcap.chunk import (
     Chunk,
     index_bytes,
     index_groups,
-    pairs_in,
+    read_indexes,
 )
 from ros2_memory.storage.mcap.records import (
     FOOTER,
@@ -48,7 +49,7 @@ from ros2_memory.storage.mcap.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from mcap.records import Statistics
 
@@ -61,6 +62,7 @@ _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 _INDEX_LENGTH: Final = struct.Struct("<Q")
 _new_tuple: Final = tuple.__new__
 _MAX_CACHED_BYTES: Final = 128 << 10
+"""Longer declarations are decoded anew for each file: they are seldom those of other files."""
 
 # Plain integers: the opcodes of records are compared with them some million times.
 _DECLARES: Final = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
@@ -72,19 +74,33 @@ class DoubtError(UnreadableError):
     """The summary section cannot be relied on; the text is a note on it, or empty."""
 
 
-def _summary(
-    file: OpenFile,
-) -> tuple[int, Mapping[int, Channel], Declarations, list[Chunk], Statistics | None]:
-    """Returns where the summary section of a file begins, and what it states.
+class _Summary(NamedTuple):
+    """What the summary section of a file states.
 
-    That is the channels by their number, the records that declare them, to compare others with, the
-    chunks and the statistics.
+    Attributes:
+        begins_at: where the section begins in the file.
+        channels: the channels by number.
+        declared: the records that declare channels and schemas, to compare others with.
+        chunks: the chunks, in the order of their indexes.
+        stated: the statistics.
+    """
+
+    begins_at: int
+    channels: Mapping[int, Channel]
+    declared: Declarations
+    chunks: list[Chunk]
+    stated: Statistics
+
+
+def _read_summary(file: OpenFile) -> _Summary:
+    """Reads the summary section of a file.
 
     Raises:
-        DoubtError: it is missing, or does not match its checksum.
+        DoubtError: it is missing, does not match its checksum, or lacks something that is needed
+            to find all messages: statistics, channels, schemas or message indexes.
         UnreadableError, struct.error and others: it is damaged.
     """
-    start, section = _section(file)
+    begins_at, section = _read_section(file)
     declaring: list[bytes] = []
     chunks: list[Chunk] = []
     stated: Statistics | None = None
@@ -95,12 +111,26 @@ def _summary(
             declaring.append(section[begin - RECORD.size : end])
         elif opcode == _STATISTICS_OPCODE:
             stated = statistics(section[begin:end])
+    if stated is None:
+        raise DoubtError
     records = b"".join(declaring)
-    declared = _declared if len(records) <= _MAX_CACHED_BYTES else _declared.__wrapped__
-    return start, *declared(records), chunks, stated
+    decode = _declarations if len(records) <= _MAX_CACHED_BYTES else _declarations.__wrapped__
+    channels, declared = decode(records)
+    counts = stated.channel_message_counts
+    if not declared.resolved or stated.channel_count > len(channels):
+        raise DoubtError
+    if not counts.keys() <= channels.keys() or len(chunks) > MAX_CHUNKS:
+        raise DoubtError
+    # A chunk without channels has no message indexes, or they are all empty.
+    if chunks and (not counts or not all(chunk.channels for chunk in chunks)):
+        raise DoubtError
+    declared_channels = frozenset(channels)
+    if not all(map(declared_channels.issuperset, {chunk.channels for chunk in chunks})):
+        raise DoubtError("its chunk indexes name channels that it does not declare")
+    return _Summary(begins_at, channels, declared, chunks, stated)
 
 
-def _section(file: OpenFile) -> tuple[int, bytes]:
+def _read_section(file: OpenFile) -> tuple[int, bytes]:
     """Returns where the summary section begins, and its bytes."""
     footer_at = file.size - MAGIC_SIZE - FOOTER.size
     footer = file.read(footer_at, FOOTER.size)
@@ -124,21 +154,24 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
         raise UnreadableError("damaged: a chunk index is shorter than it states")
     places = section[at:stop]
     # Slices with a step take the low and the high byte of every channel number at once.
-    channels = _numbers(places[:: INDEX_OFFSET.itemsize], places[1 :: INDEX_OFFSET.itemsize])
+    channels = _channel_numbers(
+        places[:: INDEX_OFFSET.itemsize], places[1 :: INDEX_OFFSET.itemsize]
+    )
     (index_length,) = _INDEX_LENGTH.unpack_from(section, stop)
-    # Past the function that takes the fields of a named tuple: it costs as much as all the rest.
+    # Not by `Chunk(...)`: that function alone costs as much as all the rest.
     fields = (offset, length, start, last, channels, places, index_length, None, False)
     return _new_tuple(Chunk, fields)
 
 
 @lru_cache(1024)
-def _numbers(low: bytes, high: bytes) -> frozenset[int]:
-    """Returns the channel numbers with these low and high bytes: one set for all equal ones."""
+def _channel_numbers(low: bytes, high: bytes) -> frozenset[int]:
+    """Returns the 16-bit numbers with these low and high bytes: one set for all equal ones."""
     return frozenset(first | second << 8 for first, second in zip(low, high, strict=True))
 
 
 @lru_cache(32)
-def _declared(records: bytes) -> tuple[Mapping[int, Channel], Declarations]:
+def _declarations(records: bytes) -> tuple[Mapping[int, Channel], Declarations]:
+    """Decodes schema and channel records: the channels by number, and the records."""
     declarations = Declarations()
     for opcode, begin, end in section_records(records):
         declarations.add(opcode, records[begin:end])
@@ -151,21 +184,22 @@ _OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
 OTHER_DECLARED: Final = "its summary section declares other channels or types than its messages"
 _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
-_HEAD_BYTES: Final = RECORD.size
 _SEAM_SHARE: Final = 16
+"""A seam is longer than one of so many parts of the two chunks beside it."""
 _SEAM_TIMES: Final = 4
+"""A seam is so many times longer than the median distance of two chunks."""
 _SEAM_CHUNKS: Final = 3
+"""How many chunks on each side count as near a seam."""
 _MOST_SEAMS: Final = 8
-_stating: Final = _STATED.pack
 
 
 class Seam(NamedTuple):
-    """A chunk after which the stated times do not go on as elsewhere in its file.
+    """Two chunks in file order between which the times jump farther than elsewhere in the file.
 
     Attributes:
-        nth: its number; the next chunk is the other side.
-        first: the earliest time that a chunk near it states, on either side.
-        last: the latest.
+        nth: the position of the first of the two chunks.
+        first: the earliest time of the chunks near the seam.
+        last: their latest time.
     """
 
     nth: int
@@ -181,11 +215,11 @@ class McapIndex(NamedTuple):
         chunks: the chunks with messages, in file order.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
-        contents: what the messages amount to; nothing where that was not asked for.
-        seams: where the times of chunks do not go on from one to the next; empty after a scan.
-        contradiction: how the indexes of the file contradict its messages, if that was found after
-            they had been used; else empty.
-        declared: what the summary section declares; None if the index comes from a scan.
+        contents: the summary of the messages; empty if it was not asked for.
+        seams: where the times jump from one chunk to the next; empty after a scan.
+        contradiction: how the indexes of the file contradict its messages; empty if they do not.
+            It is set where the indexes had been used before that was found out.
+        declared: the schemas and channels of the summary section; None after a scan.
     """
 
     channels: Mapping[int, Channel]
@@ -200,8 +234,8 @@ class McapIndex(NamedTuple):
     @property
     def used(self) -> frozenset[int]:
         """The channels that have messages."""
-        of_chunks = {chunk.channels for chunk in self.chunks}
-        return frozenset[int]().union(*of_chunks)
+        channel_sets = {chunk.channels for chunk in self.chunks}
+        return frozenset[int]().union(*channel_sets)
 
     @property
     def memory_bytes(self) -> int:
@@ -211,12 +245,11 @@ class McapIndex(NamedTuple):
 
 
 def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
-    """Returns `McapIndex.seams`.
+    """Returns the seams between chunks; none if there are more than `_MOST_SEAMS`.
 
     A writer fills one chunk after the other, so their times follow each other. Where all indexes of
-    neighbouring chunks agree on wrong times there is a hole, or an overlap, of more than a
-    `_SEAM_SHARE` of the two chunks, and of several times what is usual in the file. A file with
-    many of them was written in another order, and they say nothing.
+    neighbouring chunks agree on wrong times there is a hole or an overlap. A file with many of them
+    was written in another order, and they say nothing.
     """
     # Plain lists: for some thirty chunks arrays take twice as long.
     apart = [abs(following.start - chunk.end) for chunk, following in pairwise(chunks)]
@@ -231,97 +264,103 @@ def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
     return tuple(seams) if len(seams) <= _MOST_SEAMS else ()
 
 
-def index_from_summary(file: OpenFile, *, is_sound: bool = False) -> McapIndex:
-    """Returns the index that the summary section and the message indexes give.
-
-    Of a file that was found sound before, without what its messages amount to.
+def checked_index(file: OpenFile) -> McapIndex:
+    """Returns the index of the summary section, compared with the chunks and message indexes.
 
     Raises:
         DoubtError: the summary section is missing or unreliable; the file must be scanned.
         UnreadableError: a message index is not what the summary section says.
     """
+    with _doubting():
+        summary = _read_summary(file)
+        if summary.chunks:
+            _require_chunks_as_indexed(file, summary)
+        index = _index_of(summary)
+    if not index.chunks:
+        return index
+    tally = Tally()
+    with as_unreadable():
+        for chunks, indexes in index_groups(file, index.chunks):
+            messages = read_indexes(chunks, indexes)
+            tally.add(messages.channels, messages.times, messages.chunks)
+            begins = run_starts(messages.chunks)
+            firsts = np.minimum.reduceat(messages.times, begins).tolist()
+            lasts = np.maximum.reduceat(messages.times, begins).tolist()
+            stated_times = [(chunk.start, chunk.end) for chunk in chunks]
+            if [*zip(firsts, lasts, strict=True)] != stated_times:
+                raise UnreadableError(OUTSIDE)
+    contents = tally.contents()
+    if contents.totals.keys() != summary.stated.channel_message_counts.keys():
+        raise DoubtError
+    notes = disagreements(summary.stated, contents.totals)
+    return index._replace(contents=contents, notes=notes)
+
+
+def trusted_index(file: OpenFile) -> McapIndex:
+    """Returns the index of a file that `checked_index` has checked before, without `contents`.
+
+    Raises:
+        DoubtError: the summary section is missing or unreliable.
+    """
+    with _doubting():
+        return _index_of(_read_summary(file))
+
+
+@contextmanager
+def _doubting() -> Iterator[None]:
+    """Raises whatever damaged bytes of a summary section cause as a `DoubtError`."""
     try:
-        index, stated = _index_without_totals(file, is_sound=is_sound)
+        yield
     except (DoubtError, OSError):
         raise
     except Exception as error:
         raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
-    if is_sound or not index.chunks:
-        return index
-    tally = Tally()
-    with as_unreadable():
-        for group, regions in index_groups(file, index.chunks):
-            pairs = pairs_in(group, regions)
-            tally.add(pairs.channels, pairs.times, pairs.chunks)
-            begins = run_starts(pairs.chunks)
-            firsts = np.minimum.reduceat(pairs.times, begins).tolist()
-            lasts = np.maximum.reduceat(pairs.times, begins).tolist()
-            stated_times = [(chunk.start, chunk.end) for chunk in group]
-            if [*zip(firsts, lasts, strict=True)] != stated_times:
-                raise UnreadableError(OUTSIDE)
-    contents = tally.contents()
-    if contents.totals.keys() != stated.channel_message_counts.keys():
-        raise DoubtError
-    notes = disagreements(stated, contents.totals)
-    return index._replace(contents=contents, notes=notes)
 
 
-def _index_without_totals(file: OpenFile, *, is_sound: bool) -> tuple[McapIndex, Statistics]:
-    """Returns the index without what its messages amount to, and what the file states of that."""
-    start, channels, declared, chunks, stated = _summary(file)
-    if stated is None or not declared.resolved or stated.channel_count > len(channels):
+def _index_of(summary: _Summary) -> McapIndex:
+    """Returns the index of a summary section, without `contents`.
+
+    Raises:
+        DoubtError: its statistics do not agree with its chunk indexes.
+    """
+    chunks, stated = summary.chunks, summary.stated
+    if not _statistics_agree(stated, chunks):
         raise DoubtError
-    counts = stated.channel_message_counts
-    if not counts.keys() <= channels.keys() or len(chunks) > MAX_CHUNKS:
-        raise DoubtError
-    filled = [chunk for chunk in chunks if chunk.channels]
-    # Some have no message indexes, or all of these are empty.
-    if chunks and (not counts or len(filled) < len(chunks)):
-        raise DoubtError
-    declared_channels = frozenset(channels)
-    if not all(map(declared_channels.issuperset, {chunk.channels for chunk in filled})):
-        raise DoubtError("its chunk indexes name channels that it does not declare")
-    if chunks and not is_sound:
-        _require_chunks_as_indexed(file, start, chunks)
-    if not _agrees(stated, chunks, filled):
-        raise DoubtError
-    indexes = sum([len(chunk.index_places or b"") for chunk in filled]) // INDEX_OFFSET.itemsize
-    index_length = sum([chunk.index_length for chunk in filled])
+    indexes = sum([len(chunk.index_places or b"") for chunk in chunks]) // INDEX_OFFSET.itemsize
+    index_length = sum([chunk.index_length for chunk in chunks])
     if index_bytes(indexes, stated.message_count) != index_length:
         raise DoubtError("its message indexes do not hold what its statistics state")
-    seams = _seams(filled)
-    index = McapIndex(channels, tuple(filled), seams=seams, declared=declared)
-    return index, stated
+    return McapIndex(
+        summary.channels, tuple(chunks), seams=_seams(chunks), declared=summary.declared
+    )
 
 
-def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:
+def _require_chunks_as_indexed(file: OpenFile, summary: _Summary) -> None:
     """Compares every chunk index with the head of its chunk, and looks between the chunks.
 
     Raises:
-        DoubtError: a chunk is not where its index has it, or not of these times; or there is a
-            chunk or a message that no index knows.
+        DoubtError: a chunk is not where its index has it, or states other times; or a chunk or a
+            message is in no index.
     """
-    ordered = sorted(chunks, key=attrgetter("offset"))
-    if ordered[-1].offset >= file.size:
+    chunks = sorted(summary.chunks, key=attrgetter("offset"))
+    if chunks[-1].offset >= file.size:
         raise DoubtError(_OTHER_CHUNKS)
-    begins = [chunk.offset for chunk in ordered]
-    heads = [
-        _stating(_CHUNK, chunk.length - _HEAD_BYTES, chunk.start, chunk.end) for chunk in ordered
-    ]
-    if [file.read(begin, _STATED.size) for begin in begins] != heads:
-        raise DoubtError(_OTHER_CHUNKS)
-    ends = [MAGIC_SIZE, *[chunk.offset + chunk.length + chunk.index_length for chunk in ordered]]
-    begins.append(end)
-    for at, following in zip(ends, begins, strict=True):
-        if at != following:
-            _require_no_content(file, at, following)
+    for chunk in chunks:
+        head = _STATED.pack(_CHUNK, chunk.length - RECORD.size, chunk.start, chunk.end)
+        if file.read(chunk.offset, _STATED.size) != head:
+            raise DoubtError(_OTHER_CHUNKS)
+    end = MAGIC_SIZE
+    for chunk in chunks:
+        _require_no_content(file, end, chunk.offset)
+        end = chunk.offset + chunk.length + chunk.index_length
+    _require_no_content(file, end, summary.begins_at)
 
 
 def _require_no_content(file: OpenFile, at: int, end: int) -> None:
-    """Checks that no chunk or message lies in this part of the data section.
+    """Checks that no chunk or message lies from `at` to `end` in the data section.
 
     Raises:
-        DoubtError: one does, or the part is not made of records.
+        DoubtError: one does, or this part is not made of records.
     """
     while at < end:
         opcode, length = RECORD.unpack(file.read(at, RECORD.size))
@@ -336,14 +375,14 @@ def _require_no_content(file: OpenFile, at: int, end: int) -> None:
         raise DoubtError(_OTHER_CHUNKS)
 
 
-def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]) -> bool:
+def _statistics_agree(stated: Statistics, chunks: Sequence[Chunk]) -> bool:
     """Returns whether the statistics agree with themselves and with the chunk indexes."""
     counted = sum(stated.channel_message_counts.values())
     if counted != stated.message_count or stated.chunk_count != len(chunks):
         return False
-    if not filled:
+    if not chunks:
         return not stated.message_count
-    starts, ends = [chunk.start for chunk in filled], [chunk.end for chunk in filled]
+    starts, ends = [chunk.start for chunk in chunks], [chunk.end for chunk in chunks]
     start, end = min(starts), max(ends)
     if (start, end) != (stated.message_start_time, stated.message_end_time) or end >= MAX_NS:
         return False
@@ -353,20 +392,22 @@ def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]
 
 def disagreements(stated: Statistics, totals: Mapping[int, Extent]) -> tuple[str, ...]:
     """Returns a note if the messages contradict the statistics; else nothing."""
-    extents = totals.values()
     counts = {channel: total.count for channel, total in totals.items()}
-    count = sum([total.count for total in extents])
-    first = min([total.first for total in extents], default=stated.message_start_time)
-    last = max([total.last for total in extents], default=stated.message_end_time)
-    claimed = (stated.message_count, stated.message_start_time, stated.message_end_time)
-    if stated.channel_message_counts == counts and claimed == (count, first, last):
+    count = sum(counts.values())
+    first = min([total.first for total in totals.values()], default=stated.message_start_time)
+    last = max([total.last for total in totals.values()], default=stated.message_end_time)
+    stated_times = (stated.message_start_time, stated.message_end_time)
+    has_stated_count = stated.message_count == count and stated.channel_message_counts == counts
+    if has_stated_count and stated_times == (first, last):
         return ()
-    start, end = _seconds(stated.message_start_time), _seconds(stated.message_end_time)
+    start, end = map(_seconds, stated_times)
     note = (
         f"{WRONG_STATISTICS}: they state {stated.message_count} messages from {start} to {end};"
         f" it holds {count} from {_seconds(first)} to {_seconds(last)}"
     )
-    return (f"{note}; {MESSAGES_MISSING}" if stated.message_count > count else note,)
+    if stated.message_count > count:
+        note += f"; {MESSAGES_MISSING}"
+    return (note,)
 
 
 def _seconds(time: Ns) -> str:

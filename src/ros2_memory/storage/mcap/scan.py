@@ -16,7 +16,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
-from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, Pairs
+from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, MessageTable
 from ros2_memory.storage.mcap.index import OTHER_DECLARED, McapIndex, disagreements
 from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 
     from mcap.records import Statistics
 
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.contents import Extent
     from ros2_memory.storage.file_io import OpenFile
 
-_NONE: Final = frozenset[int]()
 _UNCHUNKED_BYTES: Final = 64 << 10
-"""Such a part has one message, or up to so many bytes: for one of them it is read as a whole."""
+"""The most bytes of a part of messages outside chunks: for one message all of it is read."""
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
 
 
@@ -61,7 +61,7 @@ def index_by_scan(file: OpenFile, limit: SizeLimit, note: str = "") -> McapIndex
 
 @dataclass(slots=True)
 class _Unchunked:
-    """Messages outside chunks that follow each other: a part of the file, as if it were a chunk."""
+    """A part of the file with messages outside chunks, which is indexed like a chunk."""
 
     begin: int
     end: int = 0
@@ -72,13 +72,32 @@ class _Unchunked:
 
 @dataclass(slots=True)
 class _Scan:
+    """One scan of a file.
+
+    Attributes:
+        file: the open file.
+        max_bytes: the size up to which a message outside chunks is read.
+        opener: decompresses the chunks.
+        read_to: where the last readable record ends.
+        data_ended: whether the data section is over, so that the summary section follows.
+        repeated: schemas and channels of the summary section.
+        declared: those of the data section, outside chunks.
+        in_chunks: those in chunks. They win over the others: a checksum protects them.
+        redeclared: whether a schema or channel was declared twice, differently.
+        chunks: the chunks with messages, and the parts of messages outside chunks.
+        tally: counts the messages.
+        unchunked: the part of messages outside chunks that is still growing.
+        stated: the statistics, if the file has them.
+        message_count: how many messages were met, also with impossible log times.
+        damaged: why each damaged record cannot be read.
+        partial_bytes: of a last, compressed chunk that was read in part.
+    """
+
     file: OpenFile
     max_bytes: int
     opener: ChunkOpener
     read_to: int = MAGIC_SIZE
     data_ended: bool = False
-    # Schemas and channels of the summary section, of the records before it, and of the chunks.
-    # Those of chunks win: a checksum protects them.
     repeated: Declarations = field(default_factory=Declarations)
     declared: Declarations = field(default_factory=Declarations)
     in_chunks: Declarations = field(default_factory=Declarations)
@@ -87,12 +106,12 @@ class _Scan:
     tally: Tally = field(default_factory=Tally)
     unchunked: _Unchunked = field(default_factory=lambda: _Unchunked(0))
     stated: Statistics | None = None
-    messages: int = 0
+    message_count: int = 0
     damaged: list[str] = field(default_factory=list)
-    partial: int = 0  # bytes of a last, compressed chunk that was read in part
+    partial_bytes: int = 0
 
     def add(self, record: FileRecord) -> None:
-        """Adds a record; one that is damaged is noted, since those behind it may be whole."""
+        """Adds a record; a damaged one is noted, since the records behind it may be whole."""
         if record.end > self.file.size:
             self._close_unchunked()
             self._add_cut_chunk(record)
@@ -122,7 +141,7 @@ class _Scan:
         self.unchunked.times.append(log_time)
         self.unchunked.offsets.append(record.offset - self.unchunked.begin)
         self.unchunked.end = record.end
-        self.messages += 1
+        self.message_count += 1
 
     def _declare(self, opcode: int, body: bytes, declarations: Declarations) -> None:
         with as_unreadable():
@@ -136,7 +155,7 @@ class _Scan:
         opened = self.opener.open(record)
         if opened.content.usable < len(opened.data):
             self.damaged.append("damaged: a chunk has bytes that are not a record")
-        self._add_content(opened.content, record.offset, record.end, None)
+        self._add_content(opened.content, record.offset, record.end)
 
     def _add_cut_chunk(self, record: FileRecord) -> None:
         """Adds the chunk that the file ends in."""
@@ -149,36 +168,41 @@ class _Scan:
             return
         self._add_content(opened.content, record.offset, self.file.size, usable)
         if opened.is_compressed:
-            self.partial = self.file.size - record.offset
+            self.partial_bytes = self.file.size - record.offset
             self.read_to = self.file.size
         else:
             self.read_to = self.file.size - len(opened.data) + usable
 
     def _add_content(
-        self, content: ChunkContent, offset: int, end: int, usable: int | None
+        self, content: ChunkContent, begin: int, end: int, usable: int | None = None
     ) -> None:
+        """Adds the content of the chunk from `begin` to `end` in the file."""
         for opcode, body in content.declarations:
             try:
                 self._declare(opcode, body, self.in_chunks)
             except UnreadableError as error:
                 self.damaged.append(str(error))
-        self.messages += content.messages
-        self._add_pairs(content.pairs, Chunk(offset, end - offset, 0, 0, _NONE, usable=usable))
+        self.message_count += content.message_count
+        if content.messages.times.size:
+            first, last, channels = self._count(content.messages)
+            chunk = Chunk(begin, end - begin, first, last, channels, usable=usable)
+            self.chunks.append(chunk)
 
     def _close_unchunked(self) -> None:
-        """Adds what was met of messages outside chunks as a part of the file."""
+        """Adds the part of messages outside chunks, if there is one, and begins a new one."""
         part, self.unchunked = self.unchunked, _Unchunked(0)
-        pairs = Pairs.of(part.channels, part.times, part.offsets)
-        length = part.end - part.begin
-        self._add_pairs(pairs, Chunk(part.begin, length, 0, 0, _NONE, is_unchunked=True))
+        messages = MessageTable.of_chunk(part.channels, part.times, part.offsets)
+        if messages.times.size:
+            first, last, channels = self._count(messages)
+            length = part.end - part.begin
+            chunk = Chunk(part.begin, length, first, last, channels, is_unchunked=True)
+            self.chunks.append(chunk)
 
-    def _add_pairs(self, pairs: Pairs, chunk: Chunk) -> None:
-        """Adds messages, and the chunk that they are in with its times and channels."""
-        if pairs.times.size:
-            self.tally.add(pairs.channels, pairs.times, pairs.chunks)
-            first, last = int(pairs.times.min()), int(pairs.times.max())
-            channels = frozenset(pairs.channels.tolist())
-            self.chunks.append(chunk._replace(start=first, end=last, channels=channels))
+    def _count(self, messages: MessageTable) -> tuple[Ns, Ns, frozenset[int]]:
+        """Counts messages; returns their first and last log time, and their channels."""
+        self.tally.add(messages.channels, messages.times, messages.chunks)
+        channels = frozenset(messages.channels.tolist())
+        return int(messages.times.min()), int(messages.times.max()), channels
 
     def index(self, note: str) -> McapIndex:
         """Returns the index of the messages found; `note` comes before its other notes."""
@@ -186,14 +210,14 @@ class _Scan:
         self._close_unchunked()
         contents = self.tally.contents()
         declarations = self.repeated
-        differing = declarations.update(self.declared)
-        differing = declarations.update(self.in_chunks) or differing
+        has_other = declarations.update(self.declared)
+        has_other = declarations.update(self.in_chunks) or has_other
         channels = declarations.channels()
         totals = {number: total for number, total in contents.totals.items() if number in channels}
         notes = self._notes(contents.totals, totals, complete=complete)
         if note:
             notes.insert(0, note)
-        if differing and not note.startswith(OTHER_DECLARED):
+        if has_other and not note.startswith(OTHER_DECLARED):
             notes.append(OTHER_DECLARED)
         if self.redeclared:
             notes.append("it declares a channel or a type twice, differently: the last one is used")
@@ -206,16 +230,25 @@ class _Scan:
         )
 
     def _notes(
-        self, found: Mapping[int, Extent], totals: Mapping[int, Extent], *, complete: bool
+        self, all_totals: Mapping[int, Extent], totals: Mapping[int, Extent], *, complete: bool
     ) -> list[str]:
+        """Returns sentences on what is missing or wrong.
+
+        Args:
+            all_totals: the messages of each channel, also of channels that are not declared.
+            totals: the messages of declared channels.
+            complete: whether the writer finished the file.
+        """
         notes = [] if complete else [self._end_note()]
-        timed = sum(total.count for total in found.values())
-        if orphans := timed - sum(total.count for total in totals.values()):
+        timed = sum(total.count for total in all_totals.values())
+        orphans = timed - sum(total.count for total in totals.values())
+        untimed = self.message_count - timed
+        if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no declared channel")
         if self.damaged:
             records = counted(len(self.damaged), "damaged record")
             notes.append(f"left out: {records} ({self.damaged[0]})")
-        if untimed := self.messages - timed:
+        if untimed:
             notes.append(f"left out: {counted(untimed, 'message')} without a possible log time")
         # Statistics that count what was left out are right.
         if self.stated is not None and not notes:
@@ -223,10 +256,10 @@ class _Scan:
         return notes
 
     def _end_note(self) -> str:
-        if self.partial:
+        if self.partial_bytes:
             return (
-                f"the file ends early: of its last chunk, {self.partial} compressed bytes, only a"
-                " part could be read"
+                f"the file ends early: of its last chunk, {self.partial_bytes} compressed bytes,"
+                " only a part could be read"
             )
         if self.data_ended:
             return "the file ends early, behind its messages: none is lost"
