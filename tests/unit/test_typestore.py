@@ -299,7 +299,7 @@ class TestFolders:
 
 
 def cached_texts(stores: Typestores) -> list[bytes]:
-    keys = (key for _, key in stores._types._all.values)
+    keys = (key for _, key in stores._types._store.entries)
     return [text for _, _, text in cast("Iterator[tuple[str, str, bytes]]", keys)]
 
 

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _SPARED: Final = 3
-"""Values that stay, though they are older, for each that goes."""
+"""For each value that is dropped, so many older ones stay."""
 _ENTRY_BYTES: Final = 200
 """What an entry takes besides its value: its key, and its place among the others."""
 _SHARED_BYTES: Final = 32 << 10
@@ -33,47 +33,55 @@ class ByteLru(Generic[T]):
     """
 
     def __init__(self, capacity: int) -> None:
-        self._all: _Values[T] = _Values(capacity)
+        self._store: _SharedStore[T] = _SharedStore(capacity)
 
     def namespace(self) -> ByteLru[T]:
         """Returns a cache with keys of its own, within the capacity of this one."""
         cache = ByteLru[T](0)
-        cache._all = self._all
+        cache._store = self._store
         return cache
 
     def get(self, key: Hashable) -> T | None:
         """Returns the value of the key, or None."""
-        with self._all.lock:
-            entry = self._all.values.get((self, key))
+        with self._store.lock:
+            entry = self._store.entries.get((self, key))
             if entry is None:
                 return None
-            self._all.values.move_to_end((self, key))
-            return entry[0]
+            self._store.entries.move_to_end((self, key))
+            return entry.value
 
     def put(self, key: Hashable, value: T, size: int) -> None:
         """Caches `value`, which takes about `size` bytes, and drops others."""
-        entries = self._all
-        size += _ENTRY_BYTES
-        with entries.lock:
-            _, replaced = entries.values.pop((self, key), (None, 0))
-            entries.bytes -= replaced
-            if size > entries.capacity:
+        store, entries = self._store, self._store.entries
+        new = _Entry(value, size + _ENTRY_BYTES)
+        with store.lock:
+            replaced = entries.pop((self, key), None)
+            if replaced is not None:
+                store.bytes -= replaced.bytes
+            if new.bytes > store.capacity:
                 return
-            while entries.bytes + size > entries.capacity:
-                for oldest in [*islice(entries.values, min(_SPARED, len(entries.values) - 1))]:
-                    entries.values.move_to_end(oldest)
-                _, (_, dropped) = entries.values.popitem(last=False)
-                entries.bytes -= dropped
-            entries.values[(self, key)] = (value, size)
-            entries.bytes += size
+            while store.bytes + new.bytes > store.capacity:
+                for spared in [*islice(entries, min(_SPARED, len(entries) - 1))]:
+                    entries.move_to_end(spared)
+                _, dropped = entries.popitem(last=False)
+                store.bytes -= dropped.bytes
+            entries[self, key] = new
+            store.bytes += new.bytes
+
+
+class _Entry(NamedTuple, Generic[T]):
+    """A cached value, and the bytes that it takes."""
+
+    value: T
+    bytes: int
 
 
 @dataclass(slots=True)
-class _Values(Generic[T]):
-    """The values of caches that share a capacity, by cache and key; last the one used last."""
+class _SharedStore(Generic[T]):
+    """The entries of caches that share a capacity, by cache and key; the last used comes last."""
 
     capacity: int
-    values: OrderedDict[tuple[ByteLru[T], Hashable], tuple[T, int]] = field(
+    entries: OrderedDict[tuple[ByteLru[T], Hashable], _Entry[T]] = field(
         default_factory=OrderedDict
     )
     bytes: int = 0
@@ -81,11 +89,11 @@ class _Values(Generic[T]):
 
 
 def shared(channel: Channel) -> Channel:
-    """Returns the first channel met that equals this one: bags of one robot declare the same.
+    """Returns one object for equal channels: bags of one robot declare the same.
 
-    A channel with long texts is returned as it is, so that no more than 16 MiB are held.
+    A channel with long texts is returned as it is, so that shared ones take 16 MiB at most.
     """
-    return _first_met(channel) if channel.memory_bytes <= _SHARED_BYTES else channel
+    return _first_equal(channel) if channel.memory_bytes <= _SHARED_BYTES else channel
 
 
 def unshared_bytes(channels: Mapping[int, Channel]) -> int:
@@ -95,5 +103,5 @@ def unshared_bytes(channels: Mapping[int, Channel]) -> int:
 
 
 @lru_cache(512)
-def _first_met(channel: Channel) -> Channel:
+def _first_equal(channel: Channel) -> Channel:
     return channel

@@ -107,8 +107,8 @@ def reading(path: Path) -> Iterator[None]:
 def as_unreadable() -> Iterator[None]:
     """Raises every exception that damaged bytes cause as an `UnreadableError`.
 
-    For parts of a file whose neighbours may be whole. OSError and MemoryError pass, since whole
-    bytes raise them too, and that the time of a call is over.
+    For parts of a file whose neighbours may be whole. OSError, MemoryError and EpisodicError (the
+    time of a call is over) pass: whole bytes raise them, too.
     """
     try:
         yield
@@ -171,8 +171,8 @@ class SizeLimit(NamedTuple):
     """How large a chunk or a message may be, decompressed.
 
     Attributes:
-        max_bytes: the size up to which one is read.
-        take_turn: is called before one takes more than `LARGE_BYTES`.
+        max_bytes: a larger one is not read.
+        take_turn: is called before more than `LARGE_BYTES` are in memory.
     """
 
     max_bytes: int
@@ -180,7 +180,7 @@ class SizeLimit(NamedTuple):
 
 
 def max_decompressed_bytes(compressed: int) -> int:
-    """Returns the most bytes that so many compressed bytes may decompress to."""
+    """Returns how many bytes these compressed bytes may decompress to at most."""
     return _ALWAYS_ALLOWED + MAX_COMPRESSION_RATIO * compressed
 
 

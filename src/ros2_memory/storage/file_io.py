@@ -57,8 +57,8 @@ class OpenFile:
     threads at once.
 
     Args:
-        path: of the file.
-        at_once: whether a small one is read at once, since most of it will be asked for.
+        path: the file.
+        at_once: whether most of the file will be read, so that a small file is read at once.
 
     Raises:
         OSError: it cannot be opened.
@@ -69,11 +69,12 @@ class OpenFile:
         self._descriptor = open_regular(path)
         status = os.fstat(self._descriptor)
         self.size = status.st_size
-        times = status.st_mtime_ns, status.st_ino, status.st_ctime_ns
-        self.key = FileKey(str(path), status.st_size, *times)
+        self.key = FileKey(
+            str(path), status.st_size, status.st_mtime_ns, status.st_ino, status.st_ctime_ns
+        )
         self._whole = b""
         if at_once and self.size <= _AT_ONCE_BYTES:
-            with suppress(OSError):  # reading a part of it raises it, too
+            with suppress(OSError):  # `read` raises it for the part that is asked for
                 self._whole = os.pread(self._descriptor, self.size, 0)
 
     def __enter__(self) -> Self:

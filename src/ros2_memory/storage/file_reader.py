@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Closing
 
 _HEADER_BYTES: Final = 4
+"""The encapsulation header of CDR."""
+_LENGTH_BYTES: Final = 4
+"""The length of a string or a sequence, before its content."""
 # A float128 is not aligned to its own size.
 _SIZES: Final[Mapping[str, int]] = {
     str(name): size for name, size in SIZEMAP.items() if name != "float128"
@@ -51,22 +54,25 @@ class _StoppedError(Exception):
     """There are more objects than are counted, or the payload does not fit its definition."""
 
 
-def holds_too_many(definition: Definition, payload: bytes) -> bool:
+def has_too_many_objects(definition: Definition, payload: bytes) -> bool:
     """Returns whether decoding a payload would make more than `MAX_OBJECTS` objects.
 
-    One byte of it can become an object of a hundred. The length that a sequence states counts. A
-    payload that does not fit its definition otherwise is left to decoding, which names the fault.
+    One byte of a payload can become an object of a hundred bytes. The length that a sequence states
+    counts. Decoding finds out whether the payload fits its definition otherwise.
     """
     if len(payload) < _COUNTED_FROM_BYTES:
         return False
-    walk = _Walk(payload)
+    counter = _ObjectCounter(payload)
     with suppress(_StoppedError, struct.error, IndexError):
-        walk.message(definition)
-    return walk.objects > MAX_OBJECTS
+        counter.count_message(definition)
+    return counter.objects > MAX_OBJECTS
 
 
-class _Walk:
-    """Goes through the fields of a payload, in either byte order, and counts texts and messages."""
+class _ObjectCounter:
+    """Counts texts and messages in a CDR payload, in either byte order.
+
+    Each method steps past what it counts. They raise `_StoppedError` when they know enough.
+    """
 
     def __init__(self, payload: bytes) -> None:
         self.objects = 0
@@ -74,87 +80,86 @@ class _Walk:
         self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
         self._position = _HEADER_BYTES
 
-    def message(self, definition: Definition) -> None:
-        self._count()
+    def count_message(self, definition: Definition) -> None:
+        self._add(1)
         if not definition.fields:
-            self._advance(1, 1)
+            self._skip(1, 1)  # the dummy byte of an empty message
         for field in definition.fields:
             if field.length is None:
-                self._one(field.kind)
+                self._count_value(field.kind)
             else:
-                length = self._length() if field.length == SEQUENCE else field.length
-                self._elements(field.kind, length)
+                length = self._read_length() if field.length == SEQUENCE else field.length
+                self._count_elements(field.kind, length)
 
-    def _elements(self, kind: str | Definition, count: int) -> None:
-        """Goes past some elements: at once where all have one size."""
+    def _count_elements(self, kind: str | Definition, count: int) -> None:
         if isinstance(kind, str) and kind in _SIZES:
             if count:  # without elements there is no padding either
-                self._advance(_SIZES[kind], _SIZES[kind] * count)
+                self._skip(_SIZES[kind], _SIZES[kind] * count)
             return
         if isinstance(kind, Definition) and self.objects + count > MAX_OBJECTS:
-            # Each is an object: none of them needs to be read.
-            self.objects += count
-            raise _StoppedError
+            self._add(count)
         for _ in range(count):
-            self._one(kind)
+            self._count_value(kind)
 
-    def _one(self, kind: str | Definition) -> None:
+    def _count_value(self, kind: str | Definition) -> None:
         if isinstance(kind, Definition):
-            self.message(kind)
+            self.count_message(kind)
         elif kind == "string":
-            self._count()
-            self._advance(1, self._length())
+            self._add(1)
+            self._skip(1, self._read_length())
         elif kind in _SIZES:
-            self._advance(_SIZES[kind], _SIZES[kind])
+            self._skip(_SIZES[kind], _SIZES[kind])
         else:
             raise _StoppedError
 
-    def _length(self) -> int:
-        at = self._advance(4, 4)
-        length: int = self._length_of.unpack_from(self._payload, at)[0]
-        return length
+    def _read_length(self) -> int:
+        at = self._skip(_LENGTH_BYTES, _LENGTH_BYTES)
+        (length,) = self._length_of.unpack_from(self._payload, at)
+        return int(length)
 
-    def _advance(self, alignment: int, size: int) -> int:
-        """Goes past an aligned value, and returns where it begins."""
-        at = self._position + -(self._position - _HEADER_BYTES) % alignment
-        self._position = at + size
+    def _skip(self, alignment: int, size: int) -> int:
+        """Steps past an aligned value, and returns where it begins."""
+        padding = -(self._position - _HEADER_BYTES) % alignment
+        begin = self._position + padding
+        self._position = begin + size
         if self._position > len(self._payload):
             raise _StoppedError
-        return at
+        return begin
 
-    def _count(self) -> None:
-        self.objects += 1
+    def _add(self, objects: int) -> None:
+        self.objects += objects
         if self.objects > MAX_OBJECTS:
             raise _StoppedError
 
 
-_MAX_KNOWN = 10_000
-_MAX_JSON_BYTES = 4 << 20
+_MAX_DECODERS: Final = 10_000
+_MAX_JSON_BYTES: Final = 4 << 20
 """A byte of JSON can become thirty of memory."""
-_EMPTY_MESSAGE_BYTES = 8
+_EMPTY_MESSAGE_BYTES: Final = 8
 """The CDR header, the one byte of a message without fields, and padding."""
 
 
-def _json(payload: bytes) -> object:
+def _decode_json(payload: bytes) -> object:
     if len(payload) > _MAX_JSON_BYTES:
         raise UnreadableError(f"it is longer than the {_MAX_JSON_BYTES >> 20} MiB that are read")
     return json.loads(payload)
 
 
-def _deserialized(message_type: MessageType, payload: bytes) -> object:
-    """Decodes a payload, unless it holds more than `MAX_OBJECTS` objects."""
+def _decode_cdr(message_type: MessageType, payload: bytes) -> object:
+    """Decodes a payload, unless it has more than `MAX_OBJECTS` objects."""
     # The recorder may not have found the text of an empty definition.
     if not message_type.fields.fields and len(payload) > _EMPTY_MESSAGE_BYTES:
         raise UnreadableError(
             "the definition in the bag is empty and the message is not; put the package's .msg"
             " folder into reader.custom_msg_paths"
         )
-    if holds_too_many(message_type.fields, payload):
+    if has_too_many_objects(message_type.fields, payload):
         raise UnreadableError(f"it states more than {MAX_OBJECTS} texts or messages")
     return message_type.deserialize(payload)
 
 
-def _reason(record: Record, error: Exception) -> str:
+def _why_undecodable(record: Record, error: Exception) -> str:
+    """Returns the reason of an `UndecodableError` for an error that decoding raised."""
     if record.payload[:4] == FRAME_MAGIC and record.channel.encoding == "cdr":
         return "its compressed payload is damaged or too large"
     words = " ".join(str(error).split())[:160] or type(error).__name__
@@ -166,7 +171,7 @@ def _reason(record: Record, error: Exception) -> str:
 
 
 def _format_of(path: Path) -> str:
-    """Returns the suffix of a bag's file, or of the file that is compressed there."""
+    """Returns the suffix of a bag file without `.zstd`: `.mcap` of `a.mcap.zstd`."""
     return path.with_suffix("").suffix if path.suffix == COMPRESSED else path.suffix
 
 
@@ -199,9 +204,9 @@ class FileReader(BagReader):
     ) -> None:
         large = large or LargeReads()
         self._typestores = Typestores(custom_msg_paths)
-        # By identity, since hashing a channel hashes its definition; the channel is kept, so that
-        # its identity is not given to another.
-        self._known: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
+        # By identity, since to hash a channel hashes its definition. The channel is kept beside its
+        # decoder, or the reason why it has none, so that no other object gets its identity.
+        self._decoders: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
         self._large = large
         self._formats: dict[str, McapBags | SqliteBags] = {
             ".mcap": McapBags(cache_mb, max_chunk_mb, large),
@@ -222,9 +227,9 @@ class FileReader(BagReader):
 
     @contextmanager
     def _open(self, path: Path) -> Iterator[tuple[McapBags | SqliteBags, Path, str]]:
-        """Yields what reads a file, where that is, and a note on why it is not complete, or "".
+        """Yields what reads a file, the path to read, and a note on why it is not complete, or "".
 
-        That is the file itself, or a temporary copy, decompressed or with its journal applied.
+        The path is the file itself, or a temporary copy: decompressed or with its journal applied.
         """
         if not self.reads(path):
             raise UnreadableError(f"not of a kind that is read ({', '.join(BAG_KINDS)})")
@@ -265,7 +270,7 @@ class FileReader(BagReader):
             with reading(path), self._open(path) as (bags, file, _):
                 yield from bags.records(file, topics, window, newest_first=newest_first)
 
-        # Mapped outside of the generator: one that has raised could not go on behind lost messages.
+        # Raised outside of the generator, which could not continue behind lost messages.
         return map(partial(raise_if_lost, path), read())
 
     def batches(
@@ -306,7 +311,7 @@ class FileReader(BagReader):
             return decoder(record.payload)
         # rosbags raises whatever the generated code runs into; a payload may hold anything.
         except Exception as error:
-            reason = _reason(record, error)
+            reason = _why_undecodable(record, error)
             raise UndecodableError(channel.topic, channel.type, reason) from error
 
     def encode(self, channel: Channel, message: object) -> bytes:
@@ -326,25 +331,33 @@ class FileReader(BagReader):
         """Returns the fields of the channel's messages; None if not CDR, or of no known type."""
         if channel.encoding != "cdr":
             return None
-        found = self._type_of(channel)
-        return None if isinstance(found, str) else found.fields
+        message_type = self._type_of(channel)
+        return None if isinstance(message_type, str) else message_type.fields
 
     def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
-        _, cached = self._known.get(id(channel), (channel, None))
+        """Returns what decodes the payloads of a channel, or the reason why nothing does."""
+        cached = self._decoders.get(id(channel))
         if cached is not None:
-            return cached
-        decoder: Callable[[bytes], object] | str = _json
-        if channel.encoding == "cdr":
-            usable = self._type_of(channel)
-            usable = usable if isinstance(usable, str) else usable.compiled()
-            decoder = usable if isinstance(usable, str) else partial(_deserialized, usable)
-        elif channel.encoding != "json":
-            decoder = f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
-        if len(self._known) >= _MAX_KNOWN:
-            self._known.clear()
-        self._known[id(channel)] = (channel, decoder)
+            _, decoder = cached
+            return decoder
+        decoder = self._build_decoder(channel)
+        if len(self._decoders) >= _MAX_DECODERS:
+            self._decoders.clear()
+        self._decoders[id(channel)] = (channel, decoder)
         return decoder
 
+    def _build_decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
+        if channel.encoding == "json":
+            return _decode_json
+        if channel.encoding != "cdr":
+            return f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
+        message_type = self._type_of(channel)
+        if isinstance(message_type, str):
+            return message_type
+        compiled = message_type.compiled()
+        return compiled if isinstance(compiled, str) else partial(_decode_cdr, compiled)
+
     def _type_of(self, channel: Channel) -> MessageType | str:
+        """Returns the message type of a channel, or the reason why there is none."""
         schema = channel.schema
         return self._typestores.lookup(schema.name, schema.encoding, schema.text)

@@ -30,12 +30,21 @@ _UNLOCKED_S = 60
 
 @dataclass(slots=True, eq=False)
 class _Copy:
-    """A temporary file and a note on it, in a folder of its own; how many read it at the moment."""
+    """A temporary file in a folder of its own.
+
+    Attributes:
+        folder: the folder.
+        size: the bytes reserved for it.
+        users: how many threads read it at the moment.
+        file: the temporary file.
+        note: a sentence on the file, as `fill` returned it.
+    """
 
     folder: Path
     size: int = 0
     users: int = 0
-    filled: tuple[Path, str] = (Path(), "")
+    file: Path = Path()
+    note: str = ""
 
 
 class Scratch:
@@ -61,32 +70,33 @@ class Scratch:
     def use(
         self, key: Hashable, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
     ) -> Iterator[tuple[Path, str]]:
-        """Yields the file that is made of the content `key`; it is not deleted inside the block.
+        """Yields a temporary file and a note on it. The file is not deleted inside the block.
 
         Args:
-            key: the content that it is made of.
-            fill: makes the file if it is not there: takes an empty folder, and a function to call
-                with a number of bytes before it writes as many; returns the file and a note on it.
+            key: identifies the content of the file.
+            fill: makes the file if it is not there. It receives an empty folder, and a function to
+                call with a number of bytes before it writes as many; it returns file and note.
 
         Raises:
             UnreadableError: the file does not fit into `max_bytes`.
             UnreachableError: the disk of the temporary files is full.
         """
-        # One file at a time is made: of two that are, either might leave no room for the other.
+        # One file is made at a time: two at once might leave no room for each other.
         with self._lock:
             copy = self._copies.get(key)
-            if copy is None or not copy.filled[0].exists():
+            if copy is None or not copy.file.exists():
                 self._delete(key)
-                copy = self._copies[key] = self._made(fill)
+                copy = self._copies[key] = self._make_copy(fill)
             self._copies.move_to_end(key)
             copy.users += 1
         try:
-            yield copy.filled
+            yield copy.file, copy.note
         finally:
             with self._lock:
                 copy.users -= 1
 
-    def _made(self, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]) -> _Copy:
+    def _make_copy(self, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]) -> _Copy:
+        """Makes a copy in a new folder; nothing is left of it after a failure."""
         try:
             if self._root is None or not self._root.exists():
                 _delete_abandoned()
@@ -98,7 +108,7 @@ class Scratch:
         except OSError as error:
             raise _disk_full(error) from error
         try:
-            copy.filled = fill(copy.folder, partial(self._reserve, copy))
+            copy.file, copy.note = fill(copy.folder, partial(self._reserve, copy))
         except BaseException as error:
             self._bytes -= copy.size
             shutil.rmtree(copy.folder, ignore_errors=True)
@@ -114,7 +124,13 @@ class Scratch:
             shutil.rmtree(copy.folder, ignore_errors=True)
 
     def _reserve(self, copy: _Copy, size: int) -> None:
-        for key in [key for key, other in self._copies.items() if not other.users]:
+        """Makes room for more bytes of a copy: deletes other copies, the oldest first.
+
+        Raises:
+            UnreadableError: they do not fit into `max_bytes`.
+        """
+        unused = [key for key, other in self._copies.items() if not other.users]
+        for key in unused:
             if self._bytes + size <= self._max_bytes:
                 break
             self._delete(key)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from itertools import starmap
 from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
@@ -48,7 +47,7 @@ _MESSAGE_BODY: Final = struct.Struct("<HIQQ")
 
 
 class Salvage:
-    """Reads one file once.
+    """Reads all records of one file, once.
 
     Attributes:
         lost_bytes: bytes of the file that made no whole record; final when `records` has ended.
@@ -61,34 +60,42 @@ class Salvage:
         self.lost_bytes = 0
 
     def records(self) -> Iterator[mcap_records.McapRecord]:
-        """Yields each record that has content of its own, not of indexes; leaves out damaged ones.
+        """Yields the records with content of their own, without indexes and damaged records.
 
         Raises:
             UnreadableError: the file is not MCAP, or ends within its magic.
         """
-        read_to, has_ended = MAGIC_SIZE, False
+        read_to, data_ended = MAGIC_SIZE, False
         for record in file_records(self._file):
-            has_ended = has_ended or record.opcode == Opcode.DATA_END
-            within = self._chunk if record.opcode == Opcode.CHUNK else self._whole
-            yield from filter(None, starmap(decode_record, within(record)))
+            data_ended = data_ended or record.opcode == Opcode.DATA_END
+            if record.opcode == Opcode.CHUNK:
+                bodies = self._bodies_in_chunk(record)
+            else:
+                bodies = self._body(record)
+            for opcode, body in bodies:
+                decoded = decode_record(opcode, body)
+                if decoded is not None:
+                    yield decoded
             read_to = min(record.end, self._file.size)
-        if not has_ended:
+        if not data_ended:
             self.lost_bytes += self._file.size - read_to
 
-    def _whole(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
+    def _body(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
+        """Yields opcode and body of a record outside chunks, if it has content and is not large."""
         if record.opcode not in _CONTENT:
             return
         size = record.end - record.body_at
         if record.opcode == Opcode.MESSAGE:
-            is_readable = record.end - record.offset <= self._max_chunk_bytes
+            is_large = record.end - record.offset > self._max_chunk_bytes
         else:
-            is_readable = size <= MAX_SECTION_BYTES
-        if is_readable:
-            yield record.opcode, self._file.read(record.body_at, size)
-        else:
+            is_large = size > MAX_SECTION_BYTES
+        if is_large:
             self.lost_bytes += size
+        else:
+            yield record.opcode, self._file.read(record.body_at, size)
 
-    def _chunk(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
+    def _bodies_in_chunk(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
+        """Yields opcode and body of each whole record with content in a chunk."""
         in_file = min(record.end, self._file.size) - record.body_at
         try:
             opened = self._opener.open(record)
@@ -105,7 +112,7 @@ class Salvage:
 
 
 def decode_record(opcode: int, body: bytes) -> mcap_records.McapRecord | None:
-    """Returns a record with content of its own; None for any other, and for a damaged one."""
+    """Decodes a record with content of its own (`_CONTENT`); None for a damaged one."""
     if opcode == Opcode.MESSAGE:
         channel, sequence, log_time, publish_time = _MESSAGE_BODY.unpack_from(body)
         data = body[_MESSAGE_BODY.size :]
@@ -139,20 +146,20 @@ class ContentDigest:
         return self._in_order.digest(), self._between.digest(), channels
 
     def add(self, record: mcap_records.McapRecord) -> bool:
-        """Adds a record; returns whether it counts: a repeated declaration does not."""
+        """Adds a record; returns False for one that does not count, as a repeated declaration."""
         if isinstance(record, mcap_records.Message):
-            return self._message(record)
+            return self._add_message(record)
         if isinstance(record, mcap_records.Schema):
             is_known = record.id == 0 or record.id in self._schemas
             self._schemas.setdefault(record.id, record)
             return not is_known
         if isinstance(record, mcap_records.Channel):
-            return self._channel(record)
+            return self._add_channel(record)
         if not isinstance(record, mcap_records.Header):
             self._between.update(repr(record).encode())
         return True
 
-    def _channel(self, channel: mcap_records.Channel) -> bool:
+    def _add_channel(self, channel: mcap_records.Channel) -> bool:
         if channel.id in self._channels:
             return False
         schema = self._schemas.get(channel.schema_id)
@@ -161,7 +168,7 @@ class ContentDigest:
         self._channels[channel.id] = hashlib.blake2b(content.encode()).digest()
         return True
 
-    def _message(self, message: mcap_records.Message) -> bool:
+    def _add_message(self, message: mcap_records.Message) -> bool:
         channel = self._channels.get(message.channel_id)
         if channel is None or message.log_time >= MAX_NS:
             return False
@@ -173,6 +180,6 @@ class ContentDigest:
         return True
 
 
-def is_of_rosbag2(record: mcap_records.McapRecord) -> bool:
+def is_rosbag2_metadata(record: mcap_records.McapRecord) -> bool:
     """Returns whether a record is the metadata.yaml that rosbag2 embeds, which counts messages."""
     return isinstance(record, mcap_records.Metadata) and record.name == "rosbag2"

@@ -1,4 +1,4 @@
-"""Writes MCAP files: closed, indexed, checked, synced; also rewrites files without some."""
+"""Writes MCAP files: closed, indexed, checked, synced. Also copies bags without some messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache
-from itertools import chain, islice
+from itertools import chain
 from typing import IO, TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
@@ -26,7 +26,7 @@ from ros2_memory.storage.errors import (
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.mcap.records import is_finished
-from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage, is_of_rosbag2
+from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage, is_rosbag2_metadata
 from ros2_memory.storage.sqlite_bag import cut_sqlite
 from ros2_memory.typestore import full_name
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 _LARGEST_CHUNK_BYTES: Final = 512 << 10
+"""Of dense files and of large sources, a few times what a reader decompresses at once."""
 CHUNK_BYTES: Final = 64 << 10
 """Small, since a reader decompresses a whole chunk for one message."""
 LIBRARY: Final = "ros2-memory"
@@ -63,13 +64,13 @@ class McapWriter(BagWriter):
         *,
         dense: bool = False,
     ) -> None:
-        """Writes a bag that holds these messages; a `dense` one has no message indexes."""
-        with _written(path) as stream:
-            writer = _writer(stream, dense=dense)
-            received = iter(records)
-            first = [*islice(received, 1)]
-            is_ros2 = all(record.channel.encoding == "cdr" for record in first)
-            writer.start(ROS2_PROFILE if is_ros2 else "", LIBRARY)
+        """Writes a bag of these messages; a `dense` one has no message indexes."""
+        with _new_file(path) as stream:
+            if dense:
+                indexes = IndexType.ALL & ~IndexType.MESSAGE
+                writer = Writer(stream, _LARGEST_CHUNK_BYTES, CompressionType.ZSTD, indexes)
+            else:
+                writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
 
             @cache
             def schema_id(schema: Schema) -> int:
@@ -78,66 +79,62 @@ class McapWriter(BagWriter):
 
             @cache
             def channel_id(channel: Channel) -> int:
-                schema, metadata = schema_id(_exported(channel)), dict(channel.metadata)
+                schema, metadata = schema_id(_rosbag2_schema(channel)), dict(channel.metadata)
                 return writer.register_channel(channel.topic, channel.encoding, schema, metadata)
 
-            for record in chain(first, received):
+            received = iter(records)
+            first = next(received, None)
+            is_ros2 = first is None or first.channel.encoding == "cdr"
+            writer.start(ROS2_PROFILE if is_ros2 else "", LIBRARY)
+            for record in chain([] if first is None else [first], received):
                 number = channel_id(record.channel)
                 writer.add_message(number, record.log_time, record.payload, record.publish_time)
             writer.finish()
 
     def rewrite(self, source: Path, target: Path) -> Rewritten:
-        """Writes all that can be read of a file that was cut short into one that is whole."""
-        with _written(target) as stream:
+        """Writes all that can be read of a file that was cut short into a whole file."""
+        with _new_file(target) as stream:
             with reading(source), OpenFile(source) as file:
                 salvage = Salvage(file, self._max_chunk_mb << 20)
-                copy = _Copy(_writer(stream, file.size))
-                digest = ContentDigest()
+                copy = _Copy(stream, file.size)
                 for record in salvage.records():
-                    if digest.add(record):
-                        copy.put(record)
+                    copy.put(record)
             copy.finish()
-            stream.flush()
-            notes = self._compare(source, target, digest)
-        return Rewritten(digest.messages, salvage.lost_bytes, notes, digest.last)
+            with reading(source):
+                before = self._bags().summarize(source)
+            if self._verify(target, copy.digest).topics != before.topics:
+                raise UnreadableError("what was written is not what could be read")
+        return Rewritten(copy.digest.messages, salvage.lost_bytes, before.notes, copy.digest.last)
 
     def cut(
         self,
         source: Path,
         target: Path,
-        takes: Callable[[str, Ns, Ns], bool],
+        leaves_out: Callable[[str, Ns, Ns], bool],
     ) -> Counter[str]:
-        """Writes a whole file again without some messages."""
-        if source.suffix.lower() == ".db3":
-            with _written(target) as stream, reading(source):
-                return cut_sqlite(source, target, stream, takes)
-        taken = Counter[str]()
-        with _written(target) as stream:
+        """Copies a whole file without some messages."""
+        with _new_file(target) as stream:
+            if source.suffix.lower() == ".db3":
+                with reading(source):
+                    return cut_sqlite(source, target, stream, leaves_out)
             with reading(source), OpenFile(source) as file:
                 if not is_finished(file):
                     raise UnreadableError("its writer did not finish it")
+                copy = _Copy(stream, file.size)
                 salvage = Salvage(file, self._max_chunk_mb << 20)
-                copy, digest = _Copy(_writer(stream, file.size)), ContentDigest()
-                for record in _without(salvage, takes, taken):
-                    if is_of_rosbag2(record):
-                        continue
-                    if digest.add(record):
-                        copy.put(record)
-                    elif isinstance(record, mcap_records.Message):
-                        raise UnreadableError("damaged: a message without a channel or a time")
-                was = sum(topic.count for topic in self._bags().summarize(source).topics)
-                if salvage.lost_bytes or was != digest.messages + taken.total():
+                left_out = _copy_without(leaves_out, salvage, copy)
+                count = sum(topic.count for topic in self._bags().summarize(source).topics)
+                if salvage.lost_bytes or count != copy.digest.messages + left_out.total():
                     raise UnreadableError("damaged: not all of its messages can be read")
             copy.finish()
-            stream.flush()
-            self._require_content(target, digest)
-        return taken
+            self._verify(target, copy.digest)
+        return left_out
 
     def _bags(self) -> McapBags:
         return McapBags(cache_mb=1, max_chunk_mb=self._max_chunk_mb)
 
-    def _require_content(self, target: Path, digest: ContentDigest) -> BagSummary:
-        """Reads a target back, compares it with what was to be written, and returns its summary."""
+    def _verify(self, target: Path, digest: ContentDigest) -> BagSummary:
+        """Reads a new file back, compares it with what was to be written, returns its summary."""
         after = self._bags().summarize(target)
         if not after.complete or after.notes:
             raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
@@ -149,77 +146,95 @@ class McapWriter(BagWriter):
             raise UnreadableError("what was written is not what could be read")
         return after
 
-    def _compare(self, source: Path, target: Path, digest: ContentDigest) -> tuple[str, ...]:
-        """Compares the target, read back, with the source; returns the notes on the source."""
-        with reading(source):
-            before = self._bags().summarize(source)
-        if self._require_content(target, digest).topics != before.topics:
-            raise UnreadableError("what was written is not what could be read")
-        return before.notes
 
+def _copy_without(
+    leaves_out: Callable[[str, Ns, Ns], bool], salvage: Salvage, copy: _Copy
+) -> Counter[str]:
+    """Copies records without some messages; returns how many of each topic were left out.
 
-def _without(
-    salvage: Salvage, takes: Callable[[str, Ns, Ns], bool], taken: Counter[str]
-) -> Iterator[mcap_records.McapRecord]:
-    """Yields all records but the messages that are taken, which are counted by topic."""
+    Raises:
+        UnreadableError: a message has no channel or no possible time.
+    """
     topics: dict[int, str] = {}
+    left_out = Counter[str]()
     for record in salvage.records():
-        if isinstance(record, mcap_records.Channel):
-            topics.setdefault(record.id, record.topic)
-        elif isinstance(record, mcap_records.Message):
+        if isinstance(record, mcap_records.Message):
             topic = topics.get(record.channel_id)
-            if topic is not None and takes(topic, record.log_time, record.publish_time):
-                taken[topic] += 1
-                continue
-        yield record
+            if topic is not None and leaves_out(topic, record.log_time, record.publish_time):
+                left_out[topic] += 1
+            elif not copy.put(record):
+                raise UnreadableError("damaged: a message without a channel or a time")
+        elif not is_rosbag2_metadata(record):
+            if isinstance(record, mcap_records.Channel):
+                topics.setdefault(record.id, record.topic)
+            copy.put(record)
+    return left_out
 
 
 class _Copy:
-    """Writes the records of another file; the writer gives schemas and channels new ids."""
+    """Writes the records of another file; the writer gives schemas and channels new ids.
 
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
+    Args:
+        stream: the new file.
+        source_bytes: the size of the other file.
+
+    Attributes:
+        digest: of what was written.
+    """
+
+    def __init__(self, stream: IO[bytes], source_bytes: int) -> None:
+        # A large source makes larger chunks: a reader takes `MAX_CHUNKS` of a file at most.
+        chunk_bytes = max(CHUNK_BYTES, max_decompressed_bytes(source_bytes) // MAX_CHUNKS)
+        chunk_bytes = min(chunk_bytes, _LARGEST_CHUNK_BYTES)
+        self.digest = ContentDigest()
+        self._stream = stream
+        self._writer = Writer(stream, chunk_bytes, CompressionType.ZSTD)
         self._started = False
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
 
-    def put(self, record: mcap_records.McapRecord) -> None:
-        """Writes one record, whose schema or channel must have come before."""
+    def put(self, record: mcap_records.McapRecord) -> bool:
+        """Writes a record; returns False for one that is left out, as `ContentDigest.add` does."""
+        if not self.digest.add(record):
+            return False
         if isinstance(record, mcap_records.Header):
             library = record.library.removesuffix(_REWRITTEN)
             self._start(record.profile, f"{library}{_REWRITTEN}")
-            return
+            return True
         self._start(ROS2_PROFILE, LIBRARY)
-        if isinstance(record, mcap_records.Message):
-            self._writer.add_message(
-                self._channels[record.channel_id],
-                record.log_time,
-                record.data,
-                record.publish_time,
-                record.sequence,
-            )
-        elif isinstance(record, mcap_records.Schema):
-            self._schemas[record.id] = self._writer.register_schema(
-                record.name, record.encoding, record.data
-            )
-        elif isinstance(record, mcap_records.Channel):
-            self._channels[record.id] = self._writer.register_channel(
-                record.topic,
-                record.message_encoding,
-                self._schemas.get(record.schema_id, 0),
-                record.metadata,
-            )
-        elif isinstance(record, mcap_records.Metadata):
-            self._writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, mcap_records.Attachment):
-            self._writer.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )
+        match record:
+            case mcap_records.Message():
+                self._writer.add_message(
+                    self._channels[record.channel_id],
+                    record.log_time,
+                    record.data,
+                    record.publish_time,
+                    record.sequence,
+                )
+            case mcap_records.Schema():
+                self._schemas[record.id] = self._writer.register_schema(
+                    record.name, record.encoding, record.data
+                )
+            case mcap_records.Channel():
+                self._channels[record.id] = self._writer.register_channel(
+                    record.topic,
+                    record.message_encoding,
+                    self._schemas.get(record.schema_id, 0),
+                    record.metadata,
+                )
+            case mcap_records.Metadata():
+                self._writer.add_metadata(record.name, record.metadata)
+            case mcap_records.Attachment():
+                self._writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
+        return True
 
     def finish(self) -> None:
-        """Writes the summary section and the footer."""
+        """Writes the summary section and the footer, so that the file can be read."""
         self._start(ROS2_PROFILE, LIBRARY)
         self._writer.finish()
+        self._stream.flush()
 
     def _start(self, profile: str, library: str) -> None:
         if not self._started:
@@ -227,7 +242,7 @@ class _Copy:
             self._writer.start(profile, library)
 
 
-def _exported(channel: Channel) -> Schema:
+def _rosbag2_schema(channel: Channel) -> Schema:
     """Returns the schema of a channel; a ROS 2 type gets the name that rosbag2 gives it."""
     schema = channel.schema
     if channel.encoding != "cdr" or schema.encoding not in _ROS2_ENCODINGS:
@@ -235,21 +250,12 @@ def _exported(channel: Channel) -> Schema:
     return replace(schema, name=full_name(schema.name))
 
 
-def _writer(stream: IO[bytes], source_bytes: int = 0, *, dense: bool = False) -> Writer:
-    if not dense:
-        # Of a large source larger ones: of a file no more chunks than `MAX_CHUNKS` are read.
-        chunk_bytes = max(CHUNK_BYTES, max_decompressed_bytes(source_bytes) // MAX_CHUNKS)
-        return Writer(stream, min(chunk_bytes, _LARGEST_CHUNK_BYTES), CompressionType.ZSTD)
-    indexes = IndexType.ALL & ~IndexType.MESSAGE
-    return Writer(stream, _LARGEST_CHUNK_BYTES, CompressionType.ZSTD, indexes)
-
-
 @contextmanager
-def _written(path: Path) -> Iterator[IO[bytes]]:
+def _new_file(path: Path) -> Iterator[IO[bytes]]:
     """Yields a stream into a new file, which is synced at the end, and deleted after a failure.
 
     Raises:
-        BagError: any other exception of the block than an `EpisodicError`.
+        BagError: the block raised another exception than an `EpisodicError`.
     """
     try:
         stream = path.open("xb")
