@@ -39,7 +39,7 @@ from ros2_memory.messages.detections import (
     SCORES,
     Detection,
     detections_of,
-    naming,
+    naming_fields,
 )
 
 if TYPE_CHECKING:
@@ -298,7 +298,7 @@ def _limited(node: dict[str, Node], labels: Labels, least: float) -> Node:
 
 def _scored(fields: Mapping[str, Node]) -> Scored | None:
     """Returns how an object is named and scored; None if none like it is a detection."""
-    names = tuple(naming(fields.keys()))
+    names = tuple(naming_fields(fields.keys()))
     labels = _leaves(fields, names, Kind.TEXT) + _leaves(fields, names, Kind.INTEGER)
     scores = _leaves(fields, SCORES, Kind.INTEGER, Kind.REAL)
     return Scored(labels[0].level, labels, scores) if labels else None

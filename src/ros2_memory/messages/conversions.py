@@ -30,7 +30,7 @@ Array: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 V = TypeVar("V")
 
 ABSENT: Final = object()
-"""The result of a step or a path where there is no such field."""
+"""Stands for a field that a message does not have."""
 _ELEMENT_NAMES: Final = ("names", "name", "joint_names")
 """Keys of a list that names the elements of the arrays beside it, as in joint states."""
 INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
@@ -43,7 +43,7 @@ _PATH: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.([A-Za-z][A-Za-z0-9_]*|[0-9]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FieldTable:
-    """The type of one message class, and its fields: name in the definition to attribute."""
+    """The type of a message class, and the attribute of each field of its definition."""
 
     type: str
     attributes: Mapping[str, str]
@@ -61,7 +61,7 @@ def field_table_of(node: object) -> FieldTable | None:
 
 @lru_cache(maxsize=4096)
 def field_table_of_class(cls: type) -> FieldTable | None:
-    """Returns the fields of messages of a dataclass; None for another class."""
+    """Returns the fields of the messages of a dataclass; None for any other class."""
     if not dataclasses.is_dataclass(cls):
         return None
     attributes: dict[str, str] = {}
@@ -76,7 +76,10 @@ def field_table_of_class(cls: type) -> FieldTable | None:
 
 
 def field_of(node: object, name: str) -> object:
-    """Returns a field of a message or an entry of a JSON object, unconverted; else ABSENT."""
+    """Returns a field of a message or an entry of a JSON object, unconverted.
+
+    ABSENT if there is none.
+    """
     if isinstance(node, dict):
         return node.get(name, ABSENT)
     table = field_table_of(node)
@@ -86,7 +89,7 @@ def field_of(node: object, name: str) -> object:
 
 
 def names_of(node: object) -> tuple[str, ...]:
-    """Returns the field names of a message or JSON object; of a list, those of its first."""
+    """Returns the field names of a message or JSON object; for a list, of its first element."""
     while isinstance(node, list | tuple):
         node = node[0] if node else None
     if isinstance(node, dict):
@@ -103,10 +106,15 @@ def parse_path(path: str) -> Segments | None:
 def descend(
     node: object, segments: Sequence[str], step: Callable[[object, str], object] = field_of
 ) -> object:
-    """Follows a path: null below a null or past the end of a list, ABSENT where no field is.
+    """Returns what is at a path: None below a null or past the end of a list, else ABSENT.
 
-    Over a list the rest of the path maps over the elements: ABSENT if no element has it, null for
-    those that lack it.
+    A name after a list is looked up in each element: the result is a list with None for elements
+    that lack it, and ABSENT if all of them do.
+
+    Args:
+        node: a message, a JSON value or a part of one.
+        segments: of the path; a whole number is an index.
+        step: returns the field of a node, or ABSENT.
     """
     for at, segment in enumerate(segments):
         if node is None or node is ABSENT:
@@ -118,23 +126,30 @@ def descend(
             index = int(segment) if len(segment) < 10 else len(node)
             node = node[index] if index < len(node) else None
         else:
-            return _each(node, segments[at:], step)
+            return _descend_each(node, segments[at:], step)
     return node
 
 
 def names_beside(value: object, dot_path: str) -> list[object]:
-    """Returns the names of an array's elements where a path has one instead of a number."""
+    """Returns the names of the elements of an array, as in joint states.
+
+    Empty unless the path has the name of an element (`position.wheel_left_joint`) where an index
+    would be, and a list beside the array names its elements.
+    """
     head, _, name = dot_path.partition(".")
     if not isinstance(value, dict) or not name or INDEX.fullmatch(name):
         return []
     array = value.get(head)
-    if not isinstance(array, list) or isinstance(next(iter(array), 0), dict):
+    if not isinstance(array, list) or (array and isinstance(array[0], dict)):
         return []
-    lists = (value.get(key) for key in _ELEMENT_NAMES if key != head)
-    return next((names for names in lists if isinstance(names, list)), [])
+    for key in _ELEMENT_NAMES:
+        names = value.get(key)
+        if key != head and isinstance(names, list):
+            return names
+    return []
 
 
-def _each(
+def _descend_each(
     nodes: Sequence[object] | Array,
     segments: Sequence[str],
     step: Callable[[object, str], object],
@@ -161,7 +176,7 @@ class Route:
         self.segments = segments
 
     def of(self, message: object) -> object:
-        """Returns what is at the path, of whatever kind; ABSENT or null where there is nothing."""
+        """Returns what is at the path; ABSENT or None if there is nothing."""
         try:
             value: object = self._fast(message)
         # JSON objects, and attributes that rosbags renamed.
@@ -195,7 +210,7 @@ class ValueKind(Enum):
 
 
 def kind_of(node: object) -> ValueKind:
-    """Returns how the extracted view shows a node; PLAIN for what is no message."""
+    """Returns how the extracted view shows a node; PLAIN if it is no message."""
     cls: type = type(node)
     return kind_of_class(cls)
 
@@ -212,35 +227,37 @@ def kind_of_class(cls: type) -> ValueKind:
 def kind_of_type(name: str, fields: Sequence[str]) -> ValueKind:
     """Returns how the extracted view shows messages of a type with these fields."""
     kind, names = _KINDS.get(name, (ValueKind.PLAIN, ""))
-    # A bag may contain a definition of its own under the name of a standard type.
+    # A bag may have a definition of its own under the name of a standard type.
     return kind if names.split() == fields else ValueKind.PLAIN
 
 
 def view(node: object, name: str) -> object:
-    """Returns a field of the extracted view of a message; else ABSENT."""
+    """Returns a field of the extracted view of a message; ABSENT if it has no such field."""
     kind = kind_of(node)
     if kind is ValueKind.TIME:
         return ABSENT
     if kind is ValueKind.QUATERNION:
+        if name not in ANGLES:
+            return ABSENT
         angles = euler(node)
-        return (None if angles is None else angles[name]) if name in ANGLES else ABSENT
+        return None if angles is None else angles[name]
     value = field_of(node, name)
     if kind is ValueKind.VECTOR:
         return Metric(value) if isinstance(value, float) else value
     table = None if value is ABSENT else field_table_of(node)
-    summaries = _NONE if table is None else summaries_of(table)
-    return summaries[name](node, value) if name in summaries else value
+    summarize = None if table is None else summaries_of(table).get(name)
+    return value if summarize is None else summarize(node, value)
 
 
 class Summary(dict[str, V]):
-    """What a value has in place of an array: how large it is, not what it holds."""
+    """Stands for a large array: its size and shape without its content."""
 
     __slots__ = ()
 
 
 def summaries_of(table: FieldTable) -> Mapping[str, Callable[[object, object], object]]:
-    """Returns, by field, the function that summarizes a message and the value of that field."""
-    return _SUMMARIES.get(table.type, _NONE)
+    """Returns by field what summarizes it: a function of the message and the field's value."""
+    return _SUMMARIES.get(table.type, {})
 
 
 _NUMBERS: Final = (int, float, np.number)  # as a tuple: a union is made anew with each call
@@ -267,7 +284,7 @@ def xyzw(node: object) -> Quaternion | None:
 
 
 def number(node: object) -> float | None:
-    """Returns a number as a float; None for anything else, and for what no float can hold."""
+    """Returns a number as a float; None for anything else, and for an integer past all floats."""
     if type(node) is float:
         return node
     if isinstance(node, bool) or not isinstance(node, _NUMBERS):
@@ -289,7 +306,7 @@ def quadruple(node: object) -> Quaternion | None:
 
 
 def _numbers(node: object, count: int) -> tuple[float | None, ...] | None:
-    """Returns the numbers of an array or tuple of this length; None where it holds others."""
+    """Returns the numbers of an array or tuple; None if it has another length or other elements."""
     if not isinstance(node, list | tuple | np.ndarray) or len(node) != count:
         return None
     numbers = tuple(map(number, node))
@@ -297,13 +314,13 @@ def _numbers(node: object, count: int) -> tuple[float | None, ...] | None:
 
 
 def rotation(node: object) -> Quaternion | None:
-    """Returns the unit quaternion of a node; None where it has no numbers, or zero or NaN ones."""
+    """Returns the unit quaternion of a node; None if it is zero, not finite or no numbers."""
     numbers = xyzw(node)
     return None if numbers is None else unit(numbers)
 
 
 def unit(numbers: Quaternion) -> Quaternion | None:
-    """Returns the unit quaternion of four numbers; None where they are zero or not finite."""
+    """Returns the unit quaternion of four numbers; None if they are zero or not finite."""
     x, y, z, w = numbers
     # Called for each pose, and nearly every quaternion of a robot is of unit length already.
     if abs(x * x + y * y + z * z + w * w - 1) < 1e-12:
@@ -331,13 +348,17 @@ def euler_of(numbers: Quaternion) -> dict[str, Degrees] | None:
 
 
 def nanoseconds(node: object) -> Ns | None:
-    """Returns the nanoseconds of a Time or Duration, or of the same in JSON; None for any other."""
-    for names in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs")):
-        sec, rest = (field_of(node, name) for name in names)
-        if isinstance(sec, int) and isinstance(rest, int):
-            whole = sec * NS_PER_S + rest
-            return whole if MIN_NS <= whole <= MAX_NS else None
+    """Returns the nanoseconds of a Time or Duration, also as JSON; None for anything else."""
+    for sec_name, nanosec_name in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs")):
+        sec, nanosec = field_of(node, sec_name), field_of(node, nanosec_name)
+        if isinstance(sec, int) and isinstance(nanosec, int):
+            time = sec * NS_PER_S + nanosec
+            return time if MIN_NS <= time <= MAX_NS else None
     return None
+
+
+_CHANNELS: Final = {"mono": 1, "bayer": 1, "rgba": 4, "bgra": 4, "rgb": 3, "bgr": 3}
+"""The channels of image encodings by how these begin; the longer prefix comes first."""
 
 
 def _image(message: object, data: object) -> object:
@@ -358,8 +379,10 @@ def channels_of(encoding: str) -> int | None:
     typed = re.fullmatch(r"\d+[USF]C(\d{1,3})", encoding)
     if typed:
         return int(typed[1])
-    named = re.match(r"mono|bayer|rgba|bgra|rgb|bgr", encoding)
-    return {"mono": 1, "bayer": 1, "rgb": 3, "bgr": 3}.get(named[0], 4) if named else None
+    for prefix, channels in _CHANNELS.items():
+        if encoding.startswith(prefix):
+            return channels
+    return None
 
 
 def _point_cloud(message: object, data: object) -> object:
@@ -386,7 +409,6 @@ _KINDS: Final[Mapping[str, tuple[ValueKind, str]]] = {
     "builtin_interfaces/msg/Time": (ValueKind.TIME, "sec nanosec"),
     "builtin_interfaces/msg/Duration": (ValueKind.TIME, "sec nanosec"),
 }
-_NONE: Final[Mapping[str, Callable[[object, object], object]]] = {}
 _SUMMARIES: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]] = {
     "sensor_msgs/msg/Image": {"data": _image},
     "sensor_msgs/msg/CompressedImage": {

@@ -1,20 +1,22 @@
-"""Reads detections from messages: what a detector saw, by name, and where if the message has that.
+"""Reads detections from messages: the name of what a detector saw, its place and its score.
 
-A detection is an object with a name under one of the fields of `naming`: an entry of a list, or the
-whole message; a list of strings under one of `LISTS_OF_LABELS` is a list of detections. A string
-that is JSON is parsed; what it names is a detection if it is in a list, has a score, a place or an
-outline, or nothing beside the name: else it is a state. Those of vision_msgs are named by their
-best hypothesis. The position is a point in metres, at one of `POSITIONS`, in the frame that the
-innermost object around it names. Boxes in an image are in pixels, and give no position. The score
-is a number under one of `SCORES`.
+- A detection is an object with a name under one of `naming_fields`: an entry of a list, or the
+  whole message. A list of strings under one of `LISTS_OF_LABELS` is a list of detections.
+- A detection of vision_msgs is named by its best hypothesis.
+- A string that is JSON is parsed. An object in it is a detection if it is in a list, has a score, a
+  place or an outline, or nothing beside its name. Otherwise it is a state.
+- The place is a point in metres at one of `POSITIONS`, in the frame that the innermost object
+  around it names. Boxes in an image are in pixels, and give no place.
+- The score is a number under one of `SCORES`.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from enum import Enum, auto
 from itertools import product
-from operator import is_, itemgetter
+from operator import is_
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES, looks_like_json
@@ -42,21 +44,27 @@ POSITIONS: Final = (
     (),  # x, y and z of the object itself
 )
 _SCORED: Final = frozenset(SCORES)
-_SHOWN: Final = frozenset({"box", "z"}.union(*(path[:1] for path in POSITIONS)))
-"""What has a score and one of these is something that was seen, and named as such things are."""
+_PLACED: Final = frozenset({"box", "z"}.union(*(path[:1] for path in POSITIONS)))
+"""Fields that have the place or the outline of an object."""
+_NAMES_OF_SEEN: Final = ("name", "category", "id")
+"""Fields that name an object which has a score and a place; of any other they say little."""
 _NOTHING: Final = "none"
-"""What JSON names so, without a score, is that nothing was seen."""
-_NAMED_BY: Final = frozenset(LABELS).union(("name", "category", "id"), *NAMED_IN_TYPES)
+"""The name by which JSON says that nothing was seen, without a score."""
+_NAMED_BY: Final = frozenset(LABELS).union(_NAMES_OF_SEEN, *NAMED_IN_TYPES)
 """An object without any of these fields has no name."""
 _MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 7
-"""Lists, objects and texts that are JSON around a detection, and it."""
+"""How many lists, objects and JSON texts are opened inside each other."""
 
 
 class Detection(NamedTuple):
-    """An object that was seen: `place` (m) is in `frame_id`, empty where the message names none.
+    """An object that was seen.
 
-    `score` is the detector's own, in its own unit; None where it gives none.
+    Attributes:
+        label: its name.
+        place: in metres, in `frame_id`; None if the message has none.
+        frame_id: empty if the message names no frame.
+        score: in the detector's own unit; None if it gives none.
     """
 
     label: str
@@ -68,127 +76,138 @@ class Detection(NamedTuple):
 def detections_of(
     value: JsonValue, frame_id: str = "", depth: int = MAX_DEPTH
 ) -> tuple[Detection, ...]:
-    """Returns the detections in an extracted value, in order; `frame_id` is the message's own.
+    """Returns the detections in an extracted value, in order.
 
-    They are looked for `depth` lists, objects and texts deep.
+    Args:
+        value: the value.
+        frame_id: the frame of the message.
+        depth: how many lists, objects and JSON texts inside each other are searched.
     """
     walk = _Walk(None)
-    walk.value(value, frame_id, depth)
+    walk.visit(value, frame_id, depth)
     return tuple(walk.detections)
 
 
-def naming(fields: Collection[str]) -> Iterator[str]:
-    """Yields which fields name an object that has some fields, the first choice first.
+def naming_fields(fields: Collection[str]) -> Iterator[str]:
+    """Yields which of its fields name an object, the first choice first.
 
-    Of these the first text that is not blank is its name, else the first whole number.
+    The first text that is not blank is the name, else the first whole number.
     """
     if not _NAMED_BY.isdisjoint(fields) and NOT_LABELLED.isdisjoint(fields):
         yield from LABELS
         yield from (name for own, name in NAMED_IN_TYPES.items() if own.issubset(fields))
-        if not (_SCORED.isdisjoint(fields) or _SHOWN.isdisjoint(fields)):
-            yield from ("name", "category", "id")
+        if not (_SCORED.isdisjoint(fields) or _PLACED.isdisjoint(fields)):
+            yield from _NAMES_OF_SEEN
 
 
 def without_low_scores(value: JsonValue, min_score: float, depth: int = MAX_DEPTH) -> JsonValue:
-    """Returns an extracted value without the detections whose score is below a limit.
+    """Returns an extracted value without the detections whose score is below `min_score`.
 
-    Null takes their place, so that the others keep theirs; in a detection with several hypotheses
-    also the place of each that scores less. What has no score stays. A value without any such
-    detection is returned as it is. They are looked for as by `detections_of`.
+    Null replaces each of them, so that the others keep their places in lists. In a detection with
+    several hypotheses null also replaces each hypothesis that scores less. A detection without a
+    score stays. A value that loses nothing is returned itself.
     """
-    return _Walk(min_score).value(value, "", depth)
+    return _Walk(min_score).visit(value, "", depth)
+
+
+class _Inside(Enum):
+    """Where a value was found."""
+
+    MESSAGE = auto()
+    JSON = auto()
+    JSON_LIST = auto()
 
 
 class _Walk:
-    """A walk over a value, which collects its detections.
+    """Collects the detections in a value, and removes those whose score is below `min_score`."""
 
-    What it returns is without those whose score is below `least`.
-    """
-
-    def __init__(self, least: float | None) -> None:
+    def __init__(self, min_score: float | None) -> None:
         self.detections: list[Detection] = []
-        self._least = least
+        self._min_score = min_score
 
-    def value(
-        self, value: JsonValue, frame: str, depth: int, listed: bool | None = None
+    def visit(
+        self, value: JsonValue, frame: str, depth: int, inside: _Inside = _Inside.MESSAGE
     ) -> JsonValue:
-        """Returns what is left of a value in a frame.
-
-        `listed`: in JSON, whether it is in a list; None outside of JSON.
-        """
+        """Returns a value without low scores; the value itself if it loses nothing."""
         if depth == 0:
             return value
         if isinstance(value, dict):
-            return self._object(value, _frame(value) or frame, depth, listed)
-        if isinstance(value, str):
-            if not looks_like_json(value):  # most are names
-                return value
-            parsed = _from_json(value)
-            kept = self.value(parsed, frame, depth - 1, listed=False)
-            return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
+            return self._visit_object(value, _frame(value) or frame, depth, inside)
         if isinstance(value, list):
-            listed = None if listed is None else True
-            parts = [
-                self.value(element, frame, depth - 1, listed)
+            if inside is _Inside.JSON:
+                inside = _Inside.JSON_LIST
+            elements = [
+                self.visit(element, frame, depth - 1, inside)
                 if isinstance(element, dict)
                 else element
                 for element in value
             ]
-            return value if all(map(is_, parts, value)) else parts
+            return value if all(map(is_, elements, value)) else elements
+        if isinstance(value, str) and looks_like_json(value):
+            parsed = _parse_json(value)
+            remaining = self.visit(parsed, frame, depth - 1, _Inside.JSON)
+            return value if remaining is parsed else json.dumps(remaining, ensure_ascii=False)
         return value
 
-    def _object(self, value: JsonObject, frame: str, depth: int, listed: bool | None) -> JsonValue:
-        """Returns what is left of an object that is a detection, or has some in it."""
+    def _visit_object(
+        self, value: JsonObject, frame: str, depth: int, inside: _Inside
+    ) -> JsonValue:
+        """Visits an object that may be a detection itself."""
         label = _label(value)
         if label is None:
-            return self._parts(value, frame, depth, listed)
-        own = _placed((value,), frame, label, _score(value))
-        is_seen = own.score is not None or not _SHOWN.isdisjoint(value)
-        if listed is None or is_seen:
-            self.detections.append(own)
-            return None if self._is_below(value) else value
-        # JSON that has a name alone: perhaps a state, of which parts may be detections.
-        begin = len(self.detections)
-        kept = self._parts(value, frame, depth, listed)
-        if label.strip().casefold() != _NOTHING and (listed or _is_alone(value)):
-            # It is a detection: what has no score in it belongs to it, and is none of its own.
-            inner = self.detections[begin:]
-            self.detections[begin:] = [own, *(one for one in inner if one.score is not None)]
-        return kept
+            return self._visit_parts(value, frame, depth, inside)
+        detection = _detection_at((value,), frame, label, _score(value))
+        is_seen = detection.score is not None or not _PLACED.isdisjoint(value)
+        if inside is _Inside.MESSAGE or is_seen:
+            self.detections.append(detection)
+            return None if self._is_low(value) else value
+        # JSON with a name alone: perhaps a state, whose parts may be detections.
+        parts = _Walk(self._min_score)
+        remaining = parts._visit_parts(value, frame, depth, inside)
+        is_something = label.strip().casefold() != _NOTHING
+        if is_something and (inside is _Inside.JSON_LIST or _has_name_alone(value)):
+            # It is a detection: parts without a score describe it, and are none themselves.
+            self.detections.append(detection)
+            self.detections += [part for part in parts.detections if part.score is not None]
+        else:
+            self.detections += parts.detections
+        return remaining
 
-    def _parts(self, value: JsonObject, frame: str, depth: int, listed: bool | None) -> JsonValue:
-        """Returns what is left of an object of which only parts may be detections."""
+    def _visit_parts(self, value: JsonObject, frame: str, depth: int, inside: _Inside) -> JsonValue:
+        """Visits an object without a name: a detection of vision_msgs, or one with them inside."""
         best = _best_result(value.get("results"))
         best_label = None if best is None else _label(_hypothesis(best))
         if best is not None and best_label is not None:
             score = _score(_hypothesis(best))
-            self.detections.append(_placed((best, value), frame, best_label, score))
-            return self._with_hypotheses(value, best)
+            self.detections.append(_detection_at((best, value), frame, best_label, score))
+            return self._without_low_hypotheses(value, best)
         fields: JsonObject = {}
-        for name, inner in value.items():
-            if name in LISTS_OF_LABELS and isinstance(inner, list):
-                labels = (element for element in inner if isinstance(element, str) and element)
+        for name, part in value.items():
+            if name in LISTS_OF_LABELS and isinstance(part, list):
+                labels = (element for element in part if isinstance(element, str) and element)
                 self.detections += map(Detection, labels)
-            is_leaf = not inner or isinstance(inner, int | float)  # most are: no call for each
-            fields[name] = inner if is_leaf else self.value(inner, frame, depth - 1, listed)
+            is_leaf = not part or isinstance(part, int | float)  # most are: no call for each
+            fields[name] = part if is_leaf else self.visit(part, frame, depth - 1, inside)
         return value if all(map(is_, fields.values(), value.values())) else fields
 
-    def _with_hypotheses(self, value: JsonObject, best: JsonObject) -> JsonValue:
-        if self._is_below(_hypothesis(best)):
+    def _without_low_hypotheses(self, value: JsonObject, best: JsonObject) -> JsonValue:
+        if self._is_low(_hypothesis(best)):
             return None
         results = value["results"]
-        kept: list[JsonValue] = [
-            None if isinstance(result, dict) and self._is_below(_hypothesis(result)) else result
-            for result in (results if isinstance(results, list) else ())
-        ]
-        return {**value, "results": kept} if None in kept else value
+        remaining: list[JsonValue] = []
+        for result in results if isinstance(results, list) else ():
+            is_low = isinstance(result, dict) and self._is_low(_hypothesis(result))
+            remaining.append(None if is_low else result)
+        return {**value, "results": remaining} if None in remaining else value
 
-    def _is_below(self, value: JsonObject) -> bool:
-        score = None if self._least is None else _score(value)
-        return score is not None and self._least is not None and score < self._least
+    def _is_low(self, value: JsonObject) -> bool:
+        if self._min_score is None:
+            return False
+        score = _score(value)
+        return score is not None and score < self._min_score
 
 
-def _is_alone(value: JsonObject) -> bool:
+def _has_name_alone(value: JsonObject) -> bool:
     """Returns whether an object has nothing beside its name, or lists of numbers or points."""
     others = [part for name, part in value.items() if name not in _NAMED_BY]
     lists = [part for part in others if isinstance(part, list)]
@@ -196,30 +215,31 @@ def _is_alone(value: JsonObject) -> bool:
 
 
 def _label(value: JsonObject) -> str | None:
-    whole = None
-    for name in naming(value):
+    """Returns the name of an object: a text before a whole number; None if it has none."""
+    first_number = None
+    for name in naming_fields(value):
         label = value.get(name)
         if isinstance(label, str) and label.strip():
             return label
-        if type(label) is int:  # a boolean is an int
-            whole = whole or str(label)
-    return whole
+        if type(label) is int and first_number is None:  # a boolean is no number
+            first_number = str(label)
+    return first_number
 
 
 def _best_result(results: JsonValue) -> JsonObject | None:
-    """Returns the hypothesis of the highest score; the first of several."""
-    if not isinstance(results, list):
-        return None
-    scored = [
-        (-math.inf if score is None else score, result)
-        for result in results
-        if isinstance(result, dict)
-        for score in [_score(_hypothesis(result))]
-    ]
-    return max(scored, key=itemgetter(0), default=(0.0, None))[1]
+    """Returns the first result of vision_msgs with the highest score; None without results."""
+    best: JsonObject | None = None
+    best_score = -math.inf
+    for result in results if isinstance(results, list) else ():
+        if isinstance(result, dict):
+            score = _score(_hypothesis(result))
+            if best is None or (score is not None and score > best_score):
+                best, best_score = result, -math.inf if score is None else score
+    return best
 
 
 def _hypothesis(result: JsonObject) -> JsonObject:
+    """Returns the object with class and score: newer vision_msgs have it inside the result."""
     hypothesis = result.get("hypothesis")
     return hypothesis if isinstance(hypothesis, dict) else result
 
@@ -238,28 +258,30 @@ def _frame(value: JsonObject) -> str:
     return frame if isinstance(frame, str) else ""
 
 
-def _placed(
-    objects: Sequence[JsonObject], outer: str, label: str, score: float | None
+def _detection_at(
+    objects: Sequence[JsonObject], frame: str, label: str, score: float | None
 ) -> Detection:
-    """Returns a detection at the first valid point of some objects in a frame.
+    """Returns a detection at the first valid point of some objects.
 
-    All zeros means that nobody filled it in.
+    A point of zeros counts as not filled in. `frame` is that of the objects; an object on the path
+    to the point may name another.
     """
     for value, path in product(objects, POSITIONS):
         if path and path[0] not in value:
             continue
         node: JsonValue = value
-        frame = outer
+        point_frame = frame
         for name in path:
             node = node.get(name) if isinstance(node, dict) else None
-            frame = (_frame(node) if isinstance(node, dict) else "") or frame
+            if isinstance(node, dict):
+                point_frame = _frame(node) or point_frame
         point = xyz(node) if isinstance(node, dict) else triple(node)
         if point is not None and any(point) and all(map(math.isfinite, point)):
-            return Detection(label, point, frame, score)
-    return Detection(label, None, outer, score)
+            return Detection(label, point, point_frame, score)
+    return Detection(label, None, frame, score)
 
 
-def _from_json(text: str) -> JsonValue:
+def _parse_json(text: str) -> JsonValue:
     """Parses a string that is JSON; None for one that is not, or is too long."""
     if len(text) > _MAX_JSON_CHARS:
         return None

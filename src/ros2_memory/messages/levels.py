@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
 
 FIELD: Final = "level"
 _LOG: Final = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40, "FATAL": 50}
@@ -28,39 +29,44 @@ _BESIDE: Final = (
     (frozenset({"message", "hardware_id"}), _STATUS),
     (frozenset({"message", "timestamp"}), _FOXGLOVE),
 )
-"""Fields beside `level` by which an extracted value is one of a log, or a status."""
+"""Levels of messages of unknown type, by the fields beside `level`."""
 
 
 def level_number(value: JsonValue, field: str | None, type_name: str) -> JsonValue:
-    """Returns the number of a level, where a condition on `level` gives its name; else the value.
+    """Returns the value of a condition, with the number of a level in place of its name.
+
+    Args:
+        value: of the condition.
+        field: the dot-path that the condition is on; only `level` has names.
+        type_name: the type of the messages; a value for a type without levels is returned itself.
 
     Raises:
         InvalidArgumentsError: messages of the type have no level of that name.
     """
-    names = _BY_TYPE.get(type_name)
-    if names is None or not _is_name_of_level(value, field):
+    levels = _BY_TYPE.get(type_name)
+    if levels is None or not _is_name_of_level(value, field):
         return value
     word = str(value).strip().upper()
-    number = names.get("WARN" if word == "WARNING" else word)
+    number = levels.get("WARN" if word == "WARNING" else word)
     if number is None:
-        levels = ", ".join(f"{name} ({level})" for name, level in names.items())
-        raise InvalidArgumentsError(f"{value!r} is no level of {type_name}: these are {levels}")
+        known = ", ".join(f"{name} ({level})" for name, level in levels.items())
+        raise InvalidArgumentsError(f"{value!r} is no level of {type_name}: these are {known}")
     return number
 
 
 def level_path(value: JsonValue, type_name: str) -> str | None:
-    """Returns the path of the level in messages of a type, where a value is the name of one."""
-    names = _BY_TYPE.get(type_name, {})
+    """Returns the dot-path of the level in messages of a type; None if the value names no level."""
+    levels = _BY_TYPE.get(type_name, {})
     word = value.strip().upper() if isinstance(value, str) else ""
-    if not names or word not in {"WARNING", *names}:
+    if not levels or word not in {"WARNING", *levels}:
         return None
     return f"status.{FIELD}" if type_name.endswith("/DiagnosticArray") else FIELD
 
 
 def unknown_name_hint(value: JsonValue, field: str | None, types: Collection[str]) -> str:
-    """Returns the end of the sentence on a condition that needs a number and got a level's name.
+    """Returns what is added to the error of a condition that needs a number and got a level's name.
 
-    Empty where the value is no such name. `types` are those of the messages asked about.
+    Empty if the value is no such name. `types` are the types of the messages asked about.
     """
     if not _is_name_of_level(value, field):
         return ""
@@ -77,18 +83,25 @@ def _is_name_of_level(value: JsonValue, field: str | None) -> bool:
 def with_level_names(value: JsonValue, type_name: str | None = None) -> JsonValue:
     """Returns a value with names beside the numbers of levels, for people: `WARN (30)`.
 
-    Without its type they are known by the fields beside them.
+    `type_name` is the message type; without it the fields beside a level tell its names.
     """
     if isinstance(value, list):
-        return [with_level_names(inner, type_name) for inner in value]
+        return [with_level_names(element, type_name) for element in value]
     if not isinstance(value, dict):
         return value
-    shown = {key: with_level_names(inner, type_name) for key, inner in value.items()}
+    shown = {key: with_level_names(part, type_name) for key, part in value.items()}
     number = value.get(FIELD)
-    beside = next((names for keys, names in _BESIDE if keys <= value.keys()), None)
-    names = beside if type_name is None else _BY_TYPE.get(type_name)
-    if names is not None and isinstance(number, int) and not isinstance(number, bool):
-        name = next((inner for inner, level in names.items() if level == number), None)
-        if name is not None:
-            shown[FIELD] = f"{name} ({number})"
+    if isinstance(number, int) and not isinstance(number, bool):
+        levels = _levels_beside(value) if type_name is None else _BY_TYPE.get(type_name, {})
+        for name, level in levels.items():
+            if level == number:
+                shown[FIELD] = f"{name} ({number})"
     return shown
+
+
+def _levels_beside(value: JsonObject) -> Mapping[str, int]:
+    """Returns the levels of an extracted value by the fields beside `level`; else none."""
+    for fields, levels in _BESIDE:
+        if fields <= value.keys():
+            return levels
+    return {}

@@ -2,8 +2,8 @@
 
 `ReplyJson` thins arrays evenly, cuts strings, rounds numbers by what they measure, writes NaN and
 infinity as null, and notes each loss once for its path. `ExactJson` keeps the whole value, NaN
-included; only what nobody reads (the data of images and point clouds, long byte arrays, a million
-numbers) is a summary there too.
+included. Both summarize what nobody reads: the data of images and point clouds, long byte arrays, a
+million numbers.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _LARGEST_SINGLE: Final = float(np.finfo(np.float32).max)
 
 
 def round_metric(number: float) -> JsonValue:
-    """Rounds metres, m/s, rad/s and their kin to 1e-4."""
+    """Rounds metres, m/s and rad/s to 1e-4."""
     return _whole_or_null(round(number, _METRIC_DECIMALS))
 
 
@@ -75,11 +75,11 @@ def round_single(number: np.float32) -> JsonValue:
 
 
 def round_real(number: float) -> JsonValue:
-    """Rounds a float of unknown unit.
+    """Rounds a float of unknown unit to 11 significant digits, or to six decimals.
 
-    rosbags decodes a scalar float32 to a Python float, which no longer shows that it was one. Its
-    value does: it is exactly a float32 and yet needs more digits than these, which happens to a
-    measured float64 once in 2**29. It is rounded as by `round_single`.
+    rosbags decodes a scalar float32 to a Python float. Such a number is recognised by its value: it
+    is exactly a float32 and needs more digits than these, which happens to a measured float64 once
+    in 2**29. It is rounded as by `round_single`.
     """
     if not math.isfinite(number) or number == int(number):
         return _whole_or_null(number)
@@ -103,8 +103,8 @@ def round_integer(number: int) -> JsonValue:
 
 
 def _whole_or_null(number: float) -> JsonValue:
-    """Returns an int where the number is integral (so -0.0 is 0), and null where not finite."""
-    if number % 1.0 > 0.0:  # neither is
+    """Returns an int if the number is integral (so -0.0 is 0), and None if it is not finite."""
+    if number % 1.0 > 0.0:  # finite and not integral, as most are
         return float(number)
     if not math.isfinite(number):
         return None
@@ -115,18 +115,18 @@ def _whole_or_null(number: float) -> JsonValue:
 def evenly(count: int, at_most: int) -> list[int]:
     """Returns at most `at_most` evenly spaced indices into `count` values, strictly increasing.
 
-    The first and the last value are kept, and the distances between neighbours differ by at most
-    one. If only one may be kept it is the last: the newest.
+    The first and the last index are among them, and distances between neighbours differ by at most
+    one. A single index is the last: the newest value.
     """
     if count <= at_most:
         return list(range(count))
     if at_most == 1:
         return [count - 1]
-    return [place * (count - 1) // (at_most - 1) for place in range(at_most)]
+    return [nth * (count - 1) // (at_most - 1) for nth in range(at_most)]
 
 
 class NumberWriter(NamedTuple):
-    """How a rendering writes numbers, by what they measure; times in ns become Unix seconds."""
+    """How numbers are written, by what they measure. Times are in ns, and become Unix seconds."""
 
     integer: Callable[[int], JsonValue]
     real: Callable[[float], JsonValue]
@@ -147,30 +147,48 @@ _ROUNDED: Final = NumberWriter(
 )
 
 
-class _Shape(NamedTuple):
-    """How messages of a class are written: each field's name, attribute, and what summarizes it."""
+class _FieldLayout(NamedTuple):
+    """A field of a message class.
+
+    Attributes:
+        name: in the definition.
+        attribute: of the message object.
+        summarize: a function of the message and the field's value; None if it is written in full.
+    """
+
+    name: str
+    attribute: str
+    summarize: Callable[[object, object], object] | None
+
+
+class _Layout(NamedTuple):
+    """How the messages of a class are written."""
 
     kind: ValueKind
-    fields: tuple[tuple[str, str, Callable[[object, object], object] | None], ...]
+    fields: tuple[_FieldLayout, ...]
 
 
 @lru_cache(maxsize=4096)
-def _shape_of_class(cls: type) -> _Shape | None:
+def _layout_of_class(cls: type) -> _Layout | None:
+    """Returns the layout of the messages of a dataclass; None for any other class."""
     table = field_table_of_class(cls)
-    return None if table is None else _shape_of_table(kind_of_class(cls), table)
+    return None if table is None else _layout_of_table(kind_of_class(cls), table)
 
 
-def _shape_of_table(kind: ValueKind, table: FieldTable) -> _Shape:
+def _layout_of_table(kind: ValueKind, table: FieldTable) -> _Layout:
     summaries = summaries_of(table)
-    rows = ((name, attribute, summaries.get(name)) for name, attribute in table.attributes.items())
-    return _Shape(kind, tuple(rows))
+    fields = [
+        _FieldLayout(name, attribute, summaries.get(name))
+        for name, attribute in table.attributes.items()
+    ]
+    return _Layout(kind, tuple(fields))
 
 
 class ExactJson:
-    """One walk over one message, which keeps all of it. Never raises because of its content.
+    """Renders one message in full. Never raises because of its content.
 
     Args:
-        limit: bytes of a byte array that is rendered as numbers.
+        limit: a byte array of more bytes is summarized.
     """
 
     write = _EXACT
@@ -203,31 +221,33 @@ class ExactJson:
 
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
         cls: type = type(node)
-        shape = _shape_of_class(cls)
-        if shape is not None:
-            return self._message(node, shape, path, depth)
+        layout = _layout_of_class(cls)
+        if layout is not None:
+            return self._message(node, layout, path, depth)
         if isinstance(node, np.ndarray):
             return self._array(node, path, depth)
         if isinstance(node, np.generic):
             return self._scalar(node, path)
         if isinstance(node, bytes | bytearray):
             return self._array(np.frombuffer(node, dtype=np.uint8), path, depth)
-        return self._composed(node, path, depth)
+        return self._plain_container(node, path, depth)
 
-    def _composed(self, node: object, path: str, depth: int) -> JsonValue:
+    def _plain_container(self, node: object, path: str, depth: int) -> JsonValue:
         if isinstance(node, list | tuple):
             return [self.value(element, path, depth) for element in self._elements(node, path)]
         if isinstance(node, dict):
-            entries, is_summary = self._entries(node, path), isinstance(node, Summary)
-            rendered = {name: self.value(node, dotted(path, name), depth) for name, node in entries}
-            return Summary(rendered) if is_summary else rendered
+            rendered = {
+                name: self.value(inner, dotted(path, name), depth)
+                for name, inner in self._entries(node, path)
+            }
+            return Summary(rendered) if isinstance(node, Summary) else rendered
         table = field_table_of(node)
         if table is None:
             return self._text(f"<{type(node).__name__}>", path)
-        return self._message(node, _shape_of_table(ValueKind.PLAIN, table), path, depth)
+        return self._message(node, _layout_of_table(ValueKind.PLAIN, table), path, depth)
 
-    def _message(self, node: object, shape: _Shape, path: str, depth: int) -> JsonValue:
-        kind = shape.kind
+    def _message(self, node: object, layout: _Layout, path: str, depth: int) -> JsonValue:
+        kind = layout.kind
         if kind is ValueKind.QUATERNION:
             return self._rotation(node, path)
         if kind is ValueKind.TIME:
@@ -239,11 +259,11 @@ class ExactJson:
             metric = self.write.metric
             return {"x": metric(x), "y": metric(y), "z": metric(z)}
         fields: JsonObject = {}
-        for name, attribute, summarize in shape.fields:
-            inner: object = getattr(node, attribute, ABSENT)
+        for name, attribute, summarize in layout.fields:
+            value: object = getattr(node, attribute, ABSENT)
             if summarize is not None:
-                inner = summarize(node, inner)
-            fields[name] = self.value(inner, f"{path}.{name}" if path else name, depth)
+                value = summarize(node, value)
+            fields[name] = self.value(value, f"{path}.{name}" if path else name, depth)
         return fields
 
     def _rotation(self, node: object, path: str) -> JsonValue:
@@ -290,14 +310,16 @@ class ExactJson:
         return [(str(name), value) for name, value in node.items()]
 
     def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
-        """Notes a loss at a path; here none is noted, since `exact` documents what is left out."""
+        """Notes a loss at a path. Nothing reads notes on an exact rendering, so none is kept."""
 
 
 class ReplyJson(ExactJson):
-    """One walk over one message for a reply.
+    """Renders one message for a reply, and notes what it leaves out.
 
-    `squeeze` divides the length of strings and bounds JSON objects too, for messages that would
-    fill a reply alone. `notes` is complete when the walk is.
+    Args:
+        limit: how many elements of an array are written.
+        squeeze: above 1 for messages that would fill a reply alone: strings are cut to that part of
+            their usual length, and JSON objects to `limit` entries.
     """
 
     write = _ROUNDED
@@ -310,12 +332,12 @@ class ReplyJson(ExactJson):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One sentence for each path and kind of loss."""
+        """One sentence for each path and kind of loss, after the message was rendered."""
         notes = [note for _, note in self._notes.values()]
         more = len(notes) - MAX_NOTES
-        return (
-            (*notes[:MAX_NOTES], f"and {more} more notes of this kind") if more > 0 else (*notes,)
-        )
+        if more > 0:
+            notes[MAX_NOTES:] = [f"and {more} more notes of this kind"]
+        return tuple(notes)
 
     def _text(self, text: str, path: str, /) -> JsonValue:
         if len(text) > self._max_text:
@@ -339,7 +361,7 @@ class ReplyJson(ExactJson):
         if len(nodes) <= self._limit:
             return nodes
         self._note_thinned(len(nodes), path)
-        return [nodes[at] for at in evenly(len(nodes), self._limit)]
+        return [nodes[index] for index in evenly(len(nodes), self._limit)]
 
     def _note_thinned(self, total: int, path: str) -> None:
         note = f"{_named(path)}: {self._limit} of {total} values, evenly spaced"
@@ -354,14 +376,14 @@ class ReplyJson(ExactJson):
         return entries[: self._max_entries]
 
     def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
-        """Notes a loss at a path; of several of one kind there, the one of most weight is kept."""
+        """Notes a loss at a path. Of several of one kind, the note of the greatest weight stays."""
         noted = self._notes.get((kind, path))
         if noted is None or noted[0] < weight:
             self._notes[kind, path] = (weight, note)
 
 
 def _at_most_64_bits(array: Array) -> Array:
-    """Returns the array in a dtype that Python's own numbers hold: float128 is not one."""
+    """Returns an array of float128 as float64, which Python's own numbers can hold."""
     return array.astype(np.float64) if array.dtype.itemsize > 8 else array
 
 
