@@ -48,16 +48,16 @@ LONGEST_QUESTION: Final = 500
 
 
 class QuestionLog:
-    """Keeps the latest questions, `most` at most; none where that is 0. One thread adds them."""
+    """Keeps the latest `most` questions for the page; 0 keeps none. One thread adds them."""
 
     def __init__(self, most: int) -> None:
-        self._kept: deque[JsonObject] = deque(maxlen=most)
+        self._questions: deque[JsonObject] = deque(maxlen=most)
         self.is_on = most > 0
         self.count = 0
 
     def add(self, name: str, arguments: Mapping[str, object], done: Answered, answer: str) -> None:
-        """Adds a call that is over, and drops the oldest one too many. Long texts are cut."""
-        kept: JsonObject = {
+        """Adds a call that is over. Long texts are cut."""
+        question: JsonObject = {
             "asked": round(time.time() - done.duration_s, 3),
             "tool": name if done.tool == name else abbreviate(name),
             "arguments": abbreviate(arguments, LONGEST_QUESTION),
@@ -66,21 +66,21 @@ class QuestionLog:
             "answer": shortened(answer, LONGEST_ANSWER),
         }
         self.count += 1
-        self._kept.append(kept)
+        self._questions.append(question)
 
     def newest(self, most: int) -> tuple[JsonObject, ...]:
-        """Returns the latest questions as the page shows them, the newest first.
+        """Returns the latest questions, the newest first, as JSON for the page.
 
-        With when they came (Unix s, wall clock), how long they took, and the begin of the reply.
+        `asked` is Unix seconds of the wall clock, `answer` the begin of the reply.
         """
-        return tuple(reversed(self._kept.copy()))[:most]  # another thread may add one
+        return tuple(reversed(self._questions.copy()))[:most]  # another thread may add one
 
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2
 """Queries are mostly Python, which runs one at a time: more threads would only slow each other.
 
-Those that may take long have threads of their own, so that a quick one never waits for them.
+Blocking tools have threads of their own, so that a quick query never waits for them.
 """
 
 _QUERY_MARGIN_S: Final = 0.5
@@ -104,13 +104,20 @@ log = get_logger(__name__)
 class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time.
 
-    `readable`: tools that only the resources use. `log_arguments`: whether log events show what a
-    caller wrote, cut short. `most_questions`: how many calls are kept for the page.
+    Args:
+        memory: answers the questions.
+        tools: the tools that clients see.
+        replies: renders answers and errors.
+        call_timeout_s: how long a call may take, with its time in a queue.
+        readable: tools that only the resources use.
+        telemetry: observes each call.
+        log_arguments: whether log events show what a caller wrote, cut short.
+        most_questions: how many calls are kept for the page.
 
     Attributes:
-        readable: the names of those that a resource can name.
-        quick: the queue of the other tools.
+        readable: the names of the tools that a resource can use.
         blocking: the queue of the tools that are declared as blocking.
+        quick: the queue of all other tools.
     """
 
     def __init__(
@@ -158,48 +165,47 @@ class Dispatcher:
     ) -> Reply:
         """Returns the reply to a call, within `call_timeout_s`. Raises nothing but cancellation.
 
-        Where more calls wait than there are threads, `client`s take turns. `for_resource`: whether
-        the tools that only the resources use can be named, too. `for_page`: whether the page asks,
-        which does not keep its own questions. `robots`: those of a fleet that the client may ask
-        about; None for all. `part` returns the part of the memory that alone answers; tools that
-        write are refused then.
+        Args:
+            name: of the tool.
+            given: its arguments, unchecked.
+            client: if more calls wait than there are threads, clients take turns.
+            for_resource: whether the tools that only the resources use can be named, too.
+            for_page: whether the page asks, whose own questions are not kept.
+            robots: the robots of a fleet that the client may ask about; None for all.
+            part: returns the part of the memory that answers; tools that write are refused then.
         """
         tools = self._readable if for_resource else self._tools
         begun = time.perf_counter_ns()
-        outcome, text = "cancelled", ""
-        with self._running() as (call, correlation_id):
+        outcome, reply = "cancelled", Reply("")
+        with self._running_call() as (call, correlation_id):
             call.robots = robots
             try:
-                try:
-                    outcome, reply = await self._outcome(
-                        tools, name, given, call, client, part=part
-                    )
-                except Exception as error:  # noqa: BLE001 - it is logged there
-                    outcome, reply = self._failed(error)
-                text = reply.text
+                outcome, reply = await self._answer(tools, name, given, call, client, part=part)
+            except Exception as error:  # noqa: BLE001 - it is logged there
+                outcome, reply = self._failed(error)
             finally:
                 done = Answered(
                     name if name in tools else UNKNOWN_TOOL,
                     outcome,
                     unix_from_ns(time.perf_counter_ns() - begun),
-                    len(text),
+                    len(reply.text),
                     correlation_id,
                     call.stages.as_ms(),
                 )
                 self._report(done, name, given)
                 if self.questions.is_on and not for_page:
-                    self.questions.add(name, given, done, text)
+                    self.questions.add(name, given, done, reply.text)
         return reply
 
     async def look(self, work: Callable[[Call], JsonObject], client: Hashable = None) -> Reply:
-        """Returns what `work` returns as JSON, or its error; within the time of a call.
+        """Returns the result of `work` as JSON, or its error, within the time of a call.
 
-        For the page: it waits in the queue of the calls that may take long, and is no tool call of
-        the log and the metrics. Raises nothing but cancellation.
+        The page asks so: in the queue of the blocking tools, without a log event and metrics of a
+        tool call. Raises nothing but cancellation.
         """
         try:
-            with self._running() as (call, _):
-                _, reply = await self._in_turn(
+            with self._running_call() as (call, _):
+                _, reply = await self._run_in_turn(
                     "the page",
                     self.blocking,
                     ("page", client),
@@ -211,16 +217,13 @@ class Dispatcher:
         return reply
 
     @contextmanager
-    def _running(self) -> Iterator[tuple[Call, str]]:
-        """Yields a call or a look, and its correlation id; in the end ends what it may still do.
-
-        Its query ends a little before the time of a call does.
-        """
+    def _running_call(self) -> Iterator[tuple[Call, str]]:
+        """Yields a call and its correlation id. After the block its query times out at once."""
         over = threading.Event()
         timeout_s = max(self._call_timeout_s - _QUERY_MARGIN_S, self._call_timeout_s * 0.9)
 
         def monotonic() -> float:
-            # Infinite when nobody waits for it any more.
+            # Past every deadline when nobody waits for the call any more.
             return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
 
         correlation_id = uuid.uuid4().hex[:12]
@@ -250,7 +253,7 @@ class Dispatcher:
             # A fault of an observer must not cost the reply.
             log.exception("telemetry_failed")
 
-    async def _outcome(
+    async def _answer(
         self,
         tools: Mapping[str, Tool],
         name: str,
@@ -260,7 +263,13 @@ class Dispatcher:
         *,
         part: Callable[[], Memory] | None,
     ) -> tuple[str, Reply]:
-        tool = _named(name, tools)
+        """Returns the outcome and the reply of a call.
+
+        Raises:
+            InvalidArgumentsError: the tool is not offered, or the arguments are refused.
+            BusyError, QueryTimeoutError: as `_run_in_turn`.
+        """
+        tool = _find_tool(name, tools)
         if part is not None and tool.writes:
             raise InvalidArgumentsError(f"{name} writes, and is not asked of one recording")
         if excess := excess_in_arguments(given):
@@ -281,65 +290,66 @@ class Dispatcher:
             )
 
         queue = self.blocking if tool.blocking else self.quick
-        return await self._in_turn(name, queue, client, call, answer)
+        return await self._run_in_turn(name, queue, client, call, answer)
 
-    async def _in_turn(
+    async def _run_in_turn(
         self, name: str, queue: FairQueue, client: Hashable, call: Call, answer: Callable[[], Reply]
     ) -> tuple[str, Reply]:
-        """Returns the outcome and the reply, once it is the client's turn.
+        """Waits for the client's turn, and returns the outcome and the reply.
 
         Raises:
             BusyError: its turn does not come in time, or too many wait.
             QueryTimeoutError: the time of a call is up.
         """
-        asked_s, waits_s = time.monotonic(), list[float]()
+        asked_s = time.monotonic()
+        waited_s: float | None = None
 
-        def begin() -> tuple[str, Reply]:
-            waits_s.append(time.monotonic() - asked_s)
-            return self._asked(answer, call, waits_s[0])
+        def run() -> tuple[str, Reply]:
+            nonlocal waited_s
+            waited_s = time.monotonic() - asked_s
+            return self._run(answer, call, waited_s)
 
         with anyio.move_on_after(self._call_timeout_s):
-            return await queue.run(client, begin)
+            return await queue.run(client, run)
         if self._stopping.is_set():
             raise BusyError(STOPPING)
-        if not waits_s:
+        if waited_s is None:
             raise BusyError(
                 f"{name} waited {self._call_timeout_s:g} s behind other calls and was not "
                 "started; ask again, with fewer at once"
             )
         raise QueryTimeoutError(
-            f"{name} needs more than {self._call_timeout_s:g} s{_with_wait(waits_s[0])}; "
+            f"{name} needs more than {self._call_timeout_s:g} s{_note_on_wait(waited_s)}; "
             "ask about a shorter window or a single topic"
         )
 
-    def _asked(self, answer: Callable[[], Reply], call: Call, waited_s: float) -> tuple[str, Reply]:
+    def _run(self, answer: Callable[[], Reply], call: Call, waited_s: float) -> tuple[str, Reply]:
         """Returns the outcome and the reply, in a worker thread; errors as replies."""
         begun = time.monotonic()
-        try:
-            # Around all of it: an error keeps what was read alive until it has become a reply.
-            with call.reading(self.memory.large):
-                try:
-                    return "ok", answer()
-                except QueryTimeoutError as error:
-                    if self._stopping.is_set():
-                        return self._failed(BusyError(STOPPING))
-                    late = f"{error}{_with_wait(waited_s)}"
-                    return self._failed(QueryTimeoutError(late, error.searched_back_to))
-                except Exception as error:  # noqa: BLE001 - it is logged there
-                    # Caught here too, because nobody may be waiting for this thread any more.
-                    return self._failed(error)
-        finally:
-            if time.monotonic() - begun > _LONG_S:
-                return_free_memory()
+        # Around all of it: an error keeps what was read alive until it has become a reply.
+        with call.reading(self.memory.large):
+            try:
+                outcome = "ok", answer()
+            except QueryTimeoutError as error:
+                timeout = QueryTimeoutError(
+                    f"{error}{_note_on_wait(waited_s)}", error.searched_back_to
+                )
+                outcome = self._failed(BusyError(STOPPING) if self._stopping.is_set() else timeout)
+            except Exception as error:  # noqa: BLE001 - it is logged there
+                # Caught here too, because nobody may be waiting for this thread any more.
+                outcome = self._failed(error)
+        if time.monotonic() - begun > _LONG_S:
+            return_free_memory()
+        return outcome
 
     def _failed(self, error: Exception) -> tuple[str, Reply]:
         """Returns the outcome and the reply of a call that an error ended.
 
-        One that is no domain error is a fault of this program, and is logged.
+        An error that is not of the domain is a fault of this program, and is logged.
         """
         try:
             if not isinstance(error, EpisodicError):
-                raise error  # noqa: TRY301 - logged as any fault in telling an error is
+                raise error  # noqa: TRY301 - logged as a fault while an error is rendered is
             reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
             return f"{error.code}{reason}", self._replies.error(error)
         except Exception:
@@ -348,14 +358,19 @@ class Dispatcher:
             return "internal", self._replies.internal(str(context.get("correlation_id")))
 
 
-def _with_wait(waited_s: float) -> str:
+def _note_on_wait(waited_s: float) -> str:
     """Returns how long a call waited for its turn, for the error of a timeout; "" if not long."""
     if waited_s < _REPORTED_WAIT_S:
         return ""
     return f" (it waited {waited_s:.1f} s of its time behind other calls)"
 
 
-def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
+def _find_tool(name: str, tools: Mapping[str, Tool]) -> Tool:
+    """Returns the tool of a name.
+
+    Raises:
+        InvalidArgumentsError: it is not offered; the sentence says why, or which names are near.
+    """
     if name in tools:
         return tools[name]
     for declaration in DECLARATIONS:
@@ -368,9 +383,9 @@ def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
 
 
 def excess_in_arguments(given: Mapping[str, object]) -> str | None:
-    """Returns why the arguments of a call are refused, naming one; None if they are accepted.
+    """Returns why the arguments of a call are too large or too deep, naming one; else None.
 
-    Stops at the limit, so that more than is allowed takes no longer than what is.
+    Stops at the limit, so that huge arguments take no longer than allowed ones.
     """
     left = MAX_VALUES - len(given)
     if left < 0:

@@ -1,15 +1,15 @@
 """The MCP server: the tools as declared, the resources, a prompt, and the view of MCP Apps.
 
-The view (SEP-1865) is one document that draws the reply of a tool in a chat, of the page's own
-drawing code. It reaches no network, whatever the client allows: what it shows is given to it by the
-client, and what it asks further goes through the client.
+The view (SEP-1865) is one document that draws the reply of a tool in a chat, with the page's
+drawing code. It reaches no network, whatever the client allows: the client gives it the reply, and
+passes on its further questions.
 """
 
 from __future__ import annotations
 
 import itertools
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from urllib.parse import unquote
 
 import anyio
@@ -54,7 +54,7 @@ _SCRIPTS: Final = ("text.js", "map.js", "timeline.js", "reply.js", "chat.js")
 
 
 def view() -> ReadResourceContents:
-    """Returns the document."""
+    """Returns the view as one HTML document."""
     html = joined(("chat.html",)).replace("<style></style>", f"<style>{joined(_STYLES)}</style>")
     html = html.replace("<script></script>", f"<script>{joined(_SCRIPTS)}</script>")
     return ReadResourceContents(html, APP_MIME_TYPE, {"ui": {"prefersBorder": True}})
@@ -73,6 +73,20 @@ _PROMPT_DESCRIPTION: Final = "Explains to a planner which tool answers which que
 
 def _resource(name: str, description: str) -> Resource:
     return Resource(uri=f"episodic://{name}", name=name, description=description, mime_type=_JSON)
+
+
+class _TemplateTool(NamedTuple):
+    """A template of resources.
+
+    Attributes:
+        template: as clients see it.
+        tool: the tool whose reply is the text of the resource.
+        argument: the argument of the tool that the last part of the URI gives.
+    """
+
+    template: ResourceTemplate
+    tool: str
+    argument: str
 
 
 RESOURCES: Final = {
@@ -116,10 +130,10 @@ MOMENT: Final = ResourceTemplate(
     mime_type=_JSON,
 )
 _TEMPLATES: Final = {
-    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type"),
-    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment"),
+    _SCHEMA_PREFIX: _TemplateTool(SCHEMA, "describe_type", "type"),
+    _MOMENT_PREFIX: _TemplateTool(MOMENT, "show_moment", "moment"),
 }
-"""By prefix: the template, the tool whose reply is the text, and its argument."""
+"""The templates by the prefix of their URIs."""
 
 
 class EpisodicServer(MCPServer[object]):
@@ -150,12 +164,17 @@ class EpisodicServer(MCPServer[object]):
         )
         self._progress = progress
         self.dispatcher = dispatcher
-        self._listed = [_listed(tool) for tool in dispatcher.tools]
+        self._listed_tools = [_listed_tool(tool) for tool in dispatcher.tools]
         has_status = any(tool.name == "memory_status" for tool in dispatcher.tools)
-        offered = dispatcher.readable
-        self._resources = {tool: row for tool, row in RESOURCES.items() if tool in offered}
-        self._templates = {prefix: row for prefix, row in _TEMPLATES.items() if row[1] in offered}
         self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
+        self._resources = {
+            tool: resource for tool, resource in RESOURCES.items() if tool in dispatcher.readable
+        }
+        self._templates = {
+            prefix: template
+            for prefix, template in _TEMPLATES.items()
+            if template.tool in dispatcher.readable
+        }
 
     async def run_stdio_async(self) -> None:
         """Serves stdin and stdout until stdin ends."""
@@ -165,20 +184,20 @@ class EpisodicServer(MCPServer[object]):
 
     async def list_tools(self) -> list[ListedTool]:
         """Returns the tools, in the order of their declaration."""
-        return self._listed
+        return self._listed_tools
 
     async def call_tool(
         self, name: str, arguments: Mapping[str, object], context: object | None = None
     ) -> CallToolResult:
-        """Returns a call's reply as one text block. Raises nothing but cancellation.
+        """Returns the reply to a call as one text block. Raises nothing but cancellation.
 
-        A client that asks for progress receives it every `PROGRESS_EVERY_S` until then.
+        Meanwhile a client that asks for progress receives it every `PROGRESS_EVERY_S`.
         """
         async with anyio.create_task_group() as tasks:
-            if isinstance(context, Context) and "progress_token" in (
-                context.request_context.meta or {}
-            ):
-                tasks.start_soon(self._report_progress, context.report_progress)
+            if isinstance(context, Context):
+                meta = context.request_context.meta or {}
+                if "progress_token" in meta:
+                    tasks.start_soon(self._report_progress, context.report_progress)
             reply = await self.dispatcher.answer(
                 name,
                 arguments,
@@ -195,11 +214,12 @@ class EpisodicServer(MCPServer[object]):
         """Reports the seconds of a call, and how far the store is filled, until cancelled."""
         for elapsed_s in itertools.count(1):
             await anyio.sleep(PROGRESS_EVERY_S)
-            progress = None
+            sentence = None
             if self._progress is not None:
                 progress = await anyio.to_thread.run_sync(self._progress, abandon_on_cancel=True)
+                sentence = _describe_progress(progress)
             with suppress(anyio.ClosedResourceError, anyio.BrokenResourceError):
-                await report(elapsed_s, None, _stored(progress))
+                await report(elapsed_s, None, sentence)
 
     async def list_resources(self) -> list[Resource]:
         """Returns the resources that have no parameter."""
@@ -207,12 +227,12 @@ class EpisodicServer(MCPServer[object]):
 
     async def list_resource_templates(self) -> list[ResourceTemplate]:
         """Returns the templates of the resources of message types and of saved moments."""
-        return [template for template, *_ in self._templates.values()]
+        return [row.template for row in self._templates.values()]
 
     async def read_resource(
         self, uri: object, context: object | None = None
     ) -> Iterable[ReadResourceContents]:
-        """Returns a resource's JSON: the reply of its tool, errors included; or the view of these.
+        """Returns a resource's JSON, which is the reply of its tool or an error; or the view.
 
         Raises:
             ResourceNotFoundError: there is no such resource; the client receives the code that the
@@ -227,15 +247,20 @@ class EpisodicServer(MCPServer[object]):
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
     def _resource_call(self, uri: str) -> tuple[str, JsonObject]:
-        """Returns the tool of a resource, and its arguments."""
-        for prefix, (_, tool, argument) in self._templates.items():
+        """Returns the tool of a resource, and its arguments.
+
+        Raises:
+            ResourceNotFoundError: there is no such resource.
+        """
+        for prefix, template in self._templates.items():
             if uri.startswith(prefix) and uri != prefix:
-                return tool, {argument: unquote(uri.removeprefix(prefix))}
+                return template.tool, {template.argument: unquote(uri.removeprefix(prefix))}
         tools = {resource.uri: tool for tool, resource in self._resources.items()}
         if uri in tools:
             return tools[uri], {}
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
-        uris = ", ".join([*tools, *(row[0].uri_template for row in self._templates.values())])
+        templates = [row.template.uri_template for row in self._templates.values()]
+        uris = ", ".join([*tools, *templates])
         raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {uris}")
 
     async def list_prompts(self) -> list[Prompt]:
@@ -262,9 +287,9 @@ class EpisodicServer(MCPServer[object]):
         )
 
 
-def _stored(progress: Progress | None) -> str | None:
-    """Returns e.g. `40 % of the bags stored`; None where none waits."""
-    if progress is None or not progress.waiting:
+def _describe_progress(progress: Progress) -> str | None:
+    """Returns e.g. `40 % of the bags stored`; None if all are."""
+    if not progress.waiting:
         return None
     done = progress.closed - progress.waiting
     return f"{100 * done // max(progress.closed, 1)} % of the bags stored"
@@ -279,13 +304,13 @@ def _http_request(context: object) -> Request | None:
 def _client(context: object) -> Hashable:
     """Returns an identity of the client: its session, or else its address and program.
 
-    None over stdio, which has one client. It serves to give out turns fairly, and nothing else: a
-    client may claim to be another.
+    None over stdio, which has one client. It only serves to give out turns fairly: a client may
+    claim to be another.
     """
     request = _http_request(context)
     if request is None:
         return None
-    # The body was parsed. Starlette would keep up to 1 MiB of it for as long as the call waits.
+    # It was parsed already. Starlette would keep up to 1 MiB of it for as long as the call waits.
     request._body = b""
     session = request.query_params.get("session_id")
     if session is not None and request.url.path.startswith(MESSAGES_PATH):
@@ -296,7 +321,7 @@ def _client(context: object) -> Hashable:
 
 
 def _robots(context: object) -> frozenset[str] | None:
-    """Returns the robots that the token of a request is for; None where it is for all."""
+    """Returns the robots that the token of a request is for; None for all."""
     request = _http_request(context)
     return None if request is None else robots_of(request.scope)
 
@@ -307,8 +332,9 @@ def _is_page(context: object) -> bool:
     return request is not None and request.headers.get("sec-fetch-site") == "same-origin"
 
 
-def _listed(tool: Tool) -> ListedTool:
-    # Hints about what a call changes are left out of tools that only read, where they mean nothing.
+def _listed_tool(tool: Tool) -> ListedTool:
+    """Returns a tool as `tools/list` shows it."""
+    # Hints about what a call changes mean nothing for tools that only read.
     annotations = ToolAnnotations(
         read_only_hint=not tool.writes,
         destructive_hint=False if tool.writes else None,

@@ -26,53 +26,56 @@ if TYPE_CHECKING:
 async def stdio_messages() -> AsyncIterator[
     tuple[ReadStream[SessionMessage | Exception], WriteStream[SessionMessage]]
 ]:
-    """Serves stdin and stdout as the SDK does; what is no message is answered here."""
-    async with stdio_server() as (lines, replies):
-        sent, messages = anyio.create_memory_object_stream[SessionMessage | Exception]()
-
-        async def relay() -> None:
-            async with sent:
-                async for line in lines:
-                    if not isinstance(line, Exception):
-                        await sent.send(line)
-                    elif refusal := refusal_of(line):
-                        await replies.send(SessionMessage(refusal))
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(relay)
-            yield messages, replies
-            tasks.cancel_scope.cancel()
+    """Yields the messages from stdin and a stream to stdout; answers invalid lines itself."""
+    async with stdio_server() as (lines, replies), anyio.create_task_group() as tasks:
+        to_server, messages = anyio.create_memory_object_stream[SessionMessage | Exception]()
+        tasks.start_soon(_relay, lines, to_server, replies)
+        yield messages, replies
+        tasks.cancel_scope.cancel()
 
 
-def refusal_of(error: Exception) -> JSONRPCError | None:
-    """Returns the reply to a line that is no message; None where the line is blank.
+async def _relay(
+    lines: ReadStream[SessionMessage | Exception],
+    to_server: WriteStream[SessionMessage | Exception],
+    replies: WriteStream[SessionMessage],
+) -> None:
+    """Passes the messages on, and answers the lines that are none."""
+    async with to_server:
+        async for line in lines:
+            if not isinstance(line, Exception):
+                await to_server.send(line)
+            elif error := error_reply(line):
+                await replies.send(SessionMessage(error))
 
-    Its `id` is that of the request, or null where none is found.
+
+def error_reply(error: Exception) -> JSONRPCError | None:
+    """Returns the reply to a line that is no message; None if the line is blank.
+
+    Its `id` is that of the request, or null if none is found.
     """
     if not isinstance(error, ValidationError):
-        return _refusal(None, INVALID_REQUEST, str(error))
+        return _error(None, INVALID_REQUEST, str(error))
     errors = error.errors(include_url=False)
-    inputs = [given["input"] for given in errors]
-    reason = errors[0]["msg"]
-    if isinstance(inputs[0], str):
-        is_blank = not inputs[0].strip()
-        return None if is_blank else _refusal(request_id(inputs[0]), PARSE_ERROR, reason)
-    # The errors say of each kind of message what is missing; some have the whole line as input.
-    known = (given["id"] for given in inputs if isinstance(given, dict) and "id" in given)
-    number = next(known, None)
-    return _refusal(number if isinstance(number, int | str) else None, INVALID_REQUEST, reason)
+    reason, line = errors[0]["msg"], errors[0]["input"]
+    if isinstance(line, str):
+        return _error(_request_id(line), PARSE_ERROR, reason) if line.strip() else None
+    # One error for each kind of message that the line is not; some have the whole line as input.
+    for fault in errors:
+        if isinstance(fault["input"], dict) and "id" in fault["input"]:
+            return _error(fault["input"]["id"], INVALID_REQUEST, reason)
+    return _error(None, INVALID_REQUEST, reason)
 
 
-def _refusal(number: int | str | None, code: int, reason: str) -> JSONRPCError:
+def _error(request_id: object, code: int, reason: str) -> JSONRPCError:
+    number = request_id if isinstance(request_id, int | str) else None
     message = f"this is no JSON-RPC message: {reason}"
     return JSONRPCError(jsonrpc="2.0", id=number, error=ErrorData(code=code, message=message))
 
 
-def request_id(text: str) -> int | str | None:
-    """Returns the id in a JSON-RPC request that the SDK does not take; None where none is found."""
+def _request_id(text: str) -> object:
+    """Returns the id in a JSON-RPC request that the SDK refuses; None if there is none."""
     try:
         message: object = json.loads(text)
     except (ValueError, RecursionError):
         return None
-    number = message.get("id") if isinstance(message, dict) else None
-    return number if isinstance(number, int | str) else None
+    return message.get("id") if isinstance(message, dict) else None

@@ -10,7 +10,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.history.view import AtTime
 from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.serving.mcp_server import _listed
+from ros2_memory.serving.mcp_server import _listed_tool
 from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.arguments import At, LastMatchArguments, MotionArguments
 from ros2_memory.tools.build import build_tools
@@ -67,7 +67,7 @@ def test_the_seventeen_tools_of_the_specification_come_first_and_in_its_order() 
 @pytest.mark.parametrize(("additions", "most"), [(False, 12_500), (True, 20_000)])
 def test_the_listing_stays_within_its_size(additions: bool, most: int) -> None:
     tools = build_tools(QuerySettings(), additions=additions, writing=True)
-    listing = ListToolsResult(tools=[_listed(tool) for tool in tools])
+    listing = ListToolsResult(tools=[_listed_tool(tool) for tool in tools])
     assert len(listing.model_dump_json(by_alias=True, exclude_none=True).encode()) <= most
 
 
