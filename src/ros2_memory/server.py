@@ -25,7 +25,7 @@ from ros2_memory import package_version
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.malloc import share_one_arena
 from ros2_memory.core.text import counted
-from ros2_memory.serving.listen import CannotListenError, resolved
+from ros2_memory.serving.listen import CannotListenError, resolve
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -102,7 +102,7 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
             from ros2_memory.serving.auth import limited_tokens, take_token
 
             # Before anything is built, so that a refusal comes at once.
-            address = resolved(at.host, at.port)
+            address = resolve(at.host, at.port)
             limited = limited_tokens(settings.fleet.tokens)
             token = take_token(
                 os.environ, host=at.host, loopback=address.is_loopback, limited=bool(limited)

@@ -22,7 +22,7 @@ import socket
 import stat
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
@@ -52,7 +52,7 @@ LOG_INTERVAL_S: Final = 60.0
 """Wrong tokens are logged at most this often: guessing must not fill the disk with log events."""
 
 _ROBOTS: Final = "ros2_memory.robots"
-"""The key in the scope of a request: the robots that its token is for; absent where for all."""
+"""The key in the scope of a request: the robots that its token is for; absent for all robots."""
 _ADMITTED: Final = "ros2_memory.admitted"
 """The key in the state of a request, which its connection and `/health` can read."""
 _SAME_SITE: Final = frozenset({"same-origin", "none"})
@@ -63,7 +63,7 @@ _REFUSED: Final = -32_001
 """The code of a JSON-RPC error that a server defines itself."""
 _MISSING: Final = "A token is needed: send it as Authorization: Bearer TOKEN.\n"
 _QUESTIONS: Final = ("/sse", "/messages/", MCP_PATH)
-"""How the paths begin that a limited token may use."""
+"""The paths that a limited token may use, or their beginnings."""
 _FORBIDDEN: Final = PlainTextResponse(
     "The token is for questions about some robots alone.\n", status_code=403
 )
@@ -89,9 +89,15 @@ def is_admitted(scope: Mapping[str, object]) -> bool:
 
 
 def robots_of(scope: Mapping[str, object]) -> frozenset[str] | None:
-    """Returns the robots that the token of a request is for; None where it is for all."""
+    """Returns the robots that the token of a request is for; None for all."""
     robots = scope.get(_ROBOTS)
     return robots if isinstance(robots, frozenset) else None
+
+
+class _Access(NamedTuple):
+    """What a token is for: questions about some robots, or everything where `robots` is None."""
+
+    robots: frozenset[str] | None
 
 
 class TokenGate:
@@ -99,10 +105,14 @@ class TokenGate:
 
     Every other request is answered with 401 before its body is read. `/health` is passed on without
     a token too, and is not admitted then. A token in a query string is not accepted, since query
-    strings are logged. Only tokens' digests are kept, and digests are compared in constant time.
+    strings are logged. Only digests of tokens are kept, and they are compared in constant time.
 
-    `token` is for everything. Each of `limited` is for the questions of MCP alone, about the
-    robots that it has here; for `/health` it counts as none.
+    Args:
+        app: receives the requests.
+        token: is for everything; None if there is no such token.
+        monotonic: seconds.
+        limited: tokens for the questions of MCP alone, each with the robots that it is for. For
+            `/health` such a token counts as none.
     """
 
     def __init__(
@@ -116,7 +126,9 @@ class TokenGate:
         tokens: dict[str, frozenset[str] | None] = {**(limited or {})}
         if token is not None:
             tokens[token] = None
-        self._digests = [(_digest(own.encode("ascii")), robots) for own, robots in tokens.items()]
+        self._access_by_digest = {
+            _digest(text.encode("ascii")): _Access(robots) for text, robots in tokens.items()
+        }
         self._refusals = LogThrottle(monotonic, LOG_INTERVAL_S)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -124,34 +136,33 @@ class TokenGate:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        shown = [value for name, value in scope["headers"] if name == b"authorization"]
-        is_right, robots = self._checked(shown[0]) if len(shown) == 1 else (False, None)
-        is_health = scope["path"] in {HEALTH_PATH, RECORDING_PATH}
-        if is_right and robots is None:
+        given = [value for name, value in scope["headers"] if name == b"authorization"]
+        access = self._access(given[0]) if len(given) == 1 else None
+        app, path = self._app, scope["path"]
+        is_health = path in {HEALTH_PATH, RECORDING_PATH}
+        if access is None:
+            if not is_health or given:
+                self._log_refused(scope, is_wrong=bool(given))
+                app = _unauthorized(is_wrong=bool(given), speaks_mcp=path == MCP_PATH)
+        elif access.robots is None:
             admit(scope)
-            await self._app(scope, receive, send)
-        elif is_health and (is_right or not shown):
-            await self._app(scope, receive, send)
-        elif is_right and not scope["path"].startswith(_QUESTIONS):
-            await _FORBIDDEN(scope, receive, send)
-        elif is_right:
+        elif path.startswith(_QUESTIONS):
             admit(scope)
-            await self._app({**scope, _ROBOTS: robots}, receive, send)
-        else:
-            self._log_refused(scope, is_wrong=bool(shown))
-            refusal = _unauthorized(is_wrong=bool(shown), speaks_mcp=scope["path"] == MCP_PATH)
-            await refusal(scope, receive, send)
+            scope = {**scope, _ROBOTS: access.robots}
+        elif not is_health:
+            app = _FORBIDDEN
+        await app(scope, receive, send)
 
-    def _checked(self, header: bytes) -> tuple[bool, frozenset[str] | None]:
-        """Returns whether a header has a token of this server, and the robots that it is for."""
+    def _access(self, header: bytes) -> _Access | None:
+        """Returns what the token in an Authorization header is for; None if it is not known."""
         scheme, token = header[: len(_SCHEME)].lower(), header[len(_SCHEME) :].strip(b" ")
-        shown = _digest(token)
-        right: tuple[bool, frozenset[str] | None] = (False, None)
-        for digest, robots in self._digests:
-            # All are compared, so that the time says nothing of which it was.
-            if hmac.compare_digest(shown, digest):
-                right = True, robots
-        return right if scheme == _SCHEME else (False, None)
+        digest = _digest(token)
+        access = None
+        # All are compared, so that the time does not tell which token it was.
+        for known, granted in self._access_by_digest.items():
+            if hmac.compare_digest(digest, known):
+                access = granted
+        return access if scheme == _SCHEME else None
 
     def _log_refused(self, scope: Scope, *, is_wrong: bool) -> None:
         """Logs the client and the number of refusals; nothing that was sent, not even the path."""
@@ -182,6 +193,14 @@ def _unauthorized(*, is_wrong: bool, speaks_mcp: bool) -> Response:
     return JSONResponse(body, status_code=401, headers=headers)
 
 
+class _Refusal(NamedTuple):
+    """Why a request is refused: the reason for the log, the HTTP status and the reply."""
+
+    reason: str
+    status: int
+    reply: str
+
+
 class ForgeryGuard:
     """Refuses requests that a web page could have forged: by Host, Origin and Sec-Fetch-Site.
 
@@ -192,9 +211,12 @@ class ForgeryGuard:
     A browser sends the page's site in Origin, which must be this server's own: other ports of this
     machine serve other programs' pages. Where it sends no Origin, Sec-Fetch-Site (W3C Fetch
     Metadata) says whether another site caused the request. A person may follow a link from anywhere
-    to the page itself, of which the other site sees nothing.
+    to the page itself: the other site sees nothing of it.
 
-    `admits`: whether requests that pass are admitted, because there is no token to ask for.
+    Args:
+        app: receives the requests that pass.
+        host: the name or address that the server listens on.
+        admits: whether requests that pass are admitted, because there is no token to ask for.
     """
 
     def __init__(self, app: ASGIApp, host: str, *, admits: bool) -> None:
@@ -210,35 +232,35 @@ class ForgeryGuard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles an ASGI connection."""
         app = self._app
-        if scope["type"] == "http":
-            if refusal := self._refusal(scope):
-                reason, status, sentence = refusal
-                if refused := self._refusals.count(reason):
-                    log.warning("request_refused", reason=reason, refused=refused)
-                app = PlainTextResponse(f"{sentence}\n", status)
-            elif self._admits:
-                admit(scope)
+        refusal = self._refusal(scope) if scope["type"] == "http" else None
+        if refusal is not None:
+            if refused := self._refusals.count(refusal.reason):
+                log.warning("request_refused", reason=refusal.reason, refused=refused)
+            app = PlainTextResponse(f"{refusal.reply}\n", refusal.status)
+        elif self._admits and scope["type"] == "http":
+            admit(scope)
         await app(scope, receive, send)
 
-    def _refusal(self, scope: Scope) -> tuple[str, int, str] | None:
-        """Returns why a request is refused, for the log, with the status and the reply."""
+    def _refusal(self, scope: Scope) -> _Refusal | None:
+        """Returns why a request is refused; None if it passes."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         name = _host_name(host)
         if name not in self._names and not (self._is_reachable and _is_address(name)):
             reply = "Host is not a name of this server; use its address instead."
-            return "the host name of another site", 421, reply
+            return _Refusal("the host name of another site", 421, reply)
         same = {f"http://{host}".lower(), f"https://{host}".lower()}
         if any(origin.lower() not in same for origin in headers.getlist("origin")):
-            return "the origin of another site", 403, "Origin is another site."
+            return _Refusal("the origin of another site", 403, "Origin is another site.")
         is_same_site = _SAME_SITE.issuperset(headers.getlist("sec-fetch-site"))
         if not is_same_site and not _is_visit(scope, headers):
-            return "a request from another site", 403, "Sec-Fetch-Site is another site."
+            reply = "Sec-Fetch-Site is another site."
+            return _Refusal("a request from another site", 403, reply)
         return None
 
 
 def _is_visit(scope: Scope, headers: Headers) -> bool:
-    """Returns whether a person has a browser open the page."""
+    """Returns whether a browser opens the page itself, as when a person follows a link."""
     return (
         scope["method"] == "GET"
         and scope["path"] == PAGE_PATH
@@ -248,12 +270,14 @@ def _is_visit(scope: Scope, headers: Headers) -> bool:
 
 
 def _host_name(host: str) -> str:
-    """Returns the name or address in a Host header, in lower case; empty if that is malformed."""
+    """Returns the name or address in a Host header, in lower case; empty if it is malformed."""
     match = _HOST.fullmatch(host)
     if match is None:
         return ""
-    name, address = match[1], match[2]
-    return name.lower() if name else address.lower() if _is_address(address) else ""
+    name, address = match.groups()
+    if name:
+        return str(name).lower()
+    return str(address).lower() if _is_address(address) else ""
 
 
 def _is_address(name: str) -> bool:
@@ -285,12 +309,12 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} both give the API token; leave one of them")
     for source, token in given.items():
-        return SecretStr(_usable(token, source))
+        return SecretStr(_read_token(token, source))
     return None
 
 
 def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[str]]:
-    """Returns the tokens in files, each with the robots that it is for.
+    """Reads the tokens in files, and returns each with the robots that it is for.
 
     Raises:
         ConfigError: a file cannot be read, its token cannot be used, or two have the same one.
@@ -298,7 +322,7 @@ def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[
     tokens: dict[str, frozenset[str]] = {}
     for path, names in robots.items():
         source = f"fleet.tokens: {path}"
-        text = _usable(path, source)
+        text = _read_token(path, source)
         if text in tokens:
             raise ConfigError(f"{source}: another file has the same token; {_HOW}")
         tokens[text] = frozenset(names)
@@ -308,13 +332,16 @@ def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[
 def take_token(
     env: MutableMapping[str, str], *, host: str, loopback: bool, limited: bool = False
 ) -> SecretStr | None:
-    """Returns the token of a server on `host`; None only where no other machine can reach it.
+    """Returns the token of a server, and removes it from the environment of child processes.
 
-    Where there are `limited` ones, none that is for everything is needed. Removes it from the
-    environment, which child processes inherit.
+    Args:
+        env: the environment.
+        host: the address that the server listens on.
+        loopback: whether only this machine can reach it, so that no token is needed.
+        limited: whether there are limited tokens, so that no token for everything is needed.
 
     Raises:
-        ConfigError: there must be a token, or the one that there is cannot be used.
+        ConfigError: a token is missing, or cannot be used.
     """
     token = api_token(env)
     env.pop(VARIABLE, None)
@@ -328,27 +355,14 @@ def take_token(
     return token
 
 
-def _usable(given: str | Path, source: str) -> str:
-    """Returns a token, or that in a file without the line's end; opens no pipe, which would block.
+def _read_token(given: str | Path, source: str) -> str:
+    """Returns a token that is given as text or in a file.
 
     Raises:
-        ConfigError: it cannot be read, or cannot be sent in a header.
+        ConfigError: it cannot be read, or cannot be sent in a header. The sentence begins with
+            `source`, which names where the token is given.
     """
-    if isinstance(given, Path):
-        try:
-            if not stat.S_ISREG(given.stat().st_mode):
-                raise ConfigError(f"{source}: {str(given)!r} is not a regular file")
-            with given.open("rb") as file:
-                data = file.read(LONGEST_TOKEN + 3)
-        except OSError as error:
-            raise ConfigError(
-                f"{source}: {str(given)!r} cannot be read: {error.strerror}; "
-                "give the server's user a file that it may read"
-            ) from None
-        # Bytes that are not text are refused below, without being shown.
-        text = data.decode("ascii", errors="replace").removesuffix("\n").removesuffix("\r")
-    else:
-        text = given
+    text = _first_line(given, source) if isinstance(given, Path) else given
     if len(text) < SHORTEST_TOKEN:
         length = f"has {len(text)} characters" if text else "is empty"
         raise ConfigError(
@@ -365,3 +379,23 @@ def _usable(given: str | Path, source: str) -> str:
             f"hold; letters, digits and -._~+/ are allowed, with = at the end; {_HOW}"
         )
     return text
+
+
+def _first_line(path: Path, source: str) -> str:
+    """Returns the text of a token file without the line's end. Bytes that are no text are replaced.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    try:
+        # A pipe would block.
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ConfigError(f"{source}: {str(path)!r} is not a regular file")
+        with path.open("rb") as file:
+            data = file.read(LONGEST_TOKEN + len("\r\n") + 1)
+    except OSError as error:
+        raise ConfigError(
+            f"{source}: {str(path)!r} cannot be read: {error.strerror}; "
+            "give the server's user a file that it may read"
+        ) from None
+    return data.decode("ascii", errors="replace").removesuffix("\n").removesuffix("\r")

@@ -45,20 +45,20 @@ T = TypeVar("T")
 log = get_logger(__name__)
 
 BACKLOG: Final = 8
-"""A child process stores more bags than these, so that answers stay fast."""
+"""If more bags wait, a child process stores them, so that answers stay fast."""
 _MERGED_HERE: Final = 100
-"""And if it is more with those that are stored again with others: an hour of short splits is."""
+"""Likewise if their batches have more bags: to store an hour of short splits again as one part."""
 _BACKLOG_ALONE: Final = 256
-"""Bags of a lake that are stored in a round: no child process knows them."""
+"""How many bags are stored in a round without a child process, as for a lake."""
 PRUNE_INTERVAL_S: Final = 600.0
 """How often what is stored of deleted files is removed, and the file of the store is checked."""
 _MOST_GONE: Final = 1 / 64
-"""Share of the stored bags; where more are gone, what is stored of them is removed at once."""
+"""If a larger share of the stored bags was deleted, the store is pruned at once."""
 
 LONGEST_TURN_S: Final = 600.0
 """How long one of several stores is filled before it is the next one's turn."""
-_AGAIN: Final = 4
-"""Slices of the clock of which what follows is made again in a round."""
+_REMADE_AT_ONCE: Final = 4
+"""Slices of the clock whose outdated fragments are made again in a round."""
 _LATELY: Final = 4
 """Intervals between scans after which bags count as out of reach."""
 
@@ -68,8 +68,10 @@ class Backfill:
     """Stores the bags of one memory. Only `progress` may be called from several threads.
 
     Attributes:
+        memory: the memory.
+        filling: fills its store of columns; None without a store.
         helper: the command line of the program that stores a backlog (`ros2-memory index`);
-            without it that is stored here.
+            without it this program does.
         undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.
     """
 
@@ -77,50 +79,63 @@ class Backfill:
     filling: Filling | None
     helper: Sequence[str] = ()
     undecodable: dict[str, str] = field(default_factory=dict)
-    _of_others: list[Ns] | None = None
+    _outdated: list[Ns] | None = None
+    """Where slices of the clock begin whose fragments were made under other settings."""
     _pruned_s: float = -math.inf
-    _left: int = 0
+    _gone_after_prune: int = 0
+    """Stored bags that `prune` left, although they cannot be read or have changed."""
     _is_precomputed: bool = False
 
     async def fill(self) -> None:
-        """Stores the closed bags that there are. Raises nothing but cancellation."""
+        """Stores the closed bags of the moment. Raises nothing but cancellation."""
         try:
             await self._fill_round()
         except Exception:
             log.exception("filling_failed")
 
     async def _fill_round(self) -> None:
-        due, in_thread = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S, self._in_thread
-        await in_thread(partial(self.look_after, thorough=due))
-        waiting, batches = await in_thread(self.waiting), await in_thread(self.batches)
+        in_thread = self._in_thread
+        is_prune_due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
+        await in_thread(partial(self.look_after, thorough=is_prune_due))
         store = None if self.filling is None else self.filling.store
-        # A store that is in memory cannot be filled by another process.
-        has_file = store is not None and store.path is not None
-        is_much = len(waiting) > BACKLOG or sum(len(batch.bags) for batch in batches) > _MERGED_HERE
-        if self.helper and is_much and has_file and await _run_helper(self.helper):
+        waiting, batches = await in_thread(self.waiting), await in_thread(self.batches)
+        if self._needs_helper(waiting, batches) and await _run_helper(self.helper):
             # Bags that the helper could not store are tried here, and refused if they fail.
             waiting, batches = await in_thread(self.waiting), await in_thread(self.batches)
         if not waiting and store is not None:
             await in_thread(store.write_again)  # whether the disk works again
-        done = tried = 0
+        stored = await self._store_batches(batches)
+        await in_thread(self.follow)
+        if (stored or not self._is_precomputed) and len(waiting) <= BACKLOG:
+            await in_thread(self.precompute)
+            self._is_precomputed = True
+        if is_prune_due or await in_thread(self.has_many_gone):
+            await in_thread(self.prune)
+        if is_prune_due:
+            self._pruned_s = time.monotonic()
+
+    def _needs_helper(self, waiting: Sequence[BagFile], batches: Sequence[Batch]) -> bool:
+        """Returns whether so much waits that the helper shall store it."""
+        # A store that is in memory cannot be filled by another process.
+        if not self.helper or self.filling is None or self.filling.store.path is None:
+            return False
+        bags = sum(len(batch.bags) for batch in batches)
+        return len(waiting) > BACKLOG or bags > _MERGED_HERE
+
+    async def _store_batches(self, batches: Sequence[Batch]) -> int:
+        """Stores the first batches, as many as a round may have; returns how many bags."""
+        tried = stored = 0
         for batch in batches:
             if tried >= (BACKLOG if self.helper else _BACKLOG_ALONE):
                 break
             tried += len(batch.bags)
-            done += await in_thread(partial(self.store, batch))
-            if store is not None and store.is_failing:
+            stored += await self._in_thread(partial(self.store, batch))
+            if self.filling is not None and self.filling.store.is_failing:
                 break
-        await in_thread(self.follow)
-        if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
-            await in_thread(self.precompute)
-            self._is_precomputed = True
-        if due or await in_thread(self.has_many_gone):
-            await in_thread(self.prune)
-        if due:
-            self._pruned_s = time.monotonic()
+        return stored
 
     async def _in_thread(self, work: Callable[[], T]) -> T:
-        """Returns what `work` returns, in a thread that waits while others hold much of a bag."""
+        """Runs `work` in a thread, which waits while others hold much of a bag."""
 
         def work_in_turn() -> T:
             with self.memory.large.during():
@@ -135,8 +150,8 @@ class Backfill:
             return Progress(sum(bag.state is BagState.CLOSED for bag in timeline.bags))
         return self.filling.progress(timeline)
 
-    def _filled(self, work: Callable[[Filling, Timeline], T], otherwise: T) -> T:
-        """Returns what `work` does with the store and the bags, where there are both.
+    def _with_store(self, work: Callable[[Filling, Timeline], T], otherwise: T) -> T:
+        """Returns the result of `work`; `otherwise` without a store or a bag directory.
 
         A missing bag directory is more likely a missing disk than an empty one.
         """
@@ -146,41 +161,44 @@ class Backfill:
         return work(self.filling, snapshot.timeline)
 
     def waiting(self) -> list[BagFile]:
-        """Returns the bags of which columns are to be stored, the newest first."""
-        return self._filled(Filling.waiting, [])
+        """Returns the bags whose columns are to be stored, the newest first."""
+        return self._with_store(Filling.waiting, [])
 
     def batches(self) -> list[Batch]:
         """Returns the bags to be stored, as `Filling.batches`."""
-        return self._filled(Filling.batches, [])
+        return self._with_store(Filling.batches, [])
 
     def store(self, batch: Batch) -> int:
         """Stores the columns of a batch of bags; returns how many bags, as `Filling.fill`."""
-        return self._filled(lambda filling, timeline: filling.fill(batch, timeline), 0)
+        return self._with_store(lambda filling, timeline: filling.fill(batch, timeline), 0)
 
     def follow(self) -> bool:
-        """Makes what follows from whole parts, and keeps the store within what it may take.
+        """Makes the fragments of whole parts, and keeps the store within its limits.
 
-        Then makes again, a few at a time, the newest first, what followed from parts under other
-        settings.
+        Also makes a few outdated fragments again, the newest first: those that were made under
+        other settings.
 
         Returns:
-            Whether there is more of that.
+            Whether there are more outdated ones.
         """
-        return self._filled(self._follow, otherwise=False)
+        return self._with_store(self._follow, otherwise=False)
 
     def _follow(self, filling: Filling, timeline: Timeline) -> bool:
-        columns = self.memory.scanner
-        coverage = columns.coverage(timeline)
+        scanner = self.memory.scanner
+        coverage = scanner.coverage(timeline)
         waiting = [] if coverage is None else coverage.starts_to_store()
         make_fragments(self.memory, filling.whole_since(), waiting)
         filling.thin()
         filling.trim()
-        if self._of_others is None:
-            self._of_others = columns.fragments_of_others()
-        now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
-        windows = [TimeWindow(start, start + PART_NS) for start in now]
-        make_fragments(self.memory, windows, [*waiting, *self._of_others])
-        return bool(self._of_others)
+        if self._outdated is None:
+            self._outdated = scanner.fragments_of_others()
+        remade, self._outdated = (
+            self._outdated[:_REMADE_AT_ONCE],
+            self._outdated[_REMADE_AT_ONCE:],
+        )
+        windows = [TimeWindow(start, start + PART_NS) for start in remade]
+        make_fragments(self.memory, windows, [*waiting, *self._outdated])
+        return bool(self._outdated)
 
     def look_after(self, *, thorough: bool = False) -> None:
         """Returns the store to its file, unless the bag directory itself is missing.
@@ -188,67 +206,69 @@ class Backfill:
         Args:
             thorough: whether the whole file is read to check its integrity.
         """
-        self._filled(lambda filling, _: filling.store.look_after(thorough=thorough), None)
+        self._with_store(lambda filling, _: filling.store.look_after(thorough=thorough), None)
 
     def precompute(self) -> None:
-        """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
+        """Answers before a client asks which topics are recorded, and which cannot be decoded.
 
-        Before a client asks.
+        This also counts the messages that overlapping recordings share, and remembers the result.
         """
         with suppress(EpisodicError):
             rows = list_recorded_topics(self.memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
 
     def has_many_gone(self) -> bool:
-        """Returns whether many of the stored bags were deleted since `prune`: it looks at all."""
-        gone, stored = self._filled(Filling.count_gone, (0, 0))
-        self._left = min(self._left, gone)
-        return gone - self._left > _MOST_GONE * stored
+        """Returns whether many of the stored bags were deleted since the last `prune`."""
+        gone, stored = self._with_store(Filling.count_gone, (0, 0))
+        self._gone_after_prune = min(self._gone_after_prune, gone)
+        return gone - self._gone_after_prune > _MOST_GONE * stored
 
     def prune(self) -> None:
-        """Removes what is stored of deleted files; stores what each metadata.yaml lists now.
+        """Removes the columns of deleted files, and stores what each metadata.yaml lists now.
 
-        Does nothing where there are no bags, for the same reason.
+        Does nothing if there are no bags: their disk is missing more likely.
         """
+        self._with_store(self._prune, None)
 
-        def of_deleted(filling: Filling, timeline: Timeline) -> None:
-            if timeline.bags:
-                filling.prune(timeline)
-                # Some that are still there cannot be read, or have changed.
-                self._left, _ = filling.count_gone(timeline)
-                self.memory.store_listings(self.memory.index.snapshot())
-
-        self._filled(of_deleted, None)
+    def _prune(self, filling: Filling, timeline: Timeline) -> None:
+        if timeline.bags:
+            filling.prune(timeline)
+            self._gone_after_prune, _ = filling.count_gone(timeline)
+            self.memory.store_listings(self.memory.index.snapshot())
 
 
 def make_fragments(
     memory: Memory, windows: Sequence[TimeWindow], waiting: Sequence[Ns] = ()
 ) -> None:
-    """Makes what follows from the parts of some times; stores it, and what questions made of it.
+    """Makes the fragments of some windows, and stores them.
 
-    It is joined by stretches of the clock, but for those in which bags or slices are `waiting`: log
-    times (ns) where they begin.
+    They are joined by stretches of the clock, but for the stretches that still wait for bags.
+
+    Args:
+        memory: the memory.
+        windows: of whole parts.
+        waiting: the log times (ns) at which bags or slices begin that are not stored yet.
     """
-    stretches = _stretches_around(windows, waiting)
-    # The newest `STRETCH_NS` of a window, and so on: few fragments wait to be written.
+    # Long windows in pieces, so that few fragments wait to be written; the newest first.
     pieces = [
         TimeWindow(max(window.start, stop - STRETCH_NS), stop)
         for window in windows
         for stop in range(window.stop, window.start, -STRETCH_NS)
     ]
-    _make_each(memory, pieces, is_joined=False)
-    # What these are joined of is written by now: not all of it is still remembered.
-    _make_each(memory, stretches, is_joined=True)
+    _make_in_each(memory, pieces, is_joined=False)
+    # Their fragments are written by now, and can be read: not all are still in memory.
+    _make_in_each(memory, _stretches_around(windows, waiting), is_joined=True)
 
 
-def _make_each(memory: Memory, windows: Sequence[TimeWindow], *, is_joined: bool) -> None:
+def _make_in_each(memory: Memory, windows: Sequence[TimeWindow], *, is_joined: bool) -> None:
+    """Makes and writes the fragments of each window; logs why some cannot be made."""
     unwritten: Ns = 0
     for window in windows:
         try:
             _make_fragments_in(memory, window, is_joined=is_joined)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
-        # Of a store that has changed, all bags are looked up again: so several at once.
+        # Several at once: after a write all bags are looked up again.
         unwritten += window.stop - window.start
         if unwritten >= STRETCH_NS:
             memory.scanner.write_fragments()
@@ -258,22 +278,23 @@ def _make_each(memory: Memory, windows: Sequence[TimeWindow], *, is_joined: bool
 
 
 def _stretches_around(windows: Sequence[TimeWindow], waiting: Sequence[Ns]) -> Sequence[TimeWindow]:
-    """Returns the stretches that windows touch and in which nothing is waiting, the newest first.
+    """Returns the stretches of the clock that windows touch and nothing waits for, newest first.
 
-    What is joined of a stretch needs all parts of it, and those that reach into it.
+    Each is widened by a part: joining needs the parts that reach into the stretch, too.
     """
-    around = [window.widened(PART_NS) for window in windows]
-    ends = {(window.start // STRETCH_NS, window.stop // STRETCH_NS) for window in around}
-    touched = {number for first, last in ends for number in range(first, last + 1)}
-    touched -= {start // STRETCH_NS for start in waiting}
+    numbers: set[int] = set()
+    for window in windows:
+        around = window.widened(PART_NS)
+        numbers.update(range(around.start // STRETCH_NS, around.stop // STRETCH_NS + 1))
+    numbers -= {start // STRETCH_NS for start in waiting}
     return [
         TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
-        for number in sorted(touched, reverse=True)
+        for number in sorted(numbers, reverse=True)
     ]
 
 
 def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -> None:
-    """Makes the fragments of a window; outlines where these are not joined of others.
+    """Makes the fragments of a window: of its parts, or those of a stretch that `is_joined`.
 
     Raises:
         EpisodicError: they cannot be made.
@@ -288,7 +309,7 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
     ]
     if not is_joined:
         fragments.append(memory.scanner.outlines_made(view.timeline, window))
-    # Each goes back in time as far as the others: what they read is still remembered.
+    # All go back in time together, so that what one reads is still in memory for the others.
     deque(merge(*fragments, reverse=True), maxlen=0)
 
 
@@ -302,7 +323,7 @@ async def keep_backfilled(backfill: Backfill, every_s: float) -> None:
 async def keep_all_backfilled(backfills: Callable[[], Sequence[Backfill]], every_s: float) -> None:
     """Fills several stores, one after the other, until it is cancelled.
 
-    A memory whose bags were not scanned lately is passed over: its disk may hang.
+    A memory whose bags were not scanned lately is skipped: its disk may hang.
     """
     while True:
         for backfill in backfills():

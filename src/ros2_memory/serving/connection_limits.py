@@ -49,7 +49,7 @@ MAX_CONNECTIONS: Final = 256
 MAX_UNKNOWN: Final = 128
 MIN_CHUNKS: Final = 256
 CHUNK_BYTES: Final = 64
-"""Beyond so many chunks the body must have so many bytes for each."""
+"""A body with more than `MIN_CHUNKS` chunks must have this many bytes for each further one."""
 ACCEPTED_AT_ONCE: Final = 16
 """In one turn of the event loop. A new connection is first read three turns later, so fewer are
 accepted by then than there is room for, and none is replaced before its first bytes were read."""
@@ -95,9 +95,10 @@ class _Connection(h11.Connection):
 class BoundedConnection(H11Protocol):
     """Uvicorn's HTTP/1.1 over one connection, which is closed when the client takes too long.
 
-    A request that is not completed is answered with 408, a connection too many with 503. A reply
-    that is not read aborts the connection, and with it the call or the event stream. Of unknown
-    connections too many, the oldest of the address that has most is aborted without a reply.
+    A request that is not completed is answered with 408, a connection above `MAX_CONNECTIONS` with
+    503. A reply that is not read aborts the connection, and with it the call or the event stream.
+    Above `MAX_UNKNOWN` a new unknown connection replaces the oldest of the address that has most,
+    without a reply.
     """
 
     _refusals: ClassVar[LogThrottle] = LogThrottle()
@@ -139,11 +140,12 @@ class BoundedConnection(H11Protocol):
             self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
             return
         if len(unknown) > MAX_UNKNOWN:
-            of_address = Counter(connection._address for connection in unknown)
-            min(
-                unknown,
-                key=lambda connection: (-of_address[connection._address], connection._made_s),
-            )._abort()
+            by_address = Counter(connection._address for connection in unknown)
+
+            def rank(connection: BoundedConnection) -> tuple[int, float]:
+                return -by_address[connection._address], connection._made_s
+
+            min(unknown, key=rank)._abort()
         self._watch()
 
     @property
@@ -151,6 +153,7 @@ class BoundedConnection(H11Protocol):
         return self.client[0] if self.client else ""
 
     def _unknown(self) -> list[BoundedConnection]:
+        """Returns the connections without an admitted request, but for those that are ending."""
         return [
             connection
             for connection in self.connections
@@ -164,7 +167,7 @@ class BoundedConnection(H11Protocol):
             log.warning("connection_refused", reason=reason, refused=refused)
 
     def _abort(self) -> None:
-        """Closes it at once, without a reply."""
+        """Closes the connection at once, without a reply."""
         self._log_refused("an unknown connection replaced by a newer one")
         self._is_refused = True
         self.transport.abort()
@@ -184,7 +187,7 @@ class BoundedConnection(H11Protocol):
 
     def on_response_complete(self) -> None:
         """Handles the end of a reply; another request may follow."""
-        self._is_admitted = not self.is_unknown
+        self._is_admitted = not self.is_unknown  # before the request is gone that tells
         super().on_response_complete()
         self._watch()
 
@@ -206,7 +209,7 @@ class BoundedConnection(H11Protocol):
 
         It counts from the beginning of that part: more bytes do not extend it.
         """
-        phase = self._awaited()
+        phase = self._awaited_phase()
         if phase == self._phase:
             return
         self._phase = phase
@@ -216,7 +219,7 @@ class BoundedConnection(H11Protocol):
             within = HEAD_S if phase == "head" else BODY_S
             self._deadline = self.loop.call_later(within, self._too_late)
 
-    def _awaited(self) -> _Phase:
+    def _awaited_phase(self) -> _Phase:
         if not self._has_begun():
             return "head"
         if self.cycle.more_body:
@@ -224,7 +227,7 @@ class BoundedConnection(H11Protocol):
         return "head" if self.cycle.response_complete else "reply"
 
     def _has_begun(self) -> bool:
-        """Returns whether there was a request at all."""
+        """Returns whether a first request has come; before that uvicorn has no `cycle`."""
         cycle: object = self.cycle
         return cycle is not None
 
@@ -282,7 +285,7 @@ def _limit_socket(transport: asyncio.Transport) -> None:
 
 @dataclass
 class RequestLimits:
-    """Reads requests for an application, and cancels it where nobody waits for its reply."""
+    """Reads the bodies of requests, and cancels the application when a client leaves."""
 
     _app: ASGIApp
 
@@ -292,7 +295,7 @@ class RequestLimits:
             await self._app(scope, receive, send)
             return
         if scope["method"] not in {"POST", "PUT", "PATCH"}:
-            await self._app(scope, receive, _once(send))
+            await self._app(scope, receive, _one_response(send))
             return
         # h11 has refused a length that is no number. Uvicorn discards the rest of a body that is
         # too large, since a client may read the refusal only afterwards.
@@ -346,11 +349,11 @@ class RequestLimits:
             tasks.cancel_scope.cancel()
 
 
-def _once(send: Send) -> Send:
-    """Returns a `send` that takes a second response for the end of the first, if that is open.
+def _one_response(send: Send) -> Send:
+    """Returns a `send` that ends an open response where a second one begins, and drops the rest.
 
-    When the server stops, the MCP library leaves an event stream open, and answers once more; so
-    it does after the whole response to a HEAD.
+    When the server stops, the MCP library leaves an event stream open, and answers once more. It
+    also answers twice to a HEAD.
     """
     has_begun = has_ended = False
 

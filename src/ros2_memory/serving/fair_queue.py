@@ -30,7 +30,7 @@ MOST_WAITING: Final = 256
 
 @dataclass(eq=False)
 class _Turn:
-    """That of a waiting query; `comes` is done when it may begin, or is refused."""
+    """The turn of a waiting query; `comes` is done when the query may begin, or is refused."""
 
     client: Hashable
     comes: asyncio.Future[None]
@@ -66,10 +66,9 @@ class FairQueue:
         self._threads.shutdown(wait=False)
 
     async def run(self, client: Hashable, query: Callable[[], T]) -> T:
-        """Waits for the client's turn, and returns what `query` returns.
+        """Waits for the client's turn, runs the query in a thread, and returns its result.
 
-        Where the caller is cancelled, its query leaves the queue. If it runs already, it goes on in
-        its thread.
+        If the caller is cancelled, its query leaves the queue; a running query goes on.
 
         Raises:
             BusyError: too many queries wait already, or the queue was stopped.
@@ -108,13 +107,13 @@ class FairQueue:
             raise
 
     def _make_room(self, client: Hashable) -> None:
-        """Refuses the newest query of the client that has most of them waiting.
+        """Refuses the newest waiting query of the client with most of them.
 
         Raises:
-            BusyError: that is the client that asks.
+            BusyError: this client would have most itself.
         """
         waiting = Counter(turn.client for turn in self._waiting)
-        most, count = waiting.most_common(1)[0]
+        [(most, count)] = waiting.most_common(1)
         refusal = BusyError(
             f"{MOST_WAITING} questions wait already; ask again when some are answered, and "
             "fewer at once"

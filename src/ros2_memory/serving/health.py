@@ -58,7 +58,7 @@ async def keep_fresh(
 ) -> None:
     """Scans the bag directory every `every_s` seconds, until it is cancelled.
 
-    `limiter`: of the threads for it; those for all background work where None.
+    `limiter` bounds the threads; without it they are those of all background work.
     """
     refresh = partial(refresh_logged, memory)
     while True:
@@ -91,11 +91,10 @@ class Health:
         self._queue.stop()
 
     async def __call__(self) -> JsonObject:
-        """Returns `ok`, or `degraded` with the reasons in `problems`.
+        """Returns `ok`, or `degraded` with the reasons in `problems`. Times are Unix seconds.
 
-        An empty memory is not a problem, and neither are topics that cannot be decoded, bags that a
-        crash left open, and bags that a wrong clock dated; they are counted. Times are Unix
-        seconds.
+        No problems are: an empty memory, topics that cannot be decoded, bags that a crash left open
+        and bags that a wrong clock dated. They are counted.
         """
         with anyio.move_on_after(TIMEOUT_S), suppress(BusyError):
             return await self._queue.run(None, self._report)
@@ -115,25 +114,25 @@ class FleetHealth:
             health.stop()
 
     async def __call__(self) -> JsonObject:
-        """Returns the report of each robot; `degraded` where one of them is.
+        """Returns the report of each robot; `degraded` if one of them is.
 
-        A robot that does not answer in time delays the report by `TIMEOUT_S`, whatever their
-        number.
+        Robots that do not answer in time delay the report by `TIMEOUT_S` in all.
         """
-        states = await asyncio.gather(*(health() for health in self._robots.values()))
-        reports = dict(zip(self._robots, states, strict=True))
-        problems = []
-        for name, report in reports.items():
-            if isinstance(of_robot := report.get("problems"), list):
-                problems += [f"{name}: {problem}" for problem in of_robot]
-        robots: JsonObject = {
-            name: {key: value for key, value in report.items() if key not in {"version", "pid"}}
-            for name, report in reports.items()
-        }
+        reports = await asyncio.gather(*(health() for health in self._robots.values()))
+        problems: list[str] = []
+        robots: JsonObject = {}
+        for name, report in zip(self._robots, reports, strict=True):
+            robot_problems = report.get("problems")
+            if isinstance(robot_problems, list):
+                problems += [f"{name}: {problem}" for problem in robot_problems]
+            robots[name] = {
+                key: value for key, value in report.items() if key not in {"version", "pid"}
+            }
         return _status(self._version, problems, {"robots": robots})
 
 
 def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:
+    """Returns what `/health` shows of one memory."""
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
     heartbeat = memory.heartbeat()
@@ -150,7 +149,7 @@ def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> J
         "latest": moment(dating.latest),
         "active": len(snapshot.active),
         **{fault: len(files) for fault, files in faulty.items()},
-        "gaps_last_hour": _gaps(memory, now),
+        "gaps_last_hour": _gaps_last_hour(memory, now),
         "index_age_s": seconds(now - snapshot.scanned_at),
     }
     foreign = memory.foreign(snapshot)
@@ -164,24 +163,24 @@ def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> J
                 for file in files[-NAMED:]
             ]
     if backfill is not None:
-        shown |= _stored(backfill)
+        shown |= _store_state(backfill)
         if backfill.filling is not None and backfill.filling.store.trouble is not None:
             trouble = backfill.filling.store.trouble
             problems.append(_short(f"the store of columns {trouble}; no answer depends on it"))
     if heartbeat is not None:
-        shown["recorder"] = _recorder(heartbeat, now)
+        shown["recorder"] = _recorder_state(heartbeat, now)
     return _status(version, problems, shown)
 
 
-def _gaps(memory: Memory, now: Ns) -> JsonObject:
+def _gaps_last_hour(memory: Memory, now: Ns) -> JsonObject:
     """Returns how often nothing was recorded in the last hour, and for how long in all."""
     view = View(memory, Call())
     gaps = [*unexcluded(view, recording_gaps(view, TimeWindow(now - _HOUR_NS, now)))]
     return {"count": len(gaps), "seconds": seconds(sum(end - start for start, end in gaps))}
 
 
-def _stored(backfill: Backfill) -> JsonObject:
-    """Returns how much is stored as columns, and what cannot be decoded."""
+def _store_state(backfill: Backfill) -> JsonObject:
+    """Returns how many bags are stored as columns, and which topics cannot be decoded."""
     shown: JsonObject = {}
     if backfill.filling is not None:
         progress, store = backfill.progress(), backfill.filling.store
@@ -206,7 +205,8 @@ def _stored(backfill: Backfill) -> JsonObject:
     return shown
 
 
-def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
+def _recorder_state(heartbeat: Heartbeat, now: Ns) -> JsonObject:
+    """Returns what the recorder last wrote about itself."""
     shown: JsonObject = {
         "state": str(heartbeat.state),
         "live": heartbeat.is_live(now),
@@ -235,10 +235,11 @@ def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
 
 
 def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
-    state: JsonObject = (
-        {"status": "degraded", "problems": [*problems]} if problems else {"status": "ok"}
-    )
-    return {**state, "version": version, "pid": os.getpid(), **shown}
+    """Returns a report: the status and its problems come before all that is `shown`."""
+    status: JsonObject = {"status": "ok"}
+    if problems:
+        status = {"status": "degraded", "problems": [*problems]}
+    return {**status, "version": version, "pid": os.getpid(), **shown}
 
 
 def _short(text: str) -> str:
@@ -248,7 +249,7 @@ def _short(text: str) -> str:
 def read_health(host: str, port: int, token: str) -> tuple[int, JsonObject]:
     """Returns the status and the reply of `/health`; an empty reply if it refuses the token.
 
-    Linux connects to the loopback address where `host` is that of all interfaces.
+    `host` may be that of all interfaces: Linux then connects to the loopback address.
 
     Raises:
         OSError: nothing answers.

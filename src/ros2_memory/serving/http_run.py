@@ -11,7 +11,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.serving.auth import MCP_PATH
 from ros2_memory.serving.connection_limits import ACCEPTED_AT_ONCE, BoundedConnection
-from ros2_memory.serving.listen import BACKLOG, Address, bound
+from ros2_memory.serving.listen import BACKLOG, Address, listen
 from ros2_memory.serving.web_app import STREAM_PATH
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def serve_http(
         access_log=False,
         timeout_graceful_shutdown=1,
     )
-    anyio.run(_Listener(config, dispatcher, when_listening).serve, [bound(at)])
+    anyio.run(_Listener(config, dispatcher, when_listening).serve, [listen(at)])
 
 
 class _Listener(uvicorn.Server):

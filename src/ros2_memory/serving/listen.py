@@ -37,8 +37,8 @@ class Address:
             return False
 
 
-def resolved(host: str, port: int) -> Address:
-    """Returns the address that a host resolves to; the IPv4 one where it has both kinds.
+def resolve(host: str, port: int) -> Address:
+    """Returns the address that a host resolves to; the IPv4 address if it has both kinds.
 
     Raises:
         CannotListenError: it resolves to none.
@@ -53,7 +53,7 @@ def resolved(host: str, port: int) -> Address:
     return Address(host, family, str(address[0]), port)
 
 
-def bound(address: Address) -> socket.socket:
+def listen(address: Address) -> socket.socket:
     """Returns a socket that listens on the address.
 
     Raises:

@@ -55,12 +55,12 @@ _OK: Final = 200
 _UNAVAILABLE: Final = 503
 
 
-def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
-    """Returns whether the recorder records, by what `/health` shows: 200, else 503.
+def _recording_response(report: JsonObject, *, shows_details: bool) -> JSONResponse:
+    """Returns 200 if the recorder records, by the report of `/health`; else 503.
 
     Also 503 while a topic of `recording.required` is not recorded as required, or a rule of
-    `recording.exclude_when` cannot be evaluated: nothing is served then of what is recorded, or it
-    is served against the rule. Other topics that are offered and not recorded are in `degraded`.
+    `recording.exclude_when` cannot be evaluated: then recorded data is withheld, or served against
+    the rule. Other topics that are offered and not recorded are in `degraded`.
     """
     reported = report.get("recorder")
     recorder = reported if isinstance(reported, dict) else {}
@@ -68,10 +68,14 @@ def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
     is_live, state = recorder.get("live", False), recorder.get("state")
     recording = is_live is True and state == "recording" and not any(faults.values())
     shown: JsonObject = {"recording": recording}
-    if all_of_it:
-        shown |= {"recorder": state, "recorder_alive": is_live}
-        shown |= {"waiting_for": recorder.get("waiting_for"), **faults}
-        shown |= {"degraded": recorder.get("degraded") or []}
+    if shows_details:
+        shown |= {
+            "recorder": state,
+            "recorder_alive": is_live,
+            "waiting_for": recorder.get("waiting_for"),
+            **faults,
+            "degraded": recorder.get("degraded") or [],
+        }
     return JSONResponse(shown, _OK if recording else _UNAVAILABLE)
 
 
@@ -91,30 +95,20 @@ def web_app(
     Args:
         server: answers `/sse`, `/messages/` and `/mcp`.
         host: the name or address that it listens on.
-        health: returns what `/health` shows.
+        health: returns the report of `/health`.
         background: runs from start to end of the application, and is cancelled then.
         api_token: demanded of every request, if there is one. Requests without it see only the
             status of `/health`, and the page, which holds no data and asks for it.
-        metrics: returns what `/metrics` shows; without it there is no such path.
-        page: where the page reads what it shows; None for a server without a page.
+        metrics: returns the text of `/metrics`; without it there is no such path.
+        page: the routes of the page's data; None for a server without a page.
         limited: other tokens, each with the robots of a fleet that it is for.
     """
     needs_token = api_token is not None or bool(limited)
     # `ForgeryGuard` checks all routes instead, and knows the addresses of a host such as 0.0.0.0.
-    guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
-    streams = server.sse_app(sse_path=STREAM_PATH, transport_security=guarded)
-    plain, streaming = (
-        _session_manager(server, guarded, json_response=json_response)
-        for json_response in (True, False)
-    )
-
-    async def show_health(request: Request) -> JSONResponse:
-        report = await health()
-        # Enough for a monitor that only watches that the server is up.
-        return JSONResponse(report if is_admitted(request.scope) else {"status": report["status"]})
-
-    async def show_recording(request: Request) -> JSONResponse:
-        return _recording(await health(), all_of_it=is_admitted(request.scope))
+    unguarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
+    streams = server.sse_app(sse_path=STREAM_PATH, transport_security=unguarded)
+    plain = _session_manager(server, unguarded, json_response=True)
+    streaming = _session_manager(server, unguarded, json_response=False)
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
@@ -127,17 +121,11 @@ def web_app(
     routes = [
         *streams.routes,
         Route(MCP_PATH, McpEndpoint(plain.handle_request, streaming.handle_request)),
-        Route(HEALTH_PATH, show_health, methods=["GET"]),
-        Route(RECORDING_PATH, show_recording, methods=["GET"]),
+        *_health_routes(health),
         *(page or ()),
     ]
     if metrics is not None:
-
-        async def show_metrics(_request: Request) -> Response:
-            exposition = await metrics()
-            return Response(exposition.body, headers={"content-type": exposition.content_type})
-
-        routes.append(Route(METRICS_PATH, show_metrics, methods=["GET"]))
+        routes.append(_metrics_route(metrics))
     app: ASGIApp = RequestLimits(Starlette(routes=routes, lifespan=lifespan))
     if needs_token:
         app = TokenGate(app, api_token, limited=limited)
@@ -147,29 +135,52 @@ def web_app(
     return ForgeryGuard(app, host, admits=not needs_token)
 
 
+def _health_routes(health: Callable[[], Awaitable[JsonObject]]) -> list[Route]:
+    """Returns `/health` and `/health/recording`; without a token they show a status alone."""
+
+    async def show_health(request: Request) -> JSONResponse:
+        report = await health()
+        # Enough for a monitor that only watches that the server is up.
+        return JSONResponse(report if is_admitted(request.scope) else {"status": report["status"]})
+
+    async def show_recording(request: Request) -> JSONResponse:
+        return _recording_response(await health(), shows_details=is_admitted(request.scope))
+
+    return [
+        Route(HEALTH_PATH, show_health, methods=["GET"]),
+        Route(RECORDING_PATH, show_recording, methods=["GET"]),
+    ]
+
+
+def _metrics_route(metrics: Callable[[], Awaitable[Exposition]]) -> Route:
+    async def show_metrics(_request: Request) -> Response:
+        exposition = await metrics()
+        return Response(exposition.body, headers={"content-type": exposition.content_type})
+
+    return Route(METRICS_PATH, show_metrics, methods=["GET"])
+
+
 def _session_manager(
     server: MCPServer[object], security: TransportSecuritySettings, *, json_response: bool
 ) -> StreamableHTTPSessionManager:
-    """Returns what answers streamable HTTP without keeping sessions."""
+    """Returns a handler of streamable HTTP that keeps no sessions."""
     server.streamable_http_app(
         stateless_http=True, json_response=json_response, transport_security=security
     )
-    # The library keeps the newest one alone.
+    # The call above has made it: the library keeps the newest one alone.
     return server.session_manager
 
 
 @dataclass
 class McpEndpoint:
-    """Answers streamable HTTP: by JSON, or by an event stream where a client wants progress.
+    """Answers streamable HTTP: by JSON, or by an event stream if a client wants progress.
 
     A reply by JSON is one message, so notifications have no place in it. `RequestLimits` has read
     the body, so the first message holds all of it.
 
-    It names each conversation, for clients that require a session: a server may name one in its
-    reply to `initialize`, and clients then send that name along (MCP specification, streamable
-    HTTP, session management). Nothing is stored under it: a call needs no earlier one. Names of
-    before a restart, of another server, or none at all are answered alike, and clients that never
-    end their session cost nothing.
+    It names a session in its reply to `initialize`, for clients that require one; they send that
+    name along then (MCP specification, streamable HTTP, session management). Nothing is stored
+    under it: a call needs no earlier one, and any name or none is answered alike.
     """
 
     _plain: ASGIApp
@@ -183,17 +194,17 @@ class McpEndpoint:
         headers = Headers(scope=scope)
         unread = [await receive()]
         body = unread[0].get("body", b"")
-        begins = _SESSION_HEADER not in headers and _INITIALIZE in body
+        begins_session = _SESSION_HEADER not in headers and _INITIALIZE in body
 
         async def receive_again() -> Message:
             return unread.pop() if unread else await receive()
 
-        async def send_named(message: Message) -> None:
+        async def send_with_session(message: Message) -> None:
             is_start = message["type"] == "http.response.start"
-            if begins and is_start and message["status"] == _OK:
+            if begins_session and is_start and message["status"] == _OK:
                 MutableHeaders(scope=message)[_SESSION_HEADER] = uuid.uuid4().hex
             await send(message)
 
-        streams = _EVENTS in headers.get("accept", "") and _PROGRESS in body
-        app = self._streaming if streams else self._plain
-        await app(scope, receive_again, send_named)
+        wants_progress = _EVENTS in headers.get("accept", "") and _PROGRESS in body
+        app = self._streaming if wants_progress else self._plain
+        await app(scope, receive_again, send_with_session)

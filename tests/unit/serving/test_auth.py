@@ -26,7 +26,7 @@ from ros2_memory.serving.auth import (
     is_admitted,
     take_token,
 )
-from ros2_memory.serving.listen import CannotListenError, bound, resolved
+from ros2_memory.serving.listen import CannotListenError, listen, resolve
 
 GOOD = "kJ7-x._~+/0123456789=="
 
@@ -268,17 +268,17 @@ def test_in_a_file_of_the_configuration_it_is_refused_and_not_repeated(tmp_path:
     ],
 )
 def test_whether_others_can_reach_it_is_judged_by_the_address(host: str, loopback: bool) -> None:
-    assert resolved(host, 9203).is_loopback is loopback
+    assert resolve(host, 9203).is_loopback is loopback
 
 
 @pytest.mark.parametrize("host", ["nosuch.invalid", "a" * 300, "..", "robot lan"])
 def test_a_host_without_an_address_is_told_with_what_to_do(host: str) -> None:
     with pytest.raises(CannotListenError, match="give an address of this machine with MCP_HOST"):
-        resolved(host, 9203)
+        resolve(host, 9203)
 
 
 def test_what_is_judged_is_what_is_listened_on() -> None:
-    address = resolved("localhost", 0)
-    with bound(address) as listening:
+    address = resolve("localhost", 0)
+    with listen(address) as listening:
         assert listening.getsockname()[0] == address.ip
         assert listening.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
