@@ -29,11 +29,11 @@ from ros2_memory.serving.page import drawn_path, span
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import (
-    box_asked,
-    moment_asked,
+    moment_reply,
     page_routes,
+    requested_box,
+    requested_window,
     span_request,
-    window_asked,
 )
 from ros2_memory.serving.page.span import span_shown
 from ros2_memory.serving.page.topics import labels_shown, topics_shown
@@ -49,7 +49,7 @@ S = NS_PER_S
 BEGIN = 1_784_000_000 * S
 BEGIN_S = 1_784_000_000
 NOTHING: Any = None
-moment_of = partial(moment_asked, memory=NOTHING, call=NOTHING)
+moment_of = partial(moment_reply, memory=NOTHING, call=NOTHING)
 
 
 @pytest.fixture(scope="module")
@@ -192,10 +192,10 @@ def test_what_is_wrong_with_a_signal_is_said_and_costs_no_other(
         (span_request, "last=nan", "last must be a number of seconds"),
         (span_request, "signal=odom", "/topic:field"),
         (span_request, "&".join(f"signal=/t:{n}" for n in range(9)), "at most 4"),
-        (window_asked, "start=1", "give start"),
-        (window_asked, "start=2&end=1", "give start"),
-        (box_asked, "x0=0&y0=0&x1=1&y1=1", "give x0"),
-        (box_asked, "x0=0&y0=0&x1=1&y1=1&pixel=-1", "give x0"),
+        (requested_window, "start=1", "give start"),
+        (requested_window, "start=2&end=1", "give start"),
+        (requested_box, "x0=0&y0=0&x1=1&y1=1", "give x0"),
+        (requested_box, "x0=0&y0=0&x1=1&y1=1&pixel=-1", "give x0"),
         (moment_of, "label=cup", "give t, or start and end"),
         (moment_of, f"t=1&label={'x' * 201}", "longer than"),
     ],
@@ -368,7 +368,7 @@ async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes
 
 
 def topics(memory: Memory, query: str) -> Any:
-    return received(topics_shown(memory, Call(), window_asked(QueryParams(query))))
+    return received(topics_shown(memory, Call(), requested_window(QueryParams(query))))
 
 
 def test_topics_have_their_rate_when_they_spoke_and_their_numbers(memory: Memory) -> None:

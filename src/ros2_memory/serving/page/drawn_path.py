@@ -1,8 +1,8 @@
-"""The path as it was driven, for the part of the map that is looked at.
+"""The path as it was driven, for the part of the map that is on the screen.
 
-The first look has the robot's track, of which a pose may be 5 cm off, and of a long span some of
-its points. Here every pose in a box of the map counts: none lies farther from the lines than half
-a pixel of the screen.
+The first look has the robot's track: its lines may pass a pose by 5 cm, and of a long span it has
+only some points. Here every pose in a box of the map counts: none lies farther from the lines than
+half a pixel of the screen.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 MOST_POINTS: Final = 20_000
 _MOST_PIXELS: Final = 20_000_000
-"""A path that passes more, as where it jumps far, is not searched for what it repeats."""
+"""In a longer path, as one that jumps far, repeated pixels are not searched for."""
 _QUICK_S: Final = 2.0
 _WHERE_LISTED: Final = "; list_recorded_topics lists all"
 _TOGETHER_NS: Final = 5 * NS_PER_S
-"""A robot that leaves the box for less is read on: reading begins anew for each stretch."""
+"""A robot may leave the box for this long within one stretch: each stretch is read separately."""
 
 
 class Box(NamedTuple):
@@ -53,37 +53,44 @@ class Box(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Points of a path in order of time; `begins`: whether no line leads to a point."""
+    """Points of a path in order of time. `begins` marks the points that no line leads to."""
 
     times: Ints
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     begins: Flags
 
-    def some(self, kept: NDArray[np.intp]) -> Line:
+    def select(self, points: NDArray[np.intp]) -> Line:
         """Returns the points with these indices."""
-        return Line(self.times[kept], self.x[kept], self.y[kept], self.begins[kept])
+        return Line(self.times[points], self.x[points], self.y[points], self.begins[points])
 
     def simplified(self, tolerance_m: float, at_most: int) -> NDArray[np.intp]:
-        """Returns the indices of at most so many points, from whose lines no other is farther."""
+        """Returns the indices of at most `at_most` points.
+
+        No other point is farther than `tolerance_m` from the lines between them, as far as
+        `at_most` allows. The ends of lines are among them.
+        """
         count = len(self.times)
         if count < 3:
             return np.arange(count)
-        are_ends = self.begins | np.append(self.begins[1:], [True])
-        are_ends[0] = True
-        ends = np.flatnonzero(are_ends)
+        is_end = self.begins | np.append(self.begins[1:], [True])
+        is_end[0] = True
+        ends = np.flatnonzero(is_end)
         points = np.stack([self.x, self.y, np.zeros(count)], axis=1)
-        clock = (self.times - self.times[0]) / NS_PER_S
-        must = ends[evenly(len(ends), at_most)]
-        kept, _ = simplified(points, clock, must, tolerance_m=tolerance_m, at_most=at_most)
-        return kept
+        clock_s = (self.times - self.times[0]) / NS_PER_S
+        ends = ends[evenly(len(ends), at_most)]
+        indices, _ = simplified(points, clock_s, ends, tolerance_m=tolerance_m, at_most=at_most)
+        return indices
 
 
 class RobotPath(NamedTuple):
-    """The robot's track in a window, in a frame.
+    """The robot's track in a window.
 
-    `is_whole`: whether there was time for all of it. `reader` has each pose; None where it is of a
-    satellite receiver.
+    Attributes:
+        frame: of the track.
+        track: the track.
+        is_whole: False if there was not time for all of it.
+        reader: reads each pose; None if the track comes from a satellite receiver.
     """
 
     frame: str
@@ -99,9 +106,9 @@ class RobotPath(NamedTuple):
 
 
 def robot_path(view: View, window: TimeWindow) -> RobotPath | None:
-    """Returns the robot's path in the map, else in the frame of odometry, or by its receiver.
+    """Returns the robot's path in the map, else in the frame of odometry, else by its receiver.
 
-    None where no topic places it.
+    None if no topic places the robot.
 
     Raises:
         QueryTimeoutError: the call's time is over before any of it is known.
@@ -111,13 +118,15 @@ def robot_path(view: View, window: TimeWindow) -> RobotPath | None:
         local = local_track(view, view.pose_topic, window)
         return None if local is None else RobotPath(*local, is_whole=True, reader=None)
     reader = TrackReader(view, places.map_frame)
-    # With what was just before, to know whether the path goes on from there.
+    # From a little earlier on, to know whether the path continues into the window.
     known = reader.track_in(TimeWindow(window.start - SILENCE_NS, window.stop))
     return RobotPath(places.map_frame, cut_track(known.track, window), known.since is None, reader)
 
 
 def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> JsonObject:
-    """Returns the path in a window where it passes a box, and whether every pose there counted.
+    """Returns the path in a window where it passes a box, as columns of points.
+
+    `exact` tells whether every pose in the box counted.
 
     Raises:
         NoDataError: no topic places the robot.
@@ -139,7 +148,7 @@ def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> Jso
 def line_in_box(
     memory: Memory, call: Call, window: TimeWindow, box: Box
 ) -> tuple[RobotPath, Line, bool]:
-    """Returns the robot's path, it as drawn in a box, and whether every pose there counted.
+    """Returns the robot's path, the line to draw in a box, and whether every pose there counted.
 
     Raises:
         NoDataError: no topic places the robot.
@@ -153,17 +162,23 @@ def line_in_box(
     lines: list[Line] = []
     is_exact = path.reader is None or box.pixel_m >= TOLERANCE_M
     if path.reader is not None and not is_exact:
-        lines = [*_every_pose(path.reader, path.track, stretches)]
+        lines = [*_lines_of_poses(path.reader, path.track, stretches)][::-1]
         is_exact = len(lines) == len(stretches)
-    older = []
-    for first, last in stretches[: len(stretches) - len(lines)]:
-        begins = np.arange(last + 1 - first) == 0
-        older.append(path.line.some(np.arange(first, last + 1))._replace(begins=begins))
-    return path, _drawn(_joined([*older, *lines[::-1]]), box.pixel_m), is_exact
+    # The track stands in for the older stretches whose poses there was no time to read.
+    older = [
+        _one_line(path.line.select(np.arange(first, last + 1)))
+        for first, last in stretches[: len(stretches) - len(lines)]
+    ]
+    return path, _draw(_concatenate([*older, *lines]), box.pixel_m), is_exact
+
+
+def _one_line(line: Line) -> Line:
+    """Returns the points as one line from the first to the last."""
+    return line._replace(begins=np.arange(len(line.times)) == 0)
 
 
 def why_no_path(view: View) -> str:
-    """Returns why no topic places the robot, and which setting gives a path."""
+    """Returns why no topic places the robot, and which setting would give a path."""
     try:
         return f"{resolve_pose_topic(view)} has no poses"
     except NoDataError as error:
@@ -171,60 +186,57 @@ def why_no_path(view: View) -> str:
 
 
 def stretches_inside(track: RobotTrack, box: Box) -> Iterator[tuple[int, int]]:
-    """Yields the first and the last vertex of each stretch of a track that may pass a box."""
-    low_x, high_x = _bounds(track.x)
-    low_y, high_y = _bounds(track.y)
-    room = TOLERANCE_M + box.pixel_m
-    inside = (low_x <= box.x1 + room) & (high_x >= box.x0 - room) & ~track.begins[1:]
-    inside &= (low_y <= box.y1 + room) & (high_y >= box.y0 - room)
-    steps = np.flatnonzero(inside)
-    begins = track.times[steps[1:]] - track.times[steps[:-1] + 1] > _TOGETHER_NS
-    begins |= np.cumsum(track.begins)[steps[1:]] != np.cumsum(track.begins)[steps[:-1]]
-    for piece in np.split(steps, np.flatnonzero(begins) + 1):
-        if len(piece):
-            yield int(piece[0]), int(piece[-1]) + 1
+    """Yields the first and the last point of each stretch of a track that may pass a box."""
+    margin = TOLERANCE_M + box.pixel_m
+    may_pass = ~track.begins[1:]  # for each step from a point to the next
+    for values, low, high in ((track.x, box.x0, box.x1), (track.y, box.y0, box.y1)):
+        may_pass &= np.minimum(values[1:], values[:-1]) <= high + margin
+        may_pass &= np.maximum(values[1:], values[:-1]) >= low - margin
+    steps = np.flatnonzero(may_pass)
+    line_of = np.cumsum(track.begins)[steps]
+    is_apart = track.times[steps[1:]] - track.times[steps[:-1] + 1] > _TOGETHER_NS
+    is_apart |= line_of[1:] != line_of[:-1]
+    for stretch in np.split(steps, np.flatnonzero(is_apart) + 1):
+        if len(stretch):
+            yield int(stretch[0]), int(stretch[-1]) + 1
 
 
-def _bounds(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return np.minimum(values[1:], values[:-1]), np.maximum(values[1:], values[:-1])
-
-
-def _every_pose(
+def _lines_of_poses(
     tracks: TrackReader, track: RobotTrack, stretches: Sequence[tuple[int, int]]
 ) -> Iterator[Line]:
-    """Yields a line through each pose of a stretch, the newest stretch first, while time lasts."""
+    """Yields a line through all poses of each stretch, the newest first, while time lasts."""
     for first, last in reversed(stretches):
         start, stop = int(track.times[first]), int(track.times[last]) + 1
         try:
             poses = tracks.poses(TimeWindow(start, stop))
         except QueryTimeoutError:
             return
-        fine = np.isfinite(poses.x) & np.isfinite(poses.y)
-        times, at = np.unique(poses.times[fine], return_index=True)
-        begins = np.arange(len(times)) == 0
-        yield Line(times, poses.x[fine][at], poses.y[fine][at], begins)
+        is_finite = np.isfinite(poses.x) & np.isfinite(poses.y)
+        times, rows = np.unique(poses.times[is_finite], return_index=True)
+        x, y = poses.x[is_finite][rows], poses.y[is_finite][rows]
+        yield _one_line(Line(times, x, y, np.zeros(len(times), np.bool_)))
 
 
-def _joined(lines: Sequence[Line]) -> Line:
+def _concatenate(lines: Sequence[Line]) -> Line:
     nothing = Line(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
     return Line(*(np.concatenate(column) for column in zip(nothing, *lines, strict=True)))
 
 
-def _drawn(line: Line, pixel_m: float) -> Line:
-    """Returns a line without what lies within half a pixel of it, or was drawn already.
+def _draw(line: Line, pixel_m: float) -> Line:
+    """Returns a line of at most `MOST_POINTS` points, within half a pixel of all points.
 
-    Of a path that takes too many points for that, it is as many pixels as it must be.
+    If that takes more points, pixels are made larger until it does not.
     """
     while True:
-        simple = line.some(line.simplified(pixel_m / 2, max(len(line.times), 1)))
-        few = _without_repeats(simple, pixel_m)
-        if len(few.times) <= MOST_POINTS:
-            return few
+        points = line.simplified(pixel_m / 2, max(len(line.times), 1))
+        drawn = _without_repeats(line.select(points), pixel_m)
+        if len(drawn.times) <= MOST_POINTS:
+            return drawn
         pixel_m *= 2
 
 
 def _without_repeats(line: Line, pixel_m: float) -> Line:
-    """Returns a line without the steps of which each pixel was drawn by others."""
+    """Returns a line without the steps whose pixels are all drawn by earlier steps."""
     if len(line.times) <= MOST_POINTS:
         return line
     dx, dy = np.diff(line.x), np.diff(line.y)
@@ -232,13 +244,15 @@ def _without_repeats(line: Line, pixel_m: float) -> Line:
     counts[line.begins[1:]] = 0
     if counts.sum() > _MOST_PIXELS:
         return line
-    part = np.repeat(np.arange(len(counts)), counts)
-    share = (np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[part]
-    cells = np.stack([line.x[part] + dx[part] * share, line.y[part] + dy[part] * share]) // pixel_m
-    row, column = (cells - cells.min(axis=1, keepdims=True)).astype(np.int64)
+    # One row for each pixel of each step.
+    step = np.repeat(np.arange(len(counts)), counts)
+    nth = np.arange(len(step)) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = nth / counts[step]
+    pixels = np.stack([line.x[step] + dx[step] * share, line.y[step] + dy[step] * share]) // pixel_m
+    row, column = (pixels - pixels.min(axis=1, keepdims=True)).astype(np.int64)
     _, first = np.unique(row * (int(column.max(initial=0)) + 1) + column, return_index=True)
-    drawn = np.zeros(len(counts), np.bool_)
-    drawn[part[first]] = True
-    kept = np.append(drawn, [False]) | np.append([False], drawn)
-    # A line leads to a point alone where that step is drawn.
-    return line._replace(begins=~np.append([False], drawn)).some(np.flatnonzero(kept))
+    is_drawn = np.zeros(len(counts), np.bool_)
+    is_drawn[step[first]] = True
+    is_needed = np.append(is_drawn, [False]) | np.append([False], is_drawn)
+    begins = ~np.append([False], is_drawn)
+    return line._replace(begins=begins).select(np.flatnonzero(is_needed))

@@ -1,4 +1,4 @@
-"""What the page shows of a moment, of a stretch of time, and of a label that was seen in it."""
+"""The page's data about a moment, about a stretch of time, and about a label seen in it."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ AROUND_S: Final = 1.0
 MOST_SEEN: Final = 60
 MOST_SIGHTINGS: Final = 30
 _CHANGES_S: Final = 10.0
+"""How long before a moment a change is shown."""
 _IN_VIEW: Final = " in view"
 _CHANGE: Final = keys("text", TENTHS_OF_S("before_s", "before"))
 
@@ -75,7 +76,7 @@ def stretch_shown(memory: Memory, call: Call, start_s: float, end_s: float) -> J
 
 
 def _seen(summary: Recap) -> list[JsonValue]:
-    """Returns what was in view, each label once: first what was all the time."""
+    """Returns the labels in view, each once; first those that were in view all the time."""
     rows: dict[str, JsonObject] = {label: {"label": label} for label in summary.throughout}
     for event in summary.events:
         label = event.text.removesuffix(_IN_VIEW)
@@ -101,7 +102,7 @@ def sightings_shown(
     ]
     rows: list[JsonObject] = []
     notes: list[str] = []
-    total: int | None = 0
+    total: int | None = 0  # None when one of them is not known
     for topic in detectors:
         sightings = find_matches(
             memory,

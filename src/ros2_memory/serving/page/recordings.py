@@ -1,4 +1,4 @@
-"""One recording of many, for the page: which there are, and a memory that holds one alone."""
+"""The page's choice of a recording: their list, and a memory of one alone."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ MOST_RECORDINGS: Final = 300
 MOST_PATHS: Final = 6
 """Colours that can be told apart on one map."""
 _MOST_MEMORIES: Final = 16
-"""Recordings that pages look at and that stay at hand."""
+"""Memories of single recordings that are cached."""
 
 
 class Recordings:
-    """The recordings of a memory, and a memory for each that is looked at. Thread-safe."""
+    """The recordings of a memory, and a memory for each that a page looks at. Thread-safe."""
 
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
-        self._narrowed = lru_cache(_MOST_MEMORIES)(partial(_narrowed, memory))
+        self._memory_of = lru_cache(_MOST_MEMORIES)(partial(_memory_of, memory))
 
     def alone(self, name: str) -> Memory:
-        """Returns a memory that holds one recording, or those of one folder, and nothing else.
+        """Returns the memory of one recording, or of the recordings in one folder.
 
         Raises:
-            InvalidArgumentsError: none is named so.
+            InvalidArgumentsError: there is no recording or folder of this name.
         """
-        alone = self._narrowed(name)
+        alone = self._memory_of(name)
         snapshot = alone.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
             near = similar(name, [str(row["name"]) for row in self._list()])
@@ -58,7 +58,7 @@ class Recordings:
         return alone
 
     def shown(self, chosen: Memory, call: Call) -> JsonObject:
-        """Returns the recordings, newest first, and where robots are mixed in what is chosen."""
+        """Returns the recordings, newest first, and notes on mixed robots in the chosen memory."""
         rows = self._list()
         return {
             "recordings": [*rows[:MOST_RECORDINGS]],
@@ -67,10 +67,10 @@ class Recordings:
         }
 
     def paths(self, chosen: Memory, call: Call, window: TimeWindow) -> JsonObject:
-        """Returns a path for each robot, where recordings are plainly of several; else none.
+        """Returns a path for each robot if recordings are plainly of several robots; else none.
 
-        Each is of one recording, or of a folder of recordings that do not overlap each other.
-        Of more than `MOST_PATHS` the newest are there; in order of name.
+        A robot is one recording, or a folder of recordings that do not overlap each other. The
+        newest `MOST_PATHS` robots have a path, by name.
         """
         names = _robots(chosen, call, window)
         robot_paths: list[JsonValue] = []
@@ -79,12 +79,13 @@ class Recordings:
                 alone = self.alone(name)
                 limits = replace(alone.limits, pose_topic=chosen.limits.pose_topic)
                 path = path_in(replace(alone, limits=limits), call, window)
+            except QueryTimeoutError as error:
+                robot_paths.append({"name": name, "error": str(error), "late": True})
             except EpisodicError as error:
-                late = {"late": True} if isinstance(error, QueryTimeoutError) else {}
-                robot_paths.append({"name": name, "error": str(error), **late})
-                continue
-            if path is not None:
-                robot_paths.append({"name": name, **path})
+                robot_paths.append({"name": name, "error": str(error)})
+            else:
+                if path is not None:
+                    robot_paths.append({"name": name, **path})
         return {"paths": robot_paths, "paths_left_out": len(names[MOST_PATHS:])}
 
     def _list(self) -> list[JsonObject]:
@@ -92,7 +93,7 @@ class Recordings:
         return _rows(index.published or index.snapshot(), str(index.bag_dir))
 
 
-def _narrowed(memory: Memory, name: str) -> Memory:
+def _memory_of(memory: Memory, name: str) -> Memory:
     """Returns a memory of one recording: its ages count from its newest message.
 
     It has neither a recorder nor a budget.
@@ -103,51 +104,64 @@ def _narrowed(memory: Memory, name: str) -> Memory:
 
 
 def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
-    """Returns recordings, and the folders of the bag directory that hold several of them."""
+    """Returns the recordings, and the folders that have several; the newest first."""
     by_name = {name_of(path, bags, root): bags for path, bags in recordings_of(snapshot).items()}
-    folders: dict[str, list[list[BagFile]]] = {}
+    rows: list[JsonObject] = []
+    bags_by_folder: dict[str, list[list[BagFile]]] = {}
     for name, bags in by_name.items():
-        if "/" in name and not is_kept_apart(name):
-            folders.setdefault(name.partition("/")[0], []).append(bags)
-    rows = [_row(name, bags) for name, bags in by_name.items()]
-    for folder, inside in folders.items():
-        if len(inside) > 1 and folder not in by_name:
-            rows.append({**_row(folder, [*chain.from_iterable(inside)]), "holds": len(inside)})
+        rows.append(_row(name, bags))
+        folder = _folder(name)
+        if folder not in by_name:
+            bags_by_folder.setdefault(folder, []).append(bags)
+    for folder, recordings in bags_by_folder.items():
+        if len(recordings) > 1:
+            row = _row(folder, [*chain.from_iterable(recordings)])
+            rows.append({**row, "holds": len(recordings)})
     return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
 
 
 def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
-    """Returns the names under which the robots of a window are found, if there are several.
+    """Returns the names of robots in a window, the newest first; none unless there are several.
 
-    Some of their recordings overlap in time, or have frames of other robots. A folder is one, but
-    for one whose own recordings overlap: there each recording is. The newest come first.
+    There are several if recordings overlap in time, or have contradicting frames. A folder of
+    recordings is one robot. If its recordings overlap each other, each recording is one.
     """
     root, ends = str(memory.index.bag_dir), dict[str, Ns]()
     for path, bags in recordings_of(memory.index.snapshot()).items():
         if any(bag.reaches_into(window) for bag in bags):
             ends[name_of(path, bags, root)] = max(bag.end for bag in bags)
-    present = {*map(_folder, ends)}
-    unlike = (
-        {_folder(path.removeprefix(f"{root}/")) for path in contradiction.recordings}
-        for contradiction in contradicting_frames(memory, call)
-    )
-    overlaps = [
-        {_folder(str(path).removeprefix(f"{root}/")) for path in (pair.first, pair.second)}
-        for pair, topic in mixed_recordings(memory, call)
-        if topic is not None and window.overlaps(pair.start, pair.end)
-    ]
-    if not overlaps and not any(len(pair) > 1 and pair <= present for pair in unlike):
+    is_mixed = False
+    folders_with_overlaps: set[str] = set()
+    for pair, topic in mixed_recordings(memory, call):
+        if topic is not None and window.overlaps(pair.start, pair.end):
+            is_mixed = True
+            first, second = (
+                _folder(str(path).removeprefix(f"{root}/")) for path in (pair.first, pair.second)
+            )
+            if first == second:
+                folders_with_overlaps.add(first)
+    if not is_mixed and not _has_contradictions(memory, call, {*map(_folder, ends)}):
         return []
-    split = {folder for pair in overlaps if len(pair) == 1 for folder in pair}
     robots: dict[str, Ns] = {}
     for name, end in ends.items():
-        robot = name if _folder(name) in split else _folder(name)
+        folder = _folder(name)
+        robot = name if folder in folders_with_overlaps else folder
         robots[robot] = max(end, robots.get(robot, end))
     return sorted(robots, key=lambda robot: (robots[robot], robot), reverse=True)
 
 
+def _has_contradictions(memory: Memory, call: Call, folders: set[str]) -> bool:
+    """Returns whether recordings in different ones of these folders have contradicting frames."""
+    root = str(memory.index.bag_dir)
+    for contradiction in contradicting_frames(memory, call):
+        involved = {_folder(path.removeprefix(f"{root}/")) for path in contradiction.recordings}
+        if len(involved) > 1 and involved <= folders:
+            return True
+    return False
+
+
 def _folder(name: str) -> str:
-    """Returns the folder of the bag directory that holds a recording, or the recording itself."""
+    """Returns the folder of the bag directory that has a recording, or the recording itself."""
     return name if is_kept_apart(name) else name.partition("/")[0]
 
 

@@ -1,11 +1,11 @@
 """The endpoints of the page: GETs that return JSON.
 
-`/page/span` is the first look, `/page/moment` a time or a tool, `/page/topics` and `/page/labels`
-list what a span has of them, and `/page/path` is the path in a part of the map.
-They answer from the same queries as the tools, in the queue of the tools that may take long. With
-`recording=NAME` they answer from that recording alone, with `poses=TOPIC` the robot is where that
-topic has it. `/page/moment` also takes `tool=NAME` and its `arguments` as JSON; a tool that writes
-is refused.
+- `/page/span` is the first look, `/page/moment` a time, `/page/path` the path in a part of the map;
+  `/page/topics` and `/page/labels` list the topics and the labels of a span.
+- They answer from the same queries as the tools, in the queue of the tools that may take long.
+- With `recording=NAME` they answer from that recording alone. With `poses=TOPIC` that topic places
+  the robot.
+- `/page/moment` also takes `tool=NAME` and its `arguments` as JSON; a tool that writes is refused.
 """
 
 from __future__ import annotations
@@ -59,61 +59,93 @@ _LONGEST_ARGUMENTS: Final = 10_000
 def page_routes(
     dispatcher: Dispatcher, progress: Callable[[], Progress] | None = None
 ) -> list[Route]:
-    """Returns the routes of the page; `progress`: how far the store of columns is filled."""
-    memory = dispatcher.memory
-    recordings = Recordings(memory)
+    """Returns the routes of the page; `progress` tells how far the store of columns is filled."""
+    page = _PageData(dispatcher, progress)
+    return [
+        page.route(SPAN_PATH, page.span),
+        page.route(MOMENT_PATH, moment_reply),
+        page.route("/page/topics", _topics),
+        page.route("/page/labels", _labels),
+        page.route("/page/path", _path),
+    ]
 
-    def chosen(given: QueryParams) -> Memory:
-        """Returns the part of the memory that is asked, in which its `poses` place the robot."""
-        name = _short(given, "recording", _LONGEST_NAME)
-        part = recordings.alone(name) if name else memory
-        topic = _short(given, "poses", _LONGEST_NAME)
-        return replace(part, limits=replace(part.limits, pose_topic=topic)) if topic else part
 
-    def span(given: QueryParams, part: Memory, call: Call) -> JsonObject:
-        shown = span_shown(part, call, span_request(given), progress, dispatcher.questions)
-        if "status" in shown:
-            shown |= recordings.shown(part, call)
-            shown |= {"memory": named(memory)} if given.get("named") == "1" else {}
-        if shown.get("mixed") and "path" in shown:
-            window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
-            shown |= recordings.paths(part, call, window)
-        return shown
+class _PageData:
+    """Answers the requests of the page from a memory, or from one of its recordings."""
 
-    def route(path: str, work: _Work) -> Route:
+    def __init__(self, dispatcher: Dispatcher, progress: Callable[[], Progress] | None) -> None:
+        self._dispatcher = dispatcher
+        self._progress = progress
+        self._memory = dispatcher.memory
+        self._recordings = Recordings(dispatcher.memory)
+
+    def route(self, path: str, work: _Work) -> Route:
+        """Returns the route of a path whose replies `work` makes."""
+
         async def answer(request: Request) -> Response:
-            client = request.client.host if request.client else None
             given = request.query_params
-            if path != MOMENT_PATH or "tool" not in given:
-                reply = await dispatcher.look(lambda call: work(given, chosen(given), call), client)
-            else:
-                try:
-                    arguments = tool_arguments(given)
-                except InvalidArgumentsError as error:
-                    return Response(f"{error}\n", 400, headers=_HEADERS)
-                reply = await dispatcher.answer(
-                    given["tool"], arguments, client, for_page=True, part=partial(chosen, given)
-                )
-            return Response(reply.text, media_type="application/json", headers=_HEADERS)
+            client = request.client.host if request.client else None
+            if path == MOMENT_PATH and "tool" in given:
+                return await self._call_tool(given, client)
+            reply = await self._dispatcher.look(
+                lambda call: work(given, self._part(given), call), client
+            )
+            return _json_response(reply.text)
 
         return Route(path, answer, methods=["GET"])
 
-    parts: dict[str, _Work] = {
-        SPAN_PATH: span,
-        MOMENT_PATH: moment_asked,
-        "/page/topics": lambda given, part, call: topics_shown(part, call, window_asked(given)),
-        "/page/labels": lambda given, part, call: labels_shown(part, call, window_asked(given)),
-        "/page/path": lambda given, part, call: path_in_box(
-            part, call, window_asked(given), box_asked(given)
-        ),
-    }
-    return [route(path, work) for path, work in parts.items()]
+    async def _call_tool(self, given: QueryParams, client: str | None) -> Response:
+        try:
+            arguments = tool_arguments(given)
+        except InvalidArgumentsError as error:
+            return Response(f"{error}\n", 400, headers=_HEADERS)
+        part = partial(self._part, given)
+        reply = await self._dispatcher.answer(
+            given["tool"], arguments, client, for_page=True, part=part
+        )
+        return _json_response(reply.text)
+
+    def _part(self, given: QueryParams) -> Memory:
+        """Returns the memory of the `recording`, or all, in which `poses` place the robot."""
+        name = _short(given, "recording", _LONGEST_NAME)
+        part = self._recordings.alone(name) if name else self._memory
+        topic = _short(given, "poses", _LONGEST_NAME)
+        return replace(part, limits=replace(part.limits, pose_topic=topic)) if topic else part
+
+    def span(self, given: QueryParams, part: Memory, call: Call) -> JsonObject:
+        """Returns the reply of `/page/span`."""
+        questions = self._dispatcher.questions
+        shown = span_shown(part, call, span_request(given), self._progress, questions)
+        if "status" in shown:
+            shown |= self._recordings.shown(part, call)
+            if given.get("named") == "1":
+                shown["memory"] = memory_name(self._memory)
+        if shown.get("mixed") and "path" in shown:
+            window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
+            shown |= self._recordings.paths(part, call, window)
+        return shown
 
 
-def named(memory: Memory) -> JsonObject:
-    """Returns the name of a memory for people, and where its folder is.
+def _topics(given: QueryParams, part: Memory, call: Call) -> JsonObject:
+    return topics_shown(part, call, requested_window(given))
 
-    Of a robot that records here it is the machine's name, else the folder's.
+
+def _labels(given: QueryParams, part: Memory, call: Call) -> JsonObject:
+    return labels_shown(part, call, requested_window(given))
+
+
+def _path(given: QueryParams, part: Memory, call: Call) -> JsonObject:
+    return path_in_box(part, call, requested_window(given), requested_box(given))
+
+
+def _json_response(text: str) -> Response:
+    return Response(text, media_type="application/json", headers=_HEADERS)
+
+
+def memory_name(memory: Memory) -> JsonObject:
+    """Returns the name of a memory for people, and its folder.
+
+    The name is that of the machine if it records here, else that of the folder.
     """
     folder = memory.index.bag_dir.resolve()
     is_robot = memory.limits.kept is not None
@@ -121,7 +153,7 @@ def named(memory: Memory) -> JsonObject:
 
 
 def span_request(given: QueryParams) -> SpanRequest:
-    """Returns what a query string asks of `/page/span`.
+    """Returns the request to `/page/span` in a query string.
 
     Raises:
         InvalidArgumentsError: a number or a signal is invalid, or there are too many signals.
@@ -144,10 +176,10 @@ def span_request(given: QueryParams) -> SpanRequest:
     )
 
 
-def moment_asked(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
-    """Returns what `/page/moment` shows: of `t`, or of the stretch from `start` to `end`.
+def moment_reply(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
+    """Returns the reply of `/page/moment` about `t`, or about the time from `start` to `end`.
 
-    With a `label`, only its sightings in the stretch.
+    With a `label`, its sightings in that time alone.
 
     Raises:
         InvalidArgumentsError: a number is invalid, the label is too long, or no time is given.
@@ -165,32 +197,33 @@ def moment_asked(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
     return stretch_shown(memory, call, start_s, end_s)
 
 
-def window_asked(given: QueryParams) -> TimeWindow:
-    """Returns the span that a query string names.
+def requested_window(given: QueryParams) -> TimeWindow:
+    """Returns the window from `start` to `end` of a query string.
 
     Raises:
-        InvalidArgumentsError: a number is missing or invalid, or the span has no length.
+        InvalidArgumentsError: a number is missing or invalid, or the window has no length.
     """
-    match _numbers(given, "start", "end"):
-        case [start_s, end_s] if start_s < end_s:
-            return TimeWindow.from_unix(start_s, end_s)
-    raise InvalidArgumentsError("give start, and end after it, in Unix seconds")
+    start_s, end_s = _number(given, "start"), _number(given, "end")
+    if start_s is None or end_s is None or start_s >= end_s:
+        raise InvalidArgumentsError("give start, and end after it, in Unix seconds")
+    return TimeWindow.from_unix(start_s, end_s)
 
 
-def box_asked(given: QueryParams) -> Box:
+def requested_box(given: QueryParams) -> Box:
     """Returns the part of the map that a query string names: `x0`, `y0`, `x1`, `y1` and `pixel`.
 
     Raises:
         InvalidArgumentsError: a number is missing or invalid, or a pixel has no size.
     """
-    match _numbers(given, "x0", "y0", "x1", "y1", "pixel", unit="metres"):
+    numbers = [_number(given, name, "metres") for name in ("x0", "y0", "x1", "y1", "pixel")]
+    match [number for number in numbers if number is not None]:
         case [x0, y0, x1, y1, pixel_m] if pixel_m > 0:
             return Box(x0, y0, x1, y1, max(pixel_m, _LEAST_PIXEL_M))
     raise InvalidArgumentsError("give x0, y0, x1, y1 and pixel (above 0), in metres")
 
 
 def tool_arguments(given: QueryParams) -> JsonObject:
-    """Returns the arguments that a query string has for a tool.
+    """Returns the `arguments` of a query string, which are those of a tool.
 
     Raises:
         InvalidArgumentsError: they are no JSON object, or too long.
@@ -210,12 +243,6 @@ def _short(given: QueryParams, name: str, longest: int) -> str:
     if len(text) > longest:
         raise InvalidArgumentsError(f"{name} is longer than {longest} characters")
     return text
-
-
-def _numbers(given: QueryParams, *names: str, unit: str = "seconds") -> list[float]:
-    """Returns those of some numbers that are given."""
-    numbers = [_number(given, name, unit) for name in names]
-    return [number for number in numbers if number is not None]
 
 
 def _number(given: QueryParams, name: str, unit: str = "seconds") -> float | None:

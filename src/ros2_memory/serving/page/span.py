@@ -59,8 +59,6 @@ from ros2_memory.things.find import find_things
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import NDArray
-
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.columns.fill import Progress
     from ros2_memory.history.context import Call, Memory
@@ -83,8 +81,8 @@ _FINE_M: Final = 0.01
 _COARSE_M: Final = 1.0
 """How near a path of many points is drawn, until few are left: from the one to the other."""
 _OF_WHOLE: Final = ("events", "things")
-"""Parts that are of the whole span; `whole_ms` is their processor time, so that a live page knows
-how often it may ask for them."""
+"""Parts about the whole span. `whole_ms` is their processor time: by it a live page decides how
+often it asks for them."""
 _NEWEST_BAGS: Final = 3
 _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
 
@@ -106,7 +104,7 @@ EVENT: Final = keys(
     INSIDE("places"),
 )
 SUMMARY: Final = keys(digits(1)("distance_m"), TENTHS_OF_S("stood_s"))
-"""Of a recap: what a stretch of time has, too."""
+"""The keys of a recap that the page shows of any stretch of time."""
 _ALL_EVENTS: Final = keys(
     objects(EVENT)("events"), PLAIN("throughout"), digits(2)("max_speed"), PAIRS("counts")
 )
@@ -129,8 +127,8 @@ _THING: Final = keys(
 )
 
 
-class Shown(NamedTuple):
-    """Keys of an answer, and the reasons if they are incomplete."""
+class Part(NamedTuple):
+    """A part of a reply: keys, and notes on why they are incomplete."""
 
     keys: JsonObject
     notes: tuple[str, ...] = ()
@@ -138,18 +136,20 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpanRequest:
-    """What a page asks for.
+    """A request to `/page/span`.
 
     Attributes:
-        start_s: Unix seconds of the begin of the span; with `end_s`, else the last `last_s`.
+        start_s: where the span begins, in Unix seconds; None for the last `last_s`.
+        end_s: where the span ends, in Unix seconds.
         last_s: seconds before the newest data.
-        since_s: only what is newer is returned of the path and the signals, and of the bag that it
-            is in; without `things` also of the events.
-        version: of the answer that the page has; nothing is looked up where it is current.
+        since_s: path and signals begin with the bag of this time (Unix seconds); without `things`
+            the events, too.
+        version: of the reply that the page has. If it is current, nothing else is looked up.
         things: whether things, events and totals of the whole span are looked up.
-        status: whether the state of the memory is; without it only how far it reaches.
-        patient: whether the answer may take long; else what takes long is left out.
-        first: whether nothing is shown yet, so that the answer must not take long as a whole.
+        status: whether the state of the memory is looked up.
+        patient: whether the parts may take long; else slow parts are left out.
+        first: whether the page shows nothing yet, so that all parts together must be quick.
+        signals: to be plotted.
     """
 
     start_s: float | None
@@ -164,7 +164,11 @@ class SpanRequest:
     signals: tuple[Signal, ...]
 
     def window(self, earliest: Ns, latest: Ns) -> TimeWindow:
-        """Returns the span over a memory that begins and ends so; at least a second long.
+        """Returns the span, at least a second long.
+
+        Args:
+            earliest: log time (ns) of the oldest message of the memory.
+            latest: log time (ns) of the newest message.
 
         Raises:
             InvalidArgumentsError: the bounds are no numbers, or reversed.
@@ -182,17 +186,21 @@ def span_shown(
     progress: Callable[[], Progress] | None = None,
     questions: QuestionLog | None = None,
 ) -> JsonObject:
-    """Returns what the page shows of a span.
+    """Returns the reply of `/page/span`.
 
-    `progress`: how far the store of columns is filled; `questions`: the latest ones, if
-    these are kept.
+    Args:
+        memory: the memory.
+        call: bounds how long this takes.
+        request: what the page asks for.
+        progress: tells how far the store of columns is filled; None without a store.
+        questions: the latest questions of clients; None if they are not shown.
 
     Raises:
         InvalidArgumentsError: the span is invalid, or a signal is not recorded.
         QueryTimeoutError: the call's time is over.
     """
     filling = None if progress is None else progress()
-    # Of a robot that is on up to a time past the newest bag, so that the folder is scanned.
+    # If a recorder runs, a time past the newest bag makes the index scan the folder.
     snapshot = memory.index.snapshot(memory.clock.now() if memory.limits.now == "wall" else None)
     version = _version(snapshot, filling, 0 if questions is None else questions.count)
     now = moment(memory.now(memory.clock.now(), snapshot.latest))
@@ -203,21 +211,42 @@ def span_shown(
         "version": version,
         "now": now,
         "latest": moment(latest),
-        "filling": _filling_shown(filling),
+        "filling": _filling_state(filling),
     }
     if questions is not None and questions.is_on:
         shown["questions"] = [*questions.newest(MOST_QUESTIONS)]
     if request.status:
-        shown["range"] = _range_shown(memory, call, snapshot)
+        shown["range"] = _recorded_range(memory, call, snapshot)
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
-    if earliest is None or latest is None:
-        return shown
-    window = request.window(earliest, latest)
-    fresh = _fresh(snapshot, window, request.since_s)
-    # Rounded away from the span, so that one that is asked again holds all that it did.
+    if earliest is not None and latest is not None:
+        window = request.window(earliest, latest)
+        fresh = _fresh_window(snapshot, window, request.since_s)
+        shown |= _span_data(memory, call, request, window=window, fresh=fresh, latest=latest)
+    return shown
+
+
+def _span_data(
+    memory: Memory,
+    call: Call,
+    request: SpanRequest,
+    *,
+    window: TimeWindow,
+    fresh: TimeWindow,
+    latest: Ns,
+) -> JsonObject:
+    """Returns the keys of the reply that depend on the span.
+
+    Args:
+        memory: the memory.
+        call: bounds how long this takes.
+        request: what the page asks for.
+        window: the whole span.
+        fresh: the part of it that the page does not have yet.
+        latest: log time (ns) of the newest message.
+    """
+    # Rounded away from the span: asked for again by these bounds, it has the same messages.
     end_s = -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
-    shown |= {"start": _start_s(window), "end": end_s, "since": _start_s(fresh)}
-    parts: dict[str, Callable[[Call], Shown]] = {
+    parts: dict[str, Callable[[Call], Part]] = {
         "path": lambda call: _path(memory, call, fresh, latest),
         "events": lambda call: _events(memory, call, window if request.things else fresh),
         "things": lambda call: _things(memory, call, window),
@@ -225,72 +254,79 @@ def span_shown(
     }
     if not request.things:
         del parts["things"]
-    all_parts = _united_parts(parts, call, request)
-    shown |= all_parts.keys
+    united = _united_parts(parts, call, request)
+    data: JsonObject = {
+        "start": _start_s(window),
+        "end": end_s,
+        "since": _start_s(fresh),
+        **united.keys,
+    }
     if request.signals:
-        shown["signals"] = [
+        data["signals"] = [
             signal_in(memory, call, signal, fresh, window) for signal in request.signals
         ]
-    shown["notes"] = [*all_parts.notes]
-    return shown
+    data["notes"] = [*united.notes]
+    return data
 
 
-def _filling_shown(filling: Progress | None) -> JsonObject | None:
-    """Returns how far the store of columns is filled; None where that is as good as full."""
-    # So it is without the newest of many bags, as while recording.
+def _filling_state(filling: Progress | None) -> JsonObject | None:
+    """Returns how far the store of columns is filled; None if it is as good as full."""
+    # While recording, the newest of many bags are never stored yet.
     if filling is None or filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10):
         return None
     return {"closed": filling.closed, "waiting": filling.waiting}
 
 
-def _range_shown(memory: Memory, call: Call, snapshot: Snapshot) -> JsonObject:
+def _recorded_range(memory: Memory, call: Call, snapshot: Snapshot) -> JsonObject:
     """Returns the recorded range with its longest gaps, and the days that were thinned, if any."""
-    ranged = data_time_range(memory, call)
-    shown: JsonObject = {**render(ranged, memory.index.bag_dir), "gaps": _gaps(ranged)}
+    recorded = data_time_range(memory, call)
+    shown: JsonObject = {**render(recorded, memory.index.bag_dir), "gaps": _gaps(recorded)}
     if thinned := snapshot.timeline.thinned_times:
         shown["thinned"] = [[_unix_s(start), _unix_s(stop)] for start, stop in thinned]
     return shown
 
 
 def _united_parts(
-    parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
-) -> Shown:
-    """Returns all parts as one, or why one is not known; and how long those of the span took."""
+    parts: Mapping[str, Callable[[Call], Part]], call: Call, request: SpanRequest
+) -> Part:
+    """Returns the keys and notes of all parts; a part that takes too long is a note."""
     shown: JsonObject = {}
     notes: list[str] = []
     budget_s, whole_s = _PART_S if request.patient else _QUICK_S, 0.0
-    whole = call.deadline.within(budget_s)
-    for name, part in parts.items():
+    deadline = call.deadline.within(budget_s)
+    for name, make_part in parts.items():
         begun = time.thread_time()
         if request.first:
-            budget_s = max(whole.left_s(), 0.0) / 2
+            # Half of what is left, so that the parts after this one have time, too.
+            budget_s = max(deadline.left_s(), 0.0) / 2
         try:
-            known = part(call.within(budget_s))
+            part = make_part(call.within(budget_s))
         except QueryTimeoutError as error:
-            known = Shown({}, (f"the {name} are not known yet: {error}",))
-        shown |= known.keys
-        notes += known.notes
-        whole_s += time.thread_time() - begun if name in _OF_WHOLE else 0.0
+            part = Part({}, (f"the {name} are not known yet: {error}",))
+        shown |= part.keys
+        notes += part.notes
+        if name in _OF_WHOLE:
+            whole_s += time.thread_time() - begun
     if request.things:
         shown["whole_ms"] = round(whole_s * 1000)
-    return Shown(shown, tuple(dict.fromkeys(notes)))
+    return Part(shown, tuple(dict.fromkeys(notes)))
 
 
-def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:
-    """Returns the part of a window that is newer than a time, from the begin of a bag.
+def _fresh_window(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:
+    """Returns the part of a window from the begin of the bag at `since_s`, in Unix seconds.
 
-    What is stored answers for whole bags.
+    Stored columns answer for whole bags.
     """
     if since_s is None:
         return window
     since = min(max(ns_from_unix(since_s), window.start), window.stop - 1)
     bags = snapshot.timeline.overlapping(TimeWindow(since, since + 1))
-    begins = min((bag.start for bag in bags), default=since)
-    return TimeWindow(max(begins, window.start), window.stop)
+    start = min((bag.start for bag in bags), default=since)
+    return TimeWindow(max(start, window.start), window.stop)
 
 
 def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> str:
-    """Returns another text whenever there is more to be shown."""
+    """Returns a text that changes whenever there is more to be shown."""
     counts = (
         snapshot.latest or 0,
         len(snapshot.bags),
@@ -303,79 +339,76 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
 
 
 def _start_s(window: TimeWindow) -> float:
-    """Returns the begin to the millisecond: asked from there, a span holds all that it did."""
+    """Returns where a window begins, in Unix seconds rounded down to the millisecond."""
     return (window.start + START_SLACK_NS) // NS_PER_MS / 1000
 
 
-def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
-    """Returns the longest gaps in order, as pairs of times."""
-    longest = sorted(ranged.gaps, key=lambda gap: gap.start - gap.end)[:MOST_GAPS]
-    return [
-        [_unix_s(gap.start), _unix_s(gap.end)] for gap in sorted(longest, key=lambda gap: gap.start)
-    ]
+def _gaps(recorded: DataTimeRange) -> list[JsonValue]:
+    """Returns the `MOST_GAPS` longest gaps in order, each as start and end in Unix seconds."""
+    gaps = sorted(recorded.gaps, key=lambda gap: gap.start - gap.end)[:MOST_GAPS]
+    gaps.sort(key=lambda gap: gap.start)
+    return [[_unix_s(gap.start), _unix_s(gap.end)] for gap in gaps]
 
 
-def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
+def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Part:
     """Returns the path, and where the robot was last; else why there is none."""
     view = View(memory, call, window.stop)
     path = newest = robot_path(view, window)
     if path is None:
         why = why_no_path(view)
-        return Shown({"path": None, "robot": None, "no_path": why}, (why,))
+        return Part({"path": None, "robot": None, "no_path": why}, (why,))
     if window.stop <= latest or not len(path.track.times):
         newest = robot_path(view, TimeWindow.before(latest, _NEWEST_NS))
-    named: list[JsonValue] = [
+    places: list[JsonValue] = [
         _place_outline(place) for place in memory.limits.places if place.frame_id == path.frame
     ]
     robot = None if newest is None else _newest_pose(newest.track)
     notes = [*view.notes.sentences()]
     if not path.is_whole:
         notes.append("the path is not complete yet: older bags are still being read")
-    return Shown({"path": _drawn(path), "robot": robot, "places": named}, tuple(notes))
+    return Part({"path": _path_points(path), "robot": robot, "places": places}, tuple(notes))
 
 
 def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
-    """Returns the path in a window; None where no topic with poses is recorded.
+    """Returns the path in a window; None if no topic with poses is recorded.
 
     Raises:
         QueryTimeoutError: it is not known within the time of a quick answer.
     """
     path = robot_path(View(memory, call.within(_QUICK_S), window.stop), window)
-    return None if path is None else _drawn(path)
+    return None if path is None else _path_points(path)
 
 
-def _drawn(path: RobotPath) -> JsonObject:
-    """Returns a path by `MOST_POINTS` points at most."""
+def _path_points(path: RobotPath) -> JsonObject:
+    """Returns at most `MOST_POINTS` points of a path as columns, as near to the path as they can.
+
+    `begins` are the positions of points before which the robot was not seen for a while.
+    """
     track = path.track
-    kept, tolerance_m = np.arange(len(track.times)), _FINE_M
-    while len(kept) > MOST_POINTS:
-        line = path.line.some(kept)
-        few = line.simplified(tolerance_m, len(kept))
-        is_too_coarse = len(few) < MOST_POINTS // 2 and tolerance_m > _FINE_M
+    points, tolerance_m = np.arange(len(track.times)), _FINE_M
+    while len(points) > MOST_POINTS:
+        line = path.line.select(points)
+        fewer = line.simplified(tolerance_m, len(points))
+        is_too_coarse = len(fewer) < MOST_POINTS // 2 and tolerance_m > _FINE_M
         if is_too_coarse or tolerance_m > _COARSE_M:
-            few = line.simplified(0.0, MOST_POINTS)  # as near as these allow: ten times slower
-        kept, tolerance_m = kept[few], 2 * tolerance_m
+            # Exactly as many as allowed, which takes ten times as long.
+            fewer = line.simplified(0.0, MOST_POINTS)
+        points, tolerance_m = points[fewer], 2 * tolerance_m
+    pieces = np.cumsum(track.begins)[points]
     return {
         "frame": path.frame,
-        "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
-        "x": np.round(track.x[kept], 2).tolist(),
-        "y": np.round(track.y[kept], 2).tolist(),
-        "yaw": [degrees(heading) for heading in track.heading[kept].tolist()],
-        "begins": _begins(track, kept),
-        "continues": bool(len(kept)) and not bool(track.begins[0]),
+        "t": np.round(track.times[points] / NS_PER_S, 3).tolist(),
+        "x": np.round(track.x[points], 2).tolist(),
+        "y": np.round(track.y[points], 2).tolist(),
+        "yaw": [degrees(heading) for heading in track.heading[points].tolist()],
+        "begins": np.flatnonzero(np.diff(pieces, prepend=-1)).tolist(),
+        "continues": bool(len(points)) and not bool(track.begins[0]),
         "whole": path.is_whole,
     }
 
 
-def _begins(track: RobotTrack, kept: NDArray[np.intp]) -> list[JsonValue]:
-    """Returns the numbers of the kept points before which the robot was not seen for a while."""
-    if not len(kept):
-        return []
-    pieces = np.cumsum(track.begins)[kept]
-    return [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist()]
-
-
 def _newest_pose(track: RobotTrack) -> JsonObject | None:
+    """Returns time (Unix s), x, y (m) and yaw (degrees) of the last point; None without one."""
     if not len(track.times):
         return None
     return {
@@ -399,23 +432,25 @@ def _place_outline(place: Place) -> JsonObject:
     return {"name": place.name, "corners": [[x, y] for x, y in corners]}
 
 
-def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
+def _events(memory: Memory, call: Call, window: TimeWindow) -> Part:
+    """Returns what happened in a window, and its totals."""
     summary = recap(
         memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False
     )
     shown = {**SUMMARY.render(summary, Scope()), **_ALL_EVENTS.render(summary, Scope())}
-    return Shown({**shown, "events_since": _start_s(window)}, summary.notes)
+    return Part({**shown, "events_since": _start_s(window)}, summary.notes)
 
 
-def _moments(memory: Memory, call: Call) -> Shown:
+def _moments(memory: Memory, call: Call) -> Part:
+    """Returns the saved moments."""
     try:
         stored = list_moments(memory, call).moments
     except EpisodicError as error:
-        return Shown({"moments": []}, (str(error),))
-    return Shown({"moments": [_MOMENT.render(saved, Scope()) for saved in stored]})
+        return Part({"moments": []}, (str(error),))
+    return Part({"moments": [_MOMENT.render(saved, Scope()) for saved in stored]})
 
 
-def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
+def _things(memory: Memory, call: Call, window: TimeWindow) -> Part:
     """Returns the things that were seen in a window."""
     try:
         answer = find_things(
@@ -426,6 +461,6 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
             limit=MOST_THINGS,
         )
     except (NoDataError, InvalidArgumentsError) as error:
-        return Shown({"things": []}, (str(error),))
+        return Part({"things": []}, (str(error),))
     things: list[JsonValue] = [_THING.render(thing, Scope()) for thing in answer.things]
-    return Shown({"things": things, "things_total": answer.total}, answer.notes)
+    return Part({"things": things, "things_total": answer.total}, answer.notes)

@@ -1,12 +1,13 @@
 """The rows of the page: when labels were in view, the numbers of a field, and the topics.
 
-Of a topic it shows how often it speaks, when it did in a span, what can be plotted, and whether it
-can place the robot: poses, and satellite receivers. Numbers come in bins: the least, the mean and
-the greatest of each. Labels count without a place, too.
+A row of a topic tells how often it speaks, when it spoke in a span, which fields can be plotted,
+and whether it can place the robot. Numbers come in bins: the least, the mean and the greatest of
+each. Labels count without a place, too.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -44,12 +45,12 @@ if TYPE_CHECKING:
 
 MOST_LABELS: Final = 60
 _BARS: Final = 400
-"""At most so many bars of a label: what lies nearer than a pixel or two is drawn as one."""
+"""Most bars of a label. Bars that would be nearer than a pixel or two are drawn as one."""
 _PATIENT_S: Final = 8.0
 
 
 def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
-    """Returns the labels that were in view longest, with how often, how long (s) and when.
+    """Returns the labels that were in view longest: how often, for how many seconds, and when.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -62,7 +63,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     if least:
         in_view = [visible.scoring(least) for visible in in_view]
     rows = [
-        _label(label, first, last, window)
+        _label_row(label, first, last, window)
         for label, (first, last) in united_tables(in_view).spans().items()
         if len(first)
     ]
@@ -71,8 +72,8 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     return {"end": unix_from_ns(window.stop), "labels": shown, "labels_total": len(rows)}
 
 
-def _label(label: str, first: Ints, last: Ints, window: TimeWindow) -> JsonObject:
-    """Returns a row of a label, whose intervals are in order and do not overlap."""
+def _label_row(label: str, first: Ints, last: Ints, window: TimeWindow) -> JsonObject:
+    """Returns the row of a label from its intervals, which are in order and do not overlap."""
     start, stop = first.clip(window.start), last.clip(None, window.stop)
     is_apart = start[1:] - stop[:-1] > (window.stop - window.start) // _BARS
     begins, ends = start[np.append(True, is_apart)], stop[np.append(is_apart, True)]
@@ -140,9 +141,9 @@ def signal_in(
 def _signal_parts(
     view: View, topic: str, field: str, window: TimeWindow, width: Ns
 ) -> tuple[list[Part], Ns | None, Sequence[UndecodableError]]:
-    """Returns the parts of a field's numbers in order; no edge of a bin cuts one.
+    """Returns the numbers of a field as parts in order, none of which crosses the edge of a bin.
 
-    Besides from which log time on they are known (None where all were read), and failures.
+    Also the log time from which on all numbers were read (None if all were), and the failures.
     """
     inside = [
         (max(first, window.start), min(last, window.stop - 1))
@@ -161,24 +162,25 @@ def _signal_parts(
 
 
 def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]:
-    """Returns for each bin with numbers its middle, and the least, mean and greatest number."""
+    """Returns for each bin with numbers its mean time (Unix s), least, mean and greatest number."""
     middles = np.array([(part.first + part.last) // 2 for part in parts], np.int64)
     bins = middles // width
     starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
-    sizes = np.array([part.size for part in parts], np.float64)
+    counts = np.array([part.size for part in parts], np.float64)
+    bin_counts = np.add.reduceat(counts, starts)
     totals = np.array([part.total for part in parts])
     lows = np.minimum.reduceat(np.array([part.least.middle for part in parts]), starts)
     highs = np.maximum.reduceat(np.array([-part.greatest.middle for part in parts]), starts)
     # One of them may be exact, and the other rounded to beyond it.
     lows, highs = np.minimum(lows, highs), np.maximum(lows, highs)
-    means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts) / SUM_SCALE
-    # Of a whole part the least and the greatest number are exact, and the sum is of rounded ones.
+    means = np.add.reduceat(totals, starts) / bin_counts / SUM_SCALE
+    # The sum of a part is of rounded numbers, and may lie beyond the exact least and greatest.
     means = np.clip(means, lows, highs)
-    times = np.add.reduceat(middles / NS_PER_S * sizes, starts) / np.add.reduceat(sizes, starts)
-    columns = (lows, means, highs)
+    times = np.add.reduceat(middles / NS_PER_S * counts, starts) / bin_counts
+    columns = zip(times.tolist(), lows.tolist(), means.tolist(), highs.tolist(), strict=True)
     return [
-        (round(at, 3), *(rounded(value, 6) for value in row))
-        for at, *row in zip(times.tolist(), *(column.tolist() for column in columns), strict=True)
+        (round(time, 3), rounded(low, 6), rounded(mean, 6), rounded(high, 6))
+        for time, low, mean, high in columns
     ]
 
 
@@ -186,19 +188,19 @@ MOST_TOPICS: Final = 200
 MOST_NUMBERS: Final = 60
 BINS: Final = 60
 _MOST_TIMES: Final = 20_000
-"""Messages of a topic of which each is counted where it is; more are spread over their bags."""
+"""If a topic has more messages, they count as spread evenly over their bags."""
 _LARGEST_BYTES: Final = 1_000_000
-"""A message that is decoded to see what numbers it has: images have none that are worth a plot."""
+"""A larger message is not decoded to see its numbers: images have none that are worth a plot."""
 _PLOTTED: Final = frozenset({"number", "list of numbers"})
 _QUICK_S: Final = 2.0
 
 
 def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
-    """Returns the topics with counts and rates, their messages in each bin of a window, and more.
+    """Returns the topics with their counts and rates, and those that can place the robot.
 
-    `numbers` are the fields that can be plotted, by the newest message; `places_robot` lists the
-    topics that can place the robot, and whether they are poses or fixes. Where time runs out,
-    messages are taken to be spread evenly over their bags.
+    In a row `spoke` counts the messages in each of `BINS` bins of the window; if time runs out,
+    they count as spread evenly over their bags. `numbers` are the fields of the newest message that
+    can be plotted.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -221,40 +223,39 @@ def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
         "type": newest_type,
         "count": by_type[newest_type].messages,
         "rate_hz": usual_rate(view.snapshot, topic, view.limits.latching),
-        "spoke": _spoke(view, topic, window).tolist(),
-        "numbers": [*_numbers(view, topic)],
+        "spoke": _count_in_bins(view, topic, window).tolist(),
+        "numbers": [*_plottable_fields(view, topic)],
     }
 
 
-def _spoke(view: View, topic: str, window: TimeWindow) -> Ints:
+def _count_in_bins(view: View, topic: str, window: TimeWindow) -> Ints:
     """Returns how many messages each bin of a window has."""
-    extents = [*view.timeline.extents(topic, window)]
-    messages = sum(summary.count for extent in extents for summary in extent.bag.summary.of(topic))
-    width = max((window.stop - window.start) // BINS, 1)
-    longest = max((extent.last - extent.first for extent in extents), default=0)
-    if longest > width and messages <= _MOST_TIMES:
-        try:
-            parts = [rows.times for rows in scan(view, topic, window, columns=False)]
-        except QueryTimeoutError:
-            pass
-        else:
-            return _binned(np.concatenate([np.zeros(0, np.int64), *parts]), window)
-    spread = [
-        np.linspace(extent.first, extent.last, min(summary.count, BINS), dtype=np.int64)
-        for extent in extents
-        for summary in extent.bag.summary.of(topic)
-    ]
-    return _binned(np.concatenate([np.zeros(0, np.int64), *spread]), window)
-
-
-def _binned(times: Ints, window: TimeWindow) -> Ints:
     length: Ns = window.stop - window.start
+    times = np.concatenate([np.zeros(0, np.int64), *_message_times(view, topic, window)])
     inside = times[(times >= window.start) & (times < window.stop)] - window.start
     return np.bincount((inside / length * BINS).astype(np.int64).clip(0, BINS - 1), minlength=BINS)
 
 
-def _numbers(view: View, topic: str) -> list[str]:
-    """Returns the fields of a topic's newest message that are numbers, as dot-paths."""
+def _message_times(view: View, topic: str, window: TimeWindow) -> list[Ints]:
+    """Returns the log times of messages, bag by bag; spread evenly if reading them takes long."""
+    extents = [*view.timeline.extents(topic, window)]
+    spread: list[Ints] = []
+    messages = 0
+    for extent in extents:
+        for summary in extent.bag.summary.of(topic):
+            messages += summary.count
+            count = min(summary.count, BINS)
+            spread.append(np.linspace(extent.first, extent.last, count, dtype=np.int64))
+    width = max((window.stop - window.start) // BINS, 1)
+    longest = max((extent.last - extent.first for extent in extents), default=0)
+    if longest > width and messages <= _MOST_TIMES:
+        with suppress(QueryTimeoutError):
+            return [rows.times for rows in scan(view, topic, window, columns=False)]
+    return spread
+
+
+def _plottable_fields(view: View, topic: str) -> list[str]:
+    """Returns the dot-paths of the numbers in a topic's newest message."""
     newest = view.stream.last(topic)
     if newest is None or len(newest.record.payload) > _LARGEST_BYTES:
         return []
@@ -262,19 +263,22 @@ def _numbers(view: View, topic: str) -> list[str]:
     if message is None:
         return []
     value = view.extractor.exact(message, newest.type)
-    numbers = [path or "data" for path, kind in fields_of(value) if kind in _PLOTTED]
-    return numbers[:MOST_NUMBERS]
+    paths = [path or "data" for path, kind in fields_of(value) if kind in _PLOTTED]
+    return paths[:MOST_NUMBERS]
 
 
 def _places_robot(view: View) -> list[JsonValue]:
-    """Returns the topics that can place the robot; those that are its own come first."""
-
-    def names(described: Iterable[str]) -> list[str]:
-        return [topic.partition(" ")[0] for topic in described]
-
+    """Returns the topics that can place the robot: its own poses, other poses, then fixes."""
     of_robot = {*topics_of_robot(view, "position")}
-    posed = names(topics_with(view, "position") or topics_that_show(view))
-    posed.sort(key=lambda topic: (topic not in of_robot, topic))
-    fixes = names(topics_with(view, "geodetic"))
-    kinds = {**dict.fromkeys(fixes, "fixes"), **dict.fromkeys(posed, "poses")}
-    return [{"topic": topic, "kind": kinds[topic]} for topic in dict.fromkeys([*posed, *fixes])]
+    poses = _names(topics_with(view, "position") or topics_that_show(view))
+    poses.sort(key=lambda topic: (topic not in of_robot, topic))
+    fixes = _names(topics_with(view, "geodetic"))
+    return [
+        {"topic": topic, "kind": "poses" if topic in poses else "fixes"}
+        for topic in dict.fromkeys([*poses, *fixes])
+    ]
+
+
+def _names(described: Iterable[str]) -> list[str]:
+    """Returns the topics of descriptions such as `/odom (nav_msgs/msg/Odometry)`."""
+    return [topic.partition(" ")[0] for topic in described]
