@@ -344,7 +344,7 @@ class ReplyJson(ExactJson):
             note = f"{_named(path)}: the first {self._max_text} of {len(text)} characters"
             self.note("text", path, note, len(text))
             text = text[: self._max_text]
-        return str(text) if text.isascii() else _encodable(text)
+        return without_surrogates(text)
 
     def _numbers(self, array: Array, path: str, /) -> JsonValue:
         if array.size > self._limit:
@@ -368,7 +368,7 @@ class ReplyJson(ExactJson):
         self.note("array", path, note, total)
 
     def _entries(self, node: Mapping[object, object], path: str, /) -> list[tuple[str, object]]:
-        entries = [(_encodable(str(name)), value) for name, value in node.items()]
+        entries = [(without_surrogates(str(name)), value) for name, value in node.items()]
         if self._max_entries is None or len(entries) <= self._max_entries:
             return entries
         note = f"{_named(path)}: the first {self._max_entries} of {len(entries)} entries"
@@ -387,9 +387,9 @@ def _at_most_64_bits(array: Array) -> Array:
     return array.astype(np.float64) if array.dtype.itemsize > 8 else array
 
 
-def _encodable(text: str) -> str:
-    """Returns the text without lone surrogates, which no encoding of JSON carries."""
-    return text.encode("utf-8", "replace").decode()
+def without_surrogates(text: str) -> str:
+    """Returns a plain `str` with `?` for lone surrogates, which no encoding of JSON carries."""
+    return str(text) if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
 def _named(path: str) -> str:
