@@ -694,7 +694,7 @@ def build_dispatcher(
         tools,
         Replies(settings.recording.bag_dir, server.max_reply_chars),
         call_timeout_s=server.call_timeout_s,
-        readable=readable_tools(memory.limits) if additions and fleet is None else (),
+        readable=readable_tools() if additions and fleet is None else (),
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,
         most_questions=server.keep_questions,

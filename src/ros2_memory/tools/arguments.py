@@ -54,7 +54,7 @@ MOST_TIMES: Final = 20
 """Moments that one call asks about."""
 MOST_WAYPOINTS: Final = 200
 _INCLUSIVE: Final = "Inclusive."
-_OF_THE_OTHER: Final = "Of the other."
+_OTHER_WINDOW: Final = "Of the other."
 FORMS_OF_TIME: Final = "Unix s or 2026-11-20T14:05."
 TIME_KINDS: Final = ("number", "string")
 """The JSON types of a time: Unix seconds, or ISO 8601 text."""
@@ -111,7 +111,10 @@ def _read_time(value: object) -> object:
 
 
 def _read_until(value: object, info: ValidationInfo[object]) -> object:
-    """Returns the end of a window: a time as `_read_time` does, but see `window_end_s`."""
+    """Returns the end of a window as `_read_time` does; a text means all of its last unit.
+
+    `14:05` means until the end of that minute.
+    """
     seconds = _read_time(value)
     if not isinstance(value, str) or not isinstance(seconds, float):
         return seconds
@@ -122,7 +125,7 @@ def _read_until(value: object, info: ValidationInfo[object]) -> object:
 
 
 def _read_moment(value: object) -> tuple[object, float]:
-    """Returns a time as `_read_time` does, and how long it lasts as text (s)."""
+    """Returns a time as `_read_time` does, and how many seconds a text spans: 60 for `14:05`."""
     return _read_time(value), rest_of_text_s(value) if isinstance(value, str) else 0.0
 
 
@@ -365,9 +368,9 @@ _ByInMatches: TypeAlias = Annotated[
 
 
 class Arguments(BaseModel):
-    """The arguments of one query, whose parameters have the names of the fields.
+    """The arguments of one query. Its parameters have the names of the fields.
 
-    An alias is the name that clients see. `Signature` refuses unknown names before.
+    An alias is the name that clients see. `Signature` has refused unknown names before.
     """
 
     # Few of them are needed by a program that asks one question: each is built when it is used.
@@ -375,20 +378,20 @@ class Arguments(BaseModel):
 
 
 class TimeArgument(Arguments):
-    """The arguments that replace a placeholder, whose fields have the same names as theirs.
+    """The arguments that replace a placeholder of `Arguments`.
 
     Attributes:
         replaces: the placeholder, `moment` or `span`.
-        text: what a tool's description says for {when}.
-        either: the names of arguments of which exactly one must be given.
+        text: replaces {when} in a tool's description.
+        either: names of arguments; exactly one of them must be given.
     """
 
     replaces: ClassVar[str]
     text: ClassVar[str]
     either: ClassVar[tuple[str, ...]] = ()
 
-    def chosen(self) -> object:
-        """Returns what the placeholder is made of."""
+    def replacement(self) -> object:
+        """Returns the value of the placeholder."""
         return dict(self)
 
 
@@ -405,8 +408,8 @@ class At(TimeArgument):
         default=(), alias="timestamps"
     )
 
-    def chosen(self) -> AtTime:
-        """Returns the moment, or those."""
+    def replacement(self) -> AtTime:
+        """Returns the moment, or several in one."""
         if self.one:
             at_s, rest_s = self.one
             return AtTime(at_s, rest_s=rest_s)
@@ -471,7 +474,7 @@ class NoArguments(Arguments):
 
 
 class RecordedTimesArguments(Arguments):
-    """Of which window gaps, silences and steps of the clock are listed."""
+    """The window in which gaps, silences and steps of the clock are listed."""
 
     start_s: _Start = None
     end_s: _End = None
@@ -710,9 +713,9 @@ class CompareArguments(Arguments):
     ]
     end_s: Annotated[_Until, Field(alias="end", description=_INCLUSIVE, examples=[1784023260])]
     with_start_s: Annotated[
-        _Time, Field(alias="with_start", description=_OF_THE_OTHER, examples=[1783936800])
+        _Time, Field(alias="with_start", description=_OTHER_WINDOW, examples=[1783936800])
     ]
     with_end_s: Annotated[
-        _Until, Field(alias="with_end", description=_OF_THE_OTHER, examples=[1783936860])
+        _Until, Field(alias="with_end", description=_OTHER_WINDOW, examples=[1783936860])
     ]
     where: _WhereOfBoth | None = None

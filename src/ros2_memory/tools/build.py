@@ -1,4 +1,4 @@
-"""The tools of a deployment: those of the specification, and those beyond it."""
+"""Builds the tools of a deployment: those of the specification, and those beyond it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ def build_tools(
 ) -> tuple[Tool, ...]:
     """Returns the tools, in order. Their descriptions name this deployment's defaults.
 
-    `additions`: also those beyond the specification; `writing`: also those of them that write.
+    Args:
+        settings: the defaults.
+        additions: whether the tools beyond the specification are there.
+        writing: whether tools that write are there.
     """
     defaults = {
         "pose_topic": settings.pose_topic,
@@ -24,18 +27,16 @@ def build_tools(
         "map_frame": settings.map_frame or "no map",
     }
     added = extra_tools.DECLARATIONS if additions else ()
-    return tuple(
-        tool
-        for declaration in (*spec_tools.DECLARATIONS, *added)
-        if writing or not declaration.writes
-        for tool in declaration.tools(defaults, plain_times=not additions)
-    )
+    tools: list[Tool] = []
+    for declaration in (*spec_tools.DECLARATIONS, *added):
+        if writing or not declaration.writes:
+            tools += declaration.tools(defaults, plain_times=not additions)
+    return tuple(tools)
 
 
-def readable_tools(settings: QuerySettings) -> tuple[Tool, ...]:
-    """Returns what is read as a resource, and is not a tool."""
-    return tuple(
-        tool
-        for declaration in extra_tools.READABLE
-        for tool in declaration.tools({"pose_topic": settings.pose_topic})
-    )
+def readable_tools() -> tuple[Tool, ...]:
+    """Returns the tools whose replies are read as resources alone."""
+    tools: list[Tool] = []
+    for declaration in extra_tools.READABLE:
+        tools += declaration.tools({})
+    return tuple(tools)

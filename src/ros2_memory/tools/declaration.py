@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
-from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 from pydantic import ValidationError
@@ -25,7 +24,7 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from datetime import time
 
     from pydantic_core.core_schema import NullableSchema
@@ -47,15 +46,21 @@ _KINDS: Final = {
     "object": "an object",
 }
 _TIME: Final = "Unix seconds or ISO 8601 text"
+_BOUNDS: Final = {
+    "minimum": "at least",
+    "exclusiveMinimum": "more than",
+    "maximum": "at most",
+}
 
 
 @dataclass(frozen=True)
 class Signature:
-    """The arguments of a model, with a `TimeArgument` in the place of their moment or span.
+    """The arguments of a tool: those of a model, with a `TimeArgument` for its moment or span.
 
-    `plain_times`: the schema declares times as numbers only, and places as names only, since some
-    clients refuse an argument of two types. The other types are still accepted. Of arguments of
-    which one must be given there is the first alone, as the specification has it.
+    With `plain_times` the schema declares times as numbers only and places as names only, since
+    some clients refuse an argument of two types; the other types are still accepted. Of several
+    arguments of which one must be given, the schema then has the first alone, as in the
+    specification.
     """
 
     _arguments: type[Arguments]
@@ -66,9 +71,9 @@ class Signature:
     def _properties(self) -> dict[str, JsonObject]:
         """Returns the JSON schema of each argument."""
         properties: dict[str, JsonObject] = {}
-        for name, schema in _properties(self._arguments).items():
+        for name, schema in _schemas_of(self._arguments).items():
             if self._when is not None and name == self._when.replaces:
-                properties.update(_properties(self._when))
+                properties.update(_schemas_of(self._when))
             else:
                 properties[name] = schema
         if self.plain_times and self._when is not None:
@@ -89,92 +94,99 @@ class Signature:
     @property
     def example(self) -> JsonObject:
         """Returns a call with the required arguments alone."""
-        needed = {*self._required, *self._either[:1]}
+        required = {*self._required, *self._either[:1]}
         return {
             name: _example_value(schema)
             for name, schema in self._properties.items()
-            if name in needed
+            if name in required
         }
 
     def json_schema(self) -> JsonObject:
         """Returns the schema that `tools/list` shows: flat, without empty defaults.
 
-        It says nothing of other arguments: the reply to an unknown one names those that are close.
+        It does not forbid other arguments: the reply to an unknown one names similar arguments.
         """
         properties: JsonObject = {}
         for name, schema in self._properties.items():
-            shown: JsonObject = {
-                key: item
-                for key, item in schema.items()
-                if key != "examples" and not (key == "default" and item in (None, []))
-            }
+            shown: JsonObject = {key: item for key, item in schema.items() if key != "examples"}
+            if shown.get("default") in (None, []):
+                shown.pop("default", None)
             properties[name] = _with_plain_times(shown) if self.plain_times else shown
-        required = [*self._required, *(self._either if self.plain_times else ())]
         whole: JsonObject = {"type": "object", "properties": properties}
-        return {**whole, "required": [*required]} if required else whole
+        required = [*self._required, *(self._either if self.plain_times else ())]
+        if required:
+            whole["required"] = [*required]
+        return whole
 
     def parse(self, given: Mapping[str, object]) -> Arguments:
-        """Returns the checked arguments. A null for an optional one counts as not given.
+        """Returns the checked arguments. A null for an optional argument counts as not given.
 
         Raises:
-            InvalidArgumentsError: one is unknown, missing, or invalid; the message names the first
-                ten, with the value that was given and an example, and counts the others.
+            InvalidArgumentsError: an argument is unknown, missing or invalid. The message names the
+                first ten with their values and an example, and counts the others.
         """
         present = {
             name: value
             for name, value in given.items()
             if value is not None or name in self._required
         }
-        problems = [*self._unknown(given), *self._missing(present), *self._unclear(present)]
+        problems = [
+            *self._unknown_arguments(given),
+            *self._missing_arguments(present),
+            *self._ambiguous_arguments(present),
+        ]
         values = dict(present)
         if self._when is not None:
             try:
-                values[self._when.replaces] = self._when.model_validate(present).chosen()
+                values[self._when.replaces] = self._when.model_validate(present).replacement()
             except ValidationError as error:
-                problems += self._wrong(error, given)
+                problems += self._invalid_arguments(error, given)
         try:
             arguments = self._arguments.model_validate(values)
         except ValidationError as error:
-            problems += self._wrong(error, given)
+            problems += self._invalid_arguments(error, given)
         else:
             if not problems:
                 return arguments
         more = len(problems) - _MAX_PROBLEMS_NAMED
-        raise InvalidArgumentsError(
-            "; ".join(problems[:_MAX_PROBLEMS_NAMED])
-            + (f"; and {more} more problems" if more > 0 else "")
-        )
+        if more > 0:
+            problems[_MAX_PROBLEMS_NAMED:] = [f"and {more} more problems"]
+        raise InvalidArgumentsError("; ".join(problems))
 
-    def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
-        names = ", ".join(self._properties)
-        hint_of_all = f"the arguments are: {names}" if names else "the tool takes none"
-        unknown = (name for name in given if name not in self._properties)
-        lacks_hint = False
-        for name in islice(unknown, _MAX_UNKNOWN_NAMED):
+    def _unknown_arguments(self, given: Mapping[str, object]) -> Iterator[str]:
+        unknown = [name for name in given if name not in self._properties]
+        names_all = False
+        for name in unknown[:_MAX_UNKNOWN_NAMED]:
             near = similar(name, self._properties, 1)
             hint = f"; do you mean {near[0]}?" if near else ""
             yield f"unknown argument {abbreviate(name)}{hint}"
-            lacks_hint = lacks_hint or not near
-        if lacks_hint:
-            yield hint_of_all
-        if more := sum(1 for _ in unknown):
+            names_all = names_all or not near
+        if names_all:
+            names = ", ".join(self._properties)
+            yield f"the arguments are: {names}" if names else "the tool takes none"
+        more = len(unknown) - _MAX_UNKNOWN_NAMED
+        if more > 0:
             yield f"and {more} more unknown arguments"
 
-    def _missing(self, present: Mapping[str, object]) -> Iterator[str]:
+    def _missing_arguments(self, present: Mapping[str, object]) -> Iterator[str]:
         for name in self._required:
             if name not in present:
-                yield f"{name} is missing: {_expected(self._properties[name])}"
+                yield f"{name} is missing: {_describe_values(self._properties[name])}"
 
-    def _unclear(self, present: Mapping[str, object]) -> Iterator[str]:
+    def _ambiguous_arguments(self, present: Mapping[str, object]) -> Iterator[str]:
+        """Yields a problem unless exactly one of the alternatives is given."""
         either = self._either
         named = [name for name in either if present.get(name) not in (None, [])]
         if len(named) > 1:
             yield f"{' and '.join(named)} were both given: give only one"
         elif either and not named:
             others = f"; or {' or '.join(either[1:])}" if either[1:] else ""
-            yield f"{either[0]} is missing: {_expected(self._properties[either[0]])}{others}"
+            expected = _describe_values(self._properties[either[0]])
+            yield f"{either[0]} is missing: {expected}{others}"
 
-    def _wrong(self, error: ValidationError, given: Mapping[str, object]) -> Iterator[str]:
+    def _invalid_arguments(
+        self, error: ValidationError, given: Mapping[str, object]
+    ) -> Iterator[str]:
         reported: set[str] = set()
         for fault in error.errors(include_url=False, include_context=False, include_input=False):
             name = str(fault["loc"][0])
@@ -183,7 +195,7 @@ class Signature:
             reported.add(name)
             reason = fault["msg"].removeprefix("Value error, ")
             why = f", which {reason}" if fault["type"] == "value_error" else ""
-            expected = _expected(self._properties[name])
+            expected = _describe_values(self._properties[name])
             yield f"{name} was {abbreviate(given[name])}{why}; expected {expected}"
 
 
@@ -199,7 +211,7 @@ class _Schema(GenerateJsonSchema):
 
 
 @cache
-def _properties(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
+def _schemas_of(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
     """Returns the JSON schema of each argument; an optional one has a default and no null."""
     schema: Mapping[str, Mapping[str, JsonObject]] = arguments.model_json_schema(
         schema_generator=_Schema
@@ -208,6 +220,7 @@ def _properties(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
 
 
 def _with_plain_times(schema: JsonObject) -> JsonObject:
+    """Returns the schema of an argument with one type; see `Signature.plain_times`."""
     plain = dict(schema)
     for kinds in (REGION_KINDS, TIME_KINDS):
         if plain.get("type") == [*kinds]:
@@ -217,33 +230,31 @@ def _with_plain_times(schema: JsonObject) -> JsonObject:
     return plain
 
 
-def _expected(schema: JsonObject) -> str:
-    """Describes the allowed values of an argument."""
-    what = _kind(schema)
-    bounds = [
-        f"{word} {schema[key]:.10g}"
-        for key, word in (
-            ("minimum", "at least"),
-            ("exclusiveMinimum", "more than"),
-            ("maximum", "at most"),
-        )
-        if isinstance(schema.get(key), int | float)
-    ]
-    text = f"{what} of {' and '.join(bounds)}" if bounds else what
+def _describe_values(schema: JsonObject) -> str:
+    """Returns the allowed values of an argument in words: `a number of at least 0, e.g. 2`."""
+    text = _describe_type(schema)
+    bounds: list[str] = []
+    for key, word in _BOUNDS.items():
+        bound = schema.get(key)
+        if isinstance(bound, int | float):
+            bounds.append(f"{word} {bound:.10g}")
+    if bounds:
+        text += f" of {' and '.join(bounds)}"
     if "description" in schema:
         text += f" ({str(schema['description']).rstrip('.')})"
-    return f"{text}, e.g. {to_json_text(_example_value(schema))}" if "examples" in schema else text
+    if "examples" in schema:
+        text += f", e.g. {to_json_text(_example_value(schema))}"
+    return text
 
 
-def _kind(schema: JsonObject) -> str:
+def _describe_type(schema: JsonObject) -> str:
     allowed, kinds = schema.get("enum"), schema.get("type")
     if isinstance(allowed, list):
         return f"one of {', '.join(map(to_json_text, allowed))}"
     if kinds == [*TIME_KINDS]:
         return _TIME
-    return " or ".join(
-        _KINDS[str(kind)] for kind in (kinds if isinstance(kinds, list) else [kinds])
-    )
+    kinds = kinds if isinstance(kinds, list) else [kinds]
+    return " or ".join([_KINDS[str(kind)] for kind in kinds])
 
 
 def _example_value(schema: JsonObject) -> JsonValue:
@@ -258,16 +269,21 @@ SHOWN_ALONE: Final = frozenset(
 )
 """Arguments that bound what is shown, and change no count."""
 Query: TypeAlias = "Callable[..., Answer]"  # type: ignore[explicit-any]
-"""A function of a memory, a call, and the fields of its arguments as keywords, as a test holds."""
+"""A function of a memory, a call, and the fields of its arguments as keywords; a test checks it."""
 
 
 @dataclass(frozen=True)
 class Tool:
     """One tool as clients see it.
 
-    `describe` returns the description and the JSON schema of the arguments. `question` checks a
-    call's arguments and binds them to the query. `writes`: it changes what is stored. `drawn` is as
-    in `ToolName`.
+    Attributes:
+        name: of the tool.
+        title: its name for people.
+        describe: returns the description and the JSON schema of the arguments.
+        blocking: whether it may take long.
+        question: checks the arguments of a call and binds them to the query.
+        writes: whether it changes what is stored.
+        drawn: as in `ToolName`.
     """
 
     name: str
@@ -301,8 +317,40 @@ class Tool:
         return self.describe()
 
 
+def _ask_at_each(
+    query: Query,
+    arguments: Mapping[str, object],
+    moments: Sequence[AtTime],
+    memory: Memory,
+    call: Call,
+) -> Answer:
+    """Answers a query about several moments, one after the other."""
+
+    def ask(fixed: Memory, moment: AtTime) -> MomentAnswer:
+        return cast("MomentAnswer", query(fixed, call, **{**arguments, "moment": moment}))
+
+    return at_each(memory, moments, ask)
+
+
+def _ask_in_each(
+    query: Query,
+    arguments: Mapping[str, object],
+    between: tuple[time, time],
+    memory: Memory,
+    call: Call,
+) -> Answer:
+    """Answers a query about the same local hours of each day."""
+
+    def ask(fixed: Memory, span: TimeRange) -> OneAnswer:
+        bounds = {"span": span, "start_s": span.start_s, "end_s": span.end_s, "last_s": None}
+        own = {name: value for name, value in bounds.items() if name in arguments}
+        return cast("OneAnswer", query(fixed, call, **{**arguments, **own}))
+
+    return in_each(memory, call, _span_of(arguments), between, ask)
+
+
 def _span_of(arguments: Mapping[str, object]) -> TimeRange:
-    """Returns the window of a call, whose bounds may be arguments of their own."""
+    """Returns the window of a call: its span, or its bounds where these are arguments."""
     span = arguments.get("span")
     if isinstance(span, TimeRange):
         return span
@@ -328,9 +376,17 @@ class ToolName:
 class ToolDeclaration:
     """A query and all its names.
 
-    `shows_example`: its schema alone does not show how it is called.
-    `instead` has the queries that answer in place of `query` where an argument is given. They need
-    not take arguments that only bound what is shown (`SHOWN_ALONE`); others are refused.
+    Attributes:
+        names: the first is described in full, the others refer to it.
+        description: the text for planners, with placeholders.
+        arguments: the model of the arguments.
+        query: answers.
+        blocking: whether it may take long.
+        writes: whether it changes what is stored.
+        shows_example: whether the description ends with a call, since the schema is not enough.
+        instead: queries that answer in place of `query`, by the argument that chooses them. Other
+            arguments that they do not take are refused, unless they only bound what is shown
+            (`SHOWN_ALONE`).
     """
 
     names: tuple[ToolName, ...]
@@ -343,9 +399,11 @@ class ToolDeclaration:
     instead: Mapping[str, Query] = field(default_factory=dict)
 
     def tools(self, defaults: Mapping[str, object], *, plain_times: bool = False) -> Iterator[Tool]:
-        """Yields a tool for each name; `defaults` fill the description's placeholders.
+        """Yields a tool for each name.
 
-        `plain_times`: see `Signature`.
+        Args:
+            defaults: values of the description's placeholders.
+            plain_times: see `Signature`.
         """
         for tool_name in self.names:
             signature = Signature(self.arguments, tool_name.when, plain_times=plain_times)
@@ -362,7 +420,7 @@ class ToolDeclaration:
     def _compose_description(
         self, name: ToolName, signature: Signature, defaults: Mapping[str, object]
     ) -> tuple[str, JsonObject]:
-        """Returns what planners read: in full for the first name; the others refer to it."""
+        """Returns the description and schema of a name; in full for the first name."""
         first, when = self.names[0], name.when
         if name is first or when is None:
             text = self.description.format(when=when.text if when else "", **defaults)
@@ -382,33 +440,26 @@ class ToolDeclaration:
         return text, schema
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
+        """Checks the arguments of a call, and returns its question.
+
+        Raises:
+            InvalidArgumentsError: they are refused.
+        """
         arguments = dict(signature.parse(given))
         between = cast("tuple[time, time] | None", arguments.pop("between", None))
-        query, chosen = self._bound(arguments)
+        query, chosen = self._choose_query(arguments)
+        moment = chosen.get("moment")
+        if isinstance(moment, AtTime) and moment.each:
+            return partial(_ask_at_each, query, chosen, moment.each)
+        if between is not None:
+            return partial(_ask_in_each, query, chosen, between)
+        return partial(query, **chosen)
 
-        def asked(memory: Memory, call: Call) -> Answer:
-            def at(fixed: Memory, own: AtTime) -> MomentAnswer:
-                return cast("MomentAnswer", query(fixed, call, **{**chosen, "moment": own}))
-
-            def over(fixed: Memory, own: TimeRange) -> OneAnswer:
-                parts = {"span": own, "start_s": own.start_s, "end_s": own.end_s, "last_s": None}
-                bounds = {name: value for name, value in parts.items() if name in chosen}
-                return cast("OneAnswer", query(fixed, call, **{**chosen, **bounds}))
-
-            moment = chosen.get("moment")
-            if isinstance(moment, AtTime) and moment.each:
-                return at_each(memory, moment.each, at)
-            if between is not None:
-                return in_each(memory, call, _span_of(chosen), between, over)
-            return query(memory, call, **chosen)
-
-        return asked
-
-    def _bound(self, arguments: dict[str, object]) -> tuple[Query, dict[str, object]]:
+    def _choose_query(self, arguments: dict[str, object]) -> tuple[Query, dict[str, object]]:
         """Returns the query that answers, and its arguments.
 
         Raises:
-            InvalidArgumentsError: one of them cannot be combined with another.
+            InvalidArgumentsError: two arguments cannot be combined.
         """
         given = [name for name, value in arguments.items() if value not in (None, False, ())]
         chosen = next((name for name in self.instead if name in given), None)

@@ -48,34 +48,43 @@ parts. Call tools marked Blocking one at a time.
 
 
 def instructions(settings: QuerySettings, *, additions: bool = True, several: bool = False) -> str:
-    """Returns the rules that prevent most wrong calls, with this deployment's defaults.
+    """Returns the rules that prevent most wrong calls, in less than 2,000 characters.
 
-    Clients cut instructions at about 2,000 characters; these are shorter. `additions`: whether the
-    tools beyond the specification are offered. `several`: whether it is the memory of several
-    robots.
+    Clients cut longer instructions.
+
+    Args:
+        settings: this deployment's defaults.
+        additions: whether the tools beyond the specification are offered.
+        several: whether the memory is of several robots.
     """
     middle = _HAPPENED if additions else _SEEN
     if several:
         middle += _SEVERAL
     elif additions:
         middle += _WHERE
-    newest = "each robot's newest message" if several else "the newest message"
+    now = "this machine's clock"
+    if settings.now == "latest":
+        now = "each robot's newest message" if several else "the newest message"
+    or_text = timestamps = ""
+    relative = "*_seconds_ago, *_last and recent_*"
+    if additions:
+        or_text = " or ISO 8601, local without offset"
+        timestamps = "; timestamps takes several: {results: [...]}"
+        relative = "*_seconds_ago, *_last, recent_* and last_s"
     return (_RULES + middle + _REST).format(
-        or_text=" or ISO 8601, local without offset" if additions else "",
-        timestamps="; timestamps takes several: {results: [...]}" if additions else "",
-        newest=_newest(settings),
-        now=newest if settings.now == "latest" else "this machine's clock",
-        relative="*_seconds_ago, *_last, recent_* and last_s"
-        if additions
-        else "*_seconds_ago, *_last and recent_*",
+        or_text=or_text,
+        timestamps=timestamps,
+        newest=_not_yet_answered(settings),
+        now=now,
+        relative=relative,
         near=f"{settings.position_tolerance_m:g}",
         pose_topic=settings.pose_topic,
         tolerance=f"{settings.time_tolerance_s:g}",
     )
 
 
-def _newest(settings: QuerySettings) -> str:
-    """Returns the sentence on what is not there yet."""
+def _not_yet_answered(settings: QuerySettings) -> str:
+    """Returns the sentence on the newest data, which cannot be asked about yet."""
     if settings.include_active and not settings.screened:
         newest = "the newest 3 s or so answer"
     elif settings.kept is not None:
@@ -125,5 +134,5 @@ Take ages, durations and distances from the reply, unchanged.
 
 
 def prompt(*, additions: bool) -> str:
-    """Returns the text that the prompt appends to the instructions; `additions`: as there."""
+    """Returns the text of the prompt after the instructions; `additions` as in `instructions`."""
     return (_ANSWERS if additions else _SPEC_ANSWERS) + _NUMBERS

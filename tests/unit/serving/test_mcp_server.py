@@ -90,7 +90,7 @@ async def test_there_are_no_other_resources_than_those_that_are_told(
 
 async def test_no_tool_names_another_that_is_not_offered(tmp_path: Path) -> None:
     write_run(tmp_path)
-    tools = [*build_tools(QuerySettings(), writing=True), *readable_tools(QuerySettings())]
+    tools = [*build_tools(QuerySettings(), writing=True), *readable_tools()]
     # But for words of English that replies use for keys.
     known = {tool.name for tool in tools} - {"visits", "compare", "recap"}
     async with Client(server(tmp_path, "server.tools=spec")) as client:
