@@ -78,6 +78,7 @@ _READ_ALIKE = (
     "ros2_memory.storage.mcap_reader.McapReader",
     "ros2_memory.storage.rosbag2_reader.Rosbag2Reader",
 )
+"""Readers that read the same from a file that both can read."""
 _MOST_SPLITS = 5000
 """The splits of one recording that `bag_dir.state_files` takes."""
 
@@ -99,9 +100,12 @@ def require_extra(what: str, extra: str, *modules: str) -> None:
 def build_reader(
     settings: Settings, *, cache_mb: int | None = None, large: LargeReads | None = None
 ) -> BagReader:
-    """Returns the bag reader that the configuration chooses, with `cache_mb` if that is given.
+    """Returns the bag reader that the configuration chooses.
 
-    `large` is the turn to hold much of a bag, where several threads read.
+    Args:
+        settings: the configuration.
+        cache_mb: the size of its cache, in place of the configured one.
+        large: the turn to hold much of a bag, if several threads read.
 
     Raises:
         ConfigError: it is refused.
@@ -118,9 +122,9 @@ def build_reader(
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
-    """Returns the recorder that the configuration chooses, which is not `recorder=none`.
+    """Returns the recorder that the configuration chooses, which must not be `recorder=none`.
 
-    `collaborators` are arguments of its constructor that are no settings.
+    `collaborators` are the arguments of its constructor that are no settings.
 
     Raises:
         ConfigError: it is refused.
@@ -136,7 +140,7 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
         session_duration_s=recording.session_duration_s,
         use_sim_time=recording.use_sim_time,
         queue_mb=recording.queue_mb,
-        required=[Required(each.topic, each.min_hz) for each in recording.required],
+        required=[Required(rule.topic, rule.min_hz) for rule in recording.required],
         min_free_gb=settings.retention.min_free_gb,
         latched_topics=settings.data.tf_static_topics,
         **collaborators,
@@ -145,12 +149,12 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
 
 
 def instantiated(node: AdapterNode, **arguments: object) -> object:
-    """Returns the adapter of a section, from its own values and further arguments."""
+    """Makes the adapter that a section of the configuration chooses."""
     return get_class(node.target)(**node.arguments, **arguments)
 
 
 def retention_limits(settings: Settings) -> RetentionLimits:
-    """Returns how much the recorder keeps."""
+    """Returns the limits by which the recorder deletes bags."""
     retention = settings.retention
     return RetentionLimits(
         max_total_bytes=round(retention.max_total_gb * GB),
@@ -168,9 +172,14 @@ def build_housekeeper(
     own: OwnRecordings,
     background: Background,
 ) -> Housekeeping:
-    """Returns what repairs and deletes bags for the recorder; no other program may delete.
+    """Returns the part of the recorder that repairs and deletes bags; nothing else may delete.
 
-    `own` lists the recordings that were made in the bag directory.
+    Args:
+        settings: the configuration.
+        bag_dir: the bag directory.
+        reader: reads bag files.
+        own: the recordings that were made in the bag directory.
+        background: runs long work.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.recorder.housekeeping import Housekeeping
@@ -206,7 +215,7 @@ def build_housekeeper(
 def _topic_cutter_of(
     settings: Settings, bag_dir: Path, reader: BagReader, writer: BagWriter
 ) -> TopicCutter | None:
-    """Returns what cuts topics with a shorter life out of bags; None where none has one."""
+    """Returns the part that cuts topics with a shorter life out of bags; None without any."""
     from ros2_memory.retention.topic_ages import TopicAge, TopicCutter, is_quiet
 
     topic_ages = [
@@ -228,7 +237,10 @@ def _topic_cutter_of(
 def _memory_days_of(
     settings: Settings, bag_dir: Path, bags: BagReader, own: OwnRecordings, writer: BagWriter
 ) -> MemoryDays | None:
-    """Returns what writes thinned days, or deletes those there are, where nothing is to stay."""
+    """Returns the part that writes thinned days, or deletes them if none shall stay.
+
+    None if nothing is thinned and there are no thinned days.
+    """
     from ros2_memory.bag_dir.layout import MEMORY_FOLDER
 
     memory = settings.memory
@@ -255,7 +267,7 @@ def _memory_days_of(
 
 
 def _extractor_of(settings: Settings) -> SchemaExtractor:
-    """Returns what reads the fields of messages that the schema map names."""
+    """Returns the extractor for the schema map of the configuration."""
     from ros2_memory.extract import SchemaExtractor
 
     return SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
@@ -268,12 +280,13 @@ def _watch_of(
     own: OwnRecordings,
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
+    """Returns what makes the watch over rules that save moments, for a keeper of moments."""
     from ros2_memory.recorder.process.topics import load_topics
     from ros2_memory.triggers.rules import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
     def is_recorded(topic: str) -> bool:
-        """Whether the list of topics, which may have changed, has one; True where it is refused."""
+        """Whether the list of topics has one now; True if the list has become invalid."""
         try:
             return load_topics(settings.recording.topics_file).matches(topic)
         except ConfigError:
@@ -294,10 +307,11 @@ def _watch_of(
 def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
     """Returns the rules of `recording.keep_when`.
 
-    `moments_bytes` is what all moments may take, which is enough for all rules together.
+    `moments_bytes` is what all saved moments may take.
 
     Raises:
-        ConfigError: their file is missing, a rule is refused, or they may take too much together.
+        ConfigError: their file is missing, a rule is refused, or together they may save more than
+            all moments may take.
     """
     from ros2_memory.bag_dir.moment_file import fault_of_label
     from ros2_memory.triggers.rules import Rule
@@ -338,6 +352,7 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
 def _screening_of(
     settings: Settings, bag_dir: Path, reader: BagReader, writer: BagWriter
 ) -> Screening | None:
+    """Returns the part that excludes what `recording.exclude_when` names; None without rules."""
     from ros2_memory.triggers.screening import Screening
 
     rules = exclusions_of(settings)
@@ -410,7 +425,7 @@ def _condition_of(settings: Settings, given: KeepRule | ExcludeRule, where: str)
 
 
 def build_repairer() -> Repairer:
-    """Returns what repairs single MCAP files."""
+    """Returns a repairer of single MCAP files."""
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.storage.mcap.writer import McapWriter
     from ros2_memory.storage.mcap_reader import McapReader
@@ -419,9 +434,13 @@ def build_repairer() -> Repairer:
 
 
 class SharedParts(NamedTuple):
-    """What memories of the same settings can share: the reader and the decoder, with their caches.
+    """The parts that memories of the same settings can share.
 
-    `large` is the reader's turn to hold much of a bag. `caches` are those of columns.
+    Attributes:
+        reader: reads bag files, and caches chunks.
+        large: the reader's turn to hold much of a bag.
+        extractor: reads the fields of messages that the schema map names.
+        caches: of columns.
     """
 
     reader: BagReader
@@ -431,9 +450,9 @@ class SharedParts(NamedTuple):
 
 
 def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedParts:
-    """Returns what reads and decodes the bags of one memory, or of several.
+    """Returns the parts that read and decode the bags of one memory, or of several.
 
-    `cache_mb` is what each of the caches of chunks and of columns may take; None: as configured.
+    `cache_mb` is the size of the cache of chunks and of that of columns; None as configured.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
@@ -452,8 +471,10 @@ def build_memory(
 ) -> Memory:
     """Returns the memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
 
-    `shared` is what it has in common with other memories; its own where None. `setting` is the one
-    that the user named the bags in, where it is another than `recording.bag_dir`.
+    Args:
+        settings: the configuration.
+        shared: the parts that it shares with other memories; None for parts of its own.
+        setting: the setting in which the user named the bags; None for `recording.bag_dir`.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
@@ -469,7 +490,6 @@ def build_memory(
     bag_dir = settings.recording.bag_dir
     reader = BagDirReader(shared.reader, bag_dir)
     columns = build_columns(settings, reader)
-
     index = IndexManager(
         bag_dir,
         reader,
@@ -492,10 +512,13 @@ def build_memory(
 def build_columns(
     settings: Settings, reader: BagReader, of_lake: str | None = None
 ) -> ColumnStore | None:
-    """Returns the store of columns; None where the configuration wants none.
+    """Returns the store of columns; None if the configuration wants none.
 
-    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes. That of
-    a lake's robot, named by `of_lake`, is in the cache folder, and made again from the lake.
+    Args:
+        settings: the configuration.
+        reader: leaves out what the bag directory hides: overlaps, and what `forget` deletes.
+        of_lake: the name of a robot in a lake. Its store is in the cache folder, and can be made
+            again from the lake.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore
@@ -511,7 +534,7 @@ def build_columns(
         partial(column_paths, settings),
         reader.definition,
         definitions=definitions,
-        # What a recorder's server stored serves who only looks, too.
+        # A program that only looks reads what the recorder's server has stored.
         sources=(bag_dir / OWN_FOLDER / FILE,),
         waits_for=bag_dir,
     )
@@ -534,7 +557,10 @@ def column_paths(settings: Settings) -> tuple[Path, ...]:
 
 
 def _cached(name: bytes) -> tuple[Path, ...]:
-    """Returns the path of a store in the cache folder, by what it is of; none without one."""
+    """Returns the path of a store in the cache folder; nothing if there is no such folder.
+
+    `name` identifies the bags of the store.
+    """
     from ros2_memory.columns.store import FILE
 
     given = os.environ.get("XDG_CACHE_HOME")
@@ -547,7 +573,7 @@ def _cached(name: bytes) -> tuple[Path, ...]:
 
 
 def _definitions_of(settings: Settings) -> list[tuple[str, int, int]]:
-    """Returns what tells the configured message definitions apart: paths, sizes and mtimes."""
+    """Returns paths, sizes and mtimes of the configured definitions: any change shows in these."""
     return [
         (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
         for folder in settings.reader.custom_msg_paths
@@ -556,10 +582,9 @@ def _definitions_of(settings: Settings) -> list[tuple[str, int, int]]:
 
 
 def reading_of(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:
-    """Returns what identifies how bags are read: settings, definitions, and this version.
+    """Returns a hash of all that decides how bags are read: settings, definitions, this version.
 
-    `schemas` is the schema map of these settings. What follows from columns depends on it. The two
-    readers of the package read a file alike.
+    Stored fragments of another hash are made again. `schemas` is the schema map of the settings.
     """
     storage = settings.storage
     return _hash_of(
@@ -583,7 +608,7 @@ def _hash_of(value: object) -> str:
 
 
 def build_backfill(settings: Settings, memory: Memory) -> Backfill:
-    """Returns what fills the store of columns of a memory, if it has one."""
+    """Returns the backfill of a memory, which fills its store of columns if it has one."""
     from ros2_memory.columns.fill import Filling, StoreLimits
     from ros2_memory.serving.backfill import Backfill
 
@@ -604,7 +629,7 @@ def build_backfill(settings: Settings, memory: Memory) -> Backfill:
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:
-    """Returns what queries need of the configuration.
+    """Returns the settings that queries need.
 
     Raises:
         ConfigError: the labels are refused.
@@ -669,7 +694,7 @@ def build_dispatcher(
     telemetry: Telemetry = SILENT,
     fleet: Fleet | None = None,
 ) -> Dispatcher:
-    """Returns what answers tool calls from a memory, or from those of a fleet's robots."""
+    """Returns the dispatcher of tool calls to a memory, or to the robots of a fleet."""
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.build import build_tools, readable_tools
     from ros2_memory.tools.replies import Replies
@@ -708,16 +733,16 @@ def build_server(
     progress: Callable[[], Progress] | None = None,
     fleet: Fleet | None = None,
 ) -> EpisodicServer:
-    """Returns the MCP server that answers from a memory, or from those of a fleet's robots.
+    """Returns the MCP server that answers from a memory, or from the robots of a fleet.
 
-    `progress`: how far the store of columns is filled.
+    `progress` tells how far the store of columns is filled.
     """
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.tools.instructions import instructions
 
     server = settings.server
-    # Answers make many objects that stay in memory, and hardly any garbage: looking for that after
-    # each 700 new ones takes up to a sixth of the first answers.
+    # Answers make many objects that stay in memory, and hardly any garbage. To look for garbage
+    # after each 700 new objects, as Python does, takes up to a sixth of the first answers.
     gc.set_threshold(NEW_OBJECTS)
     return EpisodicServer(
         build_dispatcher(settings, memory, telemetry, fleet),

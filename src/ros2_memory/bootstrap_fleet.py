@@ -39,7 +39,14 @@ if TYPE_CHECKING:
     from ros2_memory.lake.warehouse import LakeLocation
 
 
-# ruff: noqa: PLC0415 - the lake is an extra, and loads what nothing else needs
+# ruff: noqa: PLC0415 - the lake is an extra, and a server of one robot loads nothing of a fleet
+
+log = get_logger(__name__)
+
+ROBOTS_SETTING: Final = "fleet.robots"
+"""The setting that names the bags of robots."""
+_JOINED_AGAIN_S: Final = 5.0
+"""Least time between two looks into the lake for an unknown robot that is asked for."""
 
 
 def lake_location(settings: Settings) -> LakeLocation:
@@ -71,29 +78,29 @@ def lake_location(settings: Settings) -> LakeLocation:
 
 
 def _secrets_of(path: Path) -> dict[str, str]:
-    """Returns the settings in a file of secrets; no error shows any of it.
+    """Returns the names and texts in a file of secrets; no error shows any of them.
 
     Raises:
-        ConfigError: it cannot be read, or has something else.
+        ConfigError: it cannot be read, or has anything else.
     """
     try:
-        secrets: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+        given: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"lake.secrets_file: {path}: {error.strerror}") from None
     except (ValueError, yaml.YAMLError, RecursionError):
-        secrets = None
-    if not isinstance(secrets, dict) or not all(
-        isinstance(text, str) for pair in secrets.items() for text in pair
+        given = None
+    if not isinstance(given, dict) or not all(
+        isinstance(text, str) for text in (*given, *given.values())
     ):
         raise ConfigError(
             f'lake.secrets_file: {path} must have lines like s3.access-key-id: "...", names and '
             "texts alone"
         )
-    return {str(name): str(value) for name, value in secrets.items()}
+    return given
 
 
 def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
-    """Returns the lake with an engine of the settings, open until this process ends.
+    """Opens the lake of the settings with its engine, until this process ends.
 
     Raises:
         ConfigError: its place or an extra is missing.
@@ -101,27 +108,16 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     """
     location = lake_location(settings)
     require_extra("lake: duckdb", "lake", "duckdb")
-    opened = ExitStack()
-    atexit.register(opened.close)
-    catalog = opened.enter_context(location.opened())
+    closing = ExitStack()
+    atexit.register(closing.close)
+    catalog = closing.enter_context(location.opened())
     return cast("Lake", instantiated(node, catalog=catalog, translated=location.translated))
 
 
-# ruff: noqa: PLC0415 - a server of one robot loads nothing of this
-
-
-log = get_logger(__name__)
-
-ROBOTS_SETTING: Final = "fleet.robots"
-"""The setting that names the bags of robots."""
-_JOINED_AGAIN_S: Final = 5.0
-"""Least time between two looks into the lake for a robot that is asked for and not known."""
-
-
 def build_fleet(settings: Settings) -> Fleet | None:
-    """Returns the robots of `fleet.robots`, whose bags are only read; None if there are none.
+    """Returns the robots of `fleet.robots`, and those of the lake; None without `fleet.robots`.
 
-    With a lake also those that it alone has. What reads and decodes bags is shared.
+    Their bags are only read. All robots share the reader and its caches.
 
     Raises:
         ConfigError: other settings are not those of a fleet, or a robot's places are refused.
@@ -153,7 +149,7 @@ def build_fleet(settings: Settings) -> Fleet | None:
 def _robots_of(
     lake: Lake, settings: Settings, shared: SharedParts, known: Collection[str]
 ) -> Iterator[Robot]:
-    """Yields the robots of a lake besides the known ones."""
+    """Yields the robots of a lake that are not known yet."""
     lake.refresh(_JOINED_AGAIN_S)
     for name in lake.days("bags"):
         if name not in known and is_robot_name(name):
@@ -161,7 +157,7 @@ def _robots_of(
 
 
 def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None) -> Robot:
-    """Returns a robot with bags of its own, in a lake, or both.
+    """Returns a robot with bags in its own directory, in a lake, or both.
 
     Raises:
         ConfigError: the file of its places is refused.
@@ -172,7 +168,7 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     own = robot_settings(settings, name)
     limits = query_settings_of(own)
     if not settings.fleet.shared_map and own.data.places_file == settings.data.places_file:
-        # `data.places_file` is about some other map.
+        # The robot has a map of its own, and `data.places_file` is about another one.
         limits = replace(limits, places=(), places_file="")
     memory = replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
     if lake is None:
@@ -200,7 +196,7 @@ def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: Share
 def robot_settings(settings: Settings, name: str) -> Settings:
     """Returns the settings of one robot of a fleet, as if a server had it alone.
 
-    Of a robot that only a lake knows they name a bag directory that cannot be.
+    For a robot that only a lake knows, the bag directory is a path that cannot exist.
     """
     fleet, data = settings.fleet, settings.data
     bag_dir = fleet.robots.get(name, Path(os.devnull) / name)
@@ -231,14 +227,16 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
             "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
         )
 
-    def built(name: str) -> RobotBags:
+    robots: list[RobotBags] = []
+    for name in settings.fleet.robots:
         own = robot_settings(settings, name)
         memory = build_memory(own, shared, setting=ROBOTS_SETTING)
         filling = build_backfill(own, memory).filling
         reading = reading_of(own, shared.extractor.schemas)
-        return RobotBags(name, memory, shared.reader, reading, settings.lake.messages, filling)
-
-    return [*map(built, settings.fleet.robots)]
+        robots.append(
+            RobotBags(name, memory, shared.reader, reading, settings.lake.messages, filling)
+        )
+    return robots
 
 
 def _require_only_reading(settings: Settings) -> None:

@@ -25,10 +25,10 @@ from ros2_memory import package_version
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.malloc import share_one_arena
 from ros2_memory.core.text import counted
-from ros2_memory.serving.listen import CannotListenError, resolve
+from ros2_memory.serving.listen import Address, CannotListenError, resolve
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from starlette.routing import Route
 
@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(overrides: Sequence[str], page: str | None = None) -> None:
     """Loads the configuration, builds the server, and serves.
 
-    `page`: whether the address of the page is to `print`, or also to `open`.
+    `page` tells whether to `print` the address of the page, or to `open` it, too.
 
     Raises:
         CannotListenError: the address cannot be listened on.
@@ -83,33 +83,73 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
     """
     from ros2_memory.bootstrap import build_memory, build_telemetry
     from ros2_memory.bootstrap_fleet import build_fleet
-    from ros2_memory.config import (
-        exit_on_config_error,
-        files_in_use,
-        load_settings,
-        unused_config,
-    )
+    from ros2_memory.config import exit_on_config_error, load_settings
 
     with exit_on_config_error(PROGRAM):
         settings = load_settings(overrides)
         configure_logging(
             settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
         )
-        at = settings.server
-        address, token = None, None
-        limited: dict[str, frozenset[str]] = {}
-        if at.transport != "stdio":
-            from ros2_memory.serving.auth import limited_tokens, take_token
-
-            # Before anything is built, so that a refusal comes at once.
-            address = resolve(at.host, at.port)
-            limited = limited_tokens(settings.fleet.tokens)
-            token = take_token(
-                os.environ, host=at.host, loopback=address.is_loopback, limited=bool(limited)
-            )
+        # Before anything is built, so that a refusal comes at once.
+        endpoint = None if settings.server.transport == "stdio" else _http_endpoint(settings)
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)
         fleet = build_fleet(settings)
+    _log_start(settings, fleet)
+    if fleet is None:
+        parts = _parts_of_one(settings, memory, telemetry, overrides)
+    else:
+        parts = _parts_of_fleet(settings, memory, fleet, telemetry, overrides)
+    gc.freeze()
+    gc.enable()
+    try:
+        if endpoint is None:
+            import anyio
+
+            anyio.run(_serve_stdio, parts)
+        else:
+            _serve_http(endpoint, parts, telemetry, page)
+    except SystemExit:
+        log.info("stopped")
+    finally:
+        parts.server.dispatcher.stop()
+        parts.health.stop()
+        telemetry.stop()
+
+
+class _HttpEndpoint(NamedTuple):
+    """Where a server listens, and the tokens of its clients.
+
+    Attributes:
+        address: where it listens.
+        token: for everything; None if none is needed.
+        limited: other tokens, each with the robots of a fleet that it is for.
+    """
+
+    address: Address
+    token: str | None
+    limited: Mapping[str, frozenset[str]]
+
+
+def _http_endpoint(settings: Settings) -> _HttpEndpoint:
+    """Returns the endpoint of the settings, and takes the token out of the environment.
+
+    Raises:
+        CannotListenError: the host has no address.
+        ConfigError: a token is missing, or cannot be used.
+    """
+    from ros2_memory.serving.auth import limited_tokens, take_token
+
+    host = settings.server.host
+    address = resolve(host, settings.server.port)
+    limited = limited_tokens(settings.fleet.tokens)
+    token = take_token(os.environ, host=host, loopback=address.is_loopback, limited=bool(limited))
+    return _HttpEndpoint(address, token.get_secret_value() if token else None, limited)
+
+
+def _log_start(settings: Settings, fleet: Fleet | None) -> None:
+    from ros2_memory.config import files_in_use, unused_config
+
     bag_dir = str(settings.recording.bag_dir.absolute())
     if fleet is not None:
         bag_dir = f"those of {counted(len(fleet.robots), 'robot')}"
@@ -117,54 +157,40 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
         "starting",
         version=package_version(),
         bag_dir=bag_dir,
-        transport=at.transport,
+        transport=settings.server.transport,
         files=files_in_use(settings),
     )
     if unused := unused_config():
         log.warning("config_unused", reason=unused)
-    if fleet is None:
-        from ros2_memory.serving.health import refresh_logged
 
-        threading.Thread(target=refresh_logged, args=(memory,), name="first scan").start()
-        parts = _parts_of_one(settings, memory, telemetry, overrides)
-    else:
-        parts = _parts_of_fleet(settings, memory, fleet, telemetry, overrides)
-    server, health, background = parts.server, parts.health, parts.background
-    gc.freeze()
-    gc.enable()
-    try:
-        if address is None:
-            import anyio
 
-            anyio.run(_serve_stdio, server, background)
-        else:
-            from ros2_memory.serving.http_run import serve_http
-            from ros2_memory.serving.web_app import web_app
+def _serve_http(
+    endpoint: _HttpEndpoint, parts: _Parts, telemetry: Telemetry, page: str | None
+) -> None:
+    """Serves over HTTP until a signal comes.
 
-            app = web_app(
-                server,
-                host=at.host,
-                health=health,
-                background=background,
-                api_token=token.get_secret_value() if token else None,
-                metrics=telemetry.metrics,
-                page=parts.page,
-                limited=limited,
-            )
-            shown = None if parts.page is None else page
-            serve_http(
-                app, address, server.dispatcher, partial(_show_page, shown) if shown else None
-            )
-    except SystemExit:
-        log.info("stopped")
-    finally:
-        server.dispatcher.stop()
-        health.stop()
-        telemetry.stop()
+    Raises:
+        CannotListenError: the address cannot be listened on.
+    """
+    from ros2_memory.serving.http_run import serve_http
+    from ros2_memory.serving.web_app import web_app
+
+    app = web_app(
+        parts.server,
+        host=endpoint.address.host,
+        health=parts.health,
+        background=parts.background,
+        api_token=endpoint.token,
+        metrics=telemetry.metrics,
+        page=parts.page,
+        limited=endpoint.limited,
+    )
+    show_page = None if page is None or parts.page is None else partial(_show_page, page)
+    serve_http(app, endpoint.address, parts.server.dispatcher, show_page)
 
 
 def _show_page(how: str, site: str) -> None:
-    """Prints the address of the page; opens it where somebody sits at a display."""
+    """Prints the address of the page; opens it if somebody sits at a display."""
     sys.stdout.write(f"the page of this memory: {site}/\n")
     sys.stdout.flush()
     has_display = sys.platform in {"darwin", "win32"} or any(map(os.environ.get, _DISPLAYS))
@@ -175,7 +201,14 @@ def _show_page(how: str, site: str) -> None:
 
 
 class _Parts(NamedTuple):
-    """What differs between a server of one robot and that of a fleet."""
+    """The parts of a server that differ between one robot and a fleet.
+
+    Attributes:
+        server: answers MCP.
+        health: reports for `/health`.
+        background: keeps indexes fresh and stores full, until it is cancelled.
+        page: the routes of the page's data; None without a page.
+    """
 
     server: EpisodicServer
     health: Health | FleetHealth
@@ -186,14 +219,17 @@ class _Parts(NamedTuple):
 def _parts_of_one(
     settings: Settings, memory: Memory, telemetry: Telemetry, overrides: Sequence[str]
 ) -> _Parts:
+    """Returns the parts of one robot's server, and begins to scan its bags meanwhile."""
+    from ros2_memory.serving.health import Health, keep_fresh, refresh_logged
+
+    threading.Thread(target=refresh_logged, args=(memory,), name="first scan").start()
     import anyio
 
     from ros2_memory.bootstrap import build_backfill, build_server
     from ros2_memory.serving.backfill import keep_backfilled
-    from ros2_memory.serving.health import Health, keep_fresh
 
     backfill = build_backfill(settings, memory)
-    backfill.helper = _helper(overrides)
+    backfill.helper = _helper_command(overrides)
     server = build_server(settings, memory, telemetry, backfill.progress)
     every_s, page = settings.reader.index_refresh_s, None
     if settings.server.transport != "stdio" and settings.server.page:
@@ -217,7 +253,7 @@ def _parts_of_fleet(
     telemetry: Telemetry,
     overrides: Sequence[str],
 ) -> _Parts:
-    """Returns the parts of a fleet's server, which has no page: that shows one robot."""
+    """Returns the parts of a fleet's server. It has no page, which shows one robot."""
     import anyio
 
     from ros2_memory.bootstrap import build_backfill, build_server
@@ -227,12 +263,13 @@ def _parts_of_fleet(
 
     reports: dict[str, Health] = {}
     backfills: dict[str, Backfill] = {}
-    for name in settings.fleet.robots:  # of others there is no bag here
+    for name in settings.fleet.robots:  # the others have bags in the lake alone
         robot = fleet.robots[name]
         backfill = build_backfill(robot_settings(settings, name), robot.memory)
         reports[name] = Health(robot.own or robot.memory, package_version(), backfill)
-        if not robot.in_lake:  # of bags in a lake no child process knows
-            backfill.helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
+        if not robot.in_lake:  # the helper reads bags of a bag directory, not of a lake
+            options = "--bag-dir", str(robot.bag_dir.absolute())
+            backfill.helper = _helper_command(overrides, *options)
         backfills[name] = backfill
 
     def all_backfills() -> list[Backfill]:
@@ -272,7 +309,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _end_threads(code: int) -> int:
-    """Returns the exit code, or ends the process where a thread goes on.
+    """Returns the exit code; ends the process with it if a thread goes on.
 
     A thread that waits for stdin, or scans a large directory, cannot be stopped, and the
     interpreter would wait for it. Ending it loses nothing: bags are only read.
@@ -291,22 +328,22 @@ def _end_threads(code: int) -> int:
     return code
 
 
-def _helper(overrides: Sequence[str], *options: str) -> list[str]:
-    """Returns the command line of the program that stores a backlog."""
+def _helper_command(overrides: Sequence[str], *options: str) -> list[str]:
+    """Returns the command line of the program that stores a backlog of bags as columns."""
     program = [sys.executable, "-P", "-m", "ros2_memory.cli", "index"]
     return [*program, "--for-server", str(os.getpid()), *options, "--", *overrides]
 
 
 async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_LOOKED_AT_S) -> None:
-    """Looks for new bags of each robot, and for what was shipped of it, until it is cancelled.
+    """Looks for new bags of each robot and, every `lake_s` seconds, for new robots in the lake.
 
-    Where there is a lake, also for robots that were shipped for the first time, every `lake_s`
-    seconds. A disk that hangs keeps the scans of its own robot waiting alone.
+    Runs until it is cancelled. If the disk of one robot hangs, the others are still scanned.
     """
     import anyio
 
     from ros2_memory.serving.health import keep_fresh
 
+    # A thread for each scan that may hang, and one to look for new robots.
     limiter = anyio.CapacityLimiter(1)
     async with anyio.create_task_group() as tasks:
         robots: Sequence[Robot] = [*fleet.robots.values()]
@@ -322,12 +359,12 @@ async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_L
                 return
             await anyio.sleep(lake_s)
             robots = await anyio.to_thread.run_sync(
-                partial(_add_shipped_logged, fleet), abandon_on_cancel=True, limiter=limiter
+                _add_shipped, fleet, abandon_on_cancel=True, limiter=limiter
             )
 
 
-def _add_shipped_logged(fleet: Fleet) -> Sequence[Robot]:
-    """Adds robots that were shipped; logs what keeps the lake from being looked at."""
+def _add_shipped(fleet: Fleet) -> Sequence[Robot]:
+    """Adds the robots that were shipped since, and returns them; logs an error of the lake."""
     from ros2_memory.core.errors import EpisodicError
 
     try:
@@ -340,12 +377,12 @@ def _add_shipped_logged(fleet: Fleet) -> Sequence[Robot]:
     return robots
 
 
-async def _serve_stdio(server: EpisodicServer, background: Background) -> None:
+async def _serve_stdio(parts: _Parts) -> None:
     import anyio
 
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(background)
-        await server.run_stdio_async()
+        tasks.start_soon(parts.background)
+        await parts.server.run_stdio_async()
         tasks.cancel_scope.cancel()
 
 

@@ -2,8 +2,8 @@
 
 Times are `Ns` of log time, lengths metres, angles radians, velocities m/s and rad/s. `age` is how
 long before "now" the answer's own moment lies, in nanoseconds; it is set for relative questions
-only. `now` is what ages count from. The keys of its reply, with their units (`core/reply.py`), are
-`reply`.
+only. `now` is what ages count from. `reply` of a class are the keys of its JSON, with their units
+(`core/reply.py`).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ MomentAnswer: TypeAlias = TopicValue | Position | Velocity | TransformAt
 
 @result(TIME("at"), PLAIN("error", "code"), PLAIN("reason", "reason.value"), "detail")
 class NothingAt(AnswerWithNotes):
-    """The answer for one of several times without data: the reason."""
+    """Stands for an answer at one of several times that has no data: the reason."""
 
     at: Ns
     reason: NoDataReason
@@ -90,7 +90,7 @@ class NothingAt(AnswerWithNotes):
 
     @property
     def code(self) -> str:
-        """The code of the error that it would be alone."""
+        """The code of the error that a question about this time alone would get."""
         return NoDataError.code
 
 
@@ -111,7 +111,7 @@ class InWindow(NamedTuple):
 
 @result()
 class InEach(AnswerWithNotes):
-    """The answers for several windows, in the order of time; `is_all`: time did not run out."""
+    """The answers for several windows in the order of time; not `is_all` if time ran out."""
 
     windows: tuple[InWindow, ...]
     is_all: bool = True
@@ -124,10 +124,14 @@ OneAnswer: TypeAlias = (
 
 @result()
 class OfRobot:
-    """What one robot of a fleet answers; its files are named relative to `bag_dir`.
+    """The answer of one robot of a fleet.
 
-    `notes` are on where the answer was found. `now`: what its ages count from, where that is not
-    the wall clock.
+    Attributes:
+        name: of the robot.
+        bag_dir: files are named relative to it.
+        answer: of the robot.
+        notes: sentences on where the answer was found.
+        now: what ages count from; None for the wall clock.
     """
 
     name: str
@@ -139,7 +143,7 @@ class OfRobot:
 
 @result()
 class OfFleet:
-    """What several robots answer, as one JSON value."""
+    """The answers of several robots as one JSON value."""
 
     value: JsonObject
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerWithNotes:
-    """What most questions return.
+    """The base of most answers.
 
     `notes` are sentences on what was downsampled, left out, clamped or could not be read.
     """

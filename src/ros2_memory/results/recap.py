@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 MOST_SAID: Final = 30
-"""Values of another topic that are listed for one interval; of more there is their number."""
+"""Values of another topic that are listed for one interval; further ones are counted."""
 
 
 @result(
@@ -49,10 +49,14 @@ MOST_SAID: Final = 30
     PLAIN("ended").when("goes_on"),
 )
 class Spell:
-    """A value that held from `first`, of the message that says so, to `until`.
+    """A value that held for some time.
 
-    `ended`: whether a message says otherwise then; else no more is known. `skipped` is how much of
-    that the clock skipped.
+    Attributes:
+        value: the value.
+        first: log time of the message that says so.
+        until: log time of the message that says otherwise; the last known time if not `ended`.
+        ended: whether a message says otherwise.
+        skipped: how much of the time the clock skipped.
     """
 
     value: JsonValue
@@ -63,7 +67,7 @@ class Spell:
 
     @property
     def goes_on(self) -> bool:
-        """Whether no message says that it ended."""
+        """Whether no message says that the value ended."""
         return not self.ended
 
 
@@ -92,12 +96,12 @@ class Episode:
     """A text that held, the texts before and after it, and where the robot was when it began.
 
     Attributes:
-        spell: when it held.
-        previous: the text before; None where there is none, or it was not reached in time.
-        following: the text after, likewise.
-        robot: its pose then, where it is known.
-        said: what another topic said meanwhile, if that was asked.
-        skipped: how much of the time that it held the clock skipped.
+        spell: the text, and when it held.
+        previous: the text before; None if there is none, or if time ran out before it was found.
+        following: the text after; None as for `previous`.
+        robot: its pose when the text began; None if it is not known.
+        said: values of another topic meanwhile; None if they were not asked for.
+        skipped: how much of the time the clock skipped.
     """
 
     spell: Spell
@@ -128,9 +132,9 @@ def _last_until(answer: Changes) -> Ns | None:
 
 @result("topic", "type", TOTAL("total"), OBJECTS("changes"), span=(_first_change, _last_until))
 class Changes(AnswerWithNotes):
-    """The values that a topic held in a window, in order: the first of `total` of them.
+    """The first values that a topic held in a window, in order.
 
-    With `total` whether that is all of them.
+    `total` is how many there are, and whether all were counted.
     """
 
     topic: str
@@ -140,7 +144,7 @@ class Changes(AnswerWithNotes):
 
 
 class PastChange(NamedTuple):
-    """Something that changed, and how long before another event."""
+    """A change in words, and how long before an event it happened (ns)."""
 
     text: str
     before: Ns
@@ -171,13 +175,13 @@ class Before(AnswerWithNotes):
     """What changed before a time.
 
     Attributes:
-        at: the moment.
-        length: how long before it changes count.
-        changes: nearest first.
+        at: the time.
+        length: how long before it changes are listed (ns).
+        changes: the nearest first.
         more: how many others there are.
         looked_at: the topics that would show a change and were recorded at the time.
-        recorded: how many topics were recorded then in all.
-        robot: where the robot was; None where that is not known.
+        recorded: how many topics were recorded at the time in all.
+        robot: the pose of the robot; None if it is not known.
         speed_mps: from its pose topic.
         state: booleans, statuses that are not ok and the goal of each action, at that time.
         after: the first changes in the seconds after, nearest first; their `before` is negative.
@@ -207,12 +211,19 @@ class Before(AnswerWithNotes):
     PLAIN("goes_on").if_any,
 )
 class Event:
-    """Something that happened at `start`, and lasted until `end` if it took time.
+    """Something that happened.
 
-    With `goes_on`, the real end is not known. `before`: what changed before, nearest first.
-    `places`: the named places that the robot was in, the smallest first. `score`: the best one of a
-    thing in view. `skipped`: how much of its time the clock skipped. `point`: where it happened
-    (m), in the frame of the recap, where that is known of the robot itself.
+    Attributes:
+        kind: of the event.
+        start: when it began.
+        end: when it ended; None if it took no time.
+        text: the event in words.
+        goes_on: whether it had not ended at `end`.
+        before: what changed before, nearest first.
+        places: the named places that the robot was in, the smallest first.
+        score: the best score of a thing in view.
+        skipped: how much of its time the clock skipped.
+        point: where the robot was (m), in the frame of the recap; None if that is not known.
     """
 
     kind: str
@@ -252,21 +263,21 @@ class Recap(AnswerWithNotes):
         start: of the window, inclusive.
         end: of the window, inclusive.
         now: what ages count from.
-        distance_m: length of the driven path; None, as what follows, where no pose gives it.
-        max_speed: in m/s.
-        stood: how long the robot stood in all, in standstills of `shortest_stop` or longer. One
-            that goes on outside of the window counts as far as it is inside, so the times of
-            windows that follow each other add up. None where poses are there, but too noisy or too
-            few to know.
+        distance_m: length of the driven path; None without poses.
+        max_speed: in m/s; None without poses.
+        stood: how long the robot stood in standstills of `shortest_stop` or longer. A standstill
+            counts as far as it is inside the window, so the times of successive windows add up.
+            None without poses, and if they are too noisy or too few to know.
         shortest_stop: shorter stops do not count.
         frame_id: of the places in texts.
         events: what happened, in order of time.
         throughout: things that a detector saw during the whole window at its usual rate.
-        counts: how many events of each kind there were, also of those that are left out.
+        counts: how many events of each kind there were, with those that are not listed.
         path_sum_m: the plain sum of distances, if noise adds much to it.
         gap_m: the path across gaps in the recording, in straight lines; None without a gap.
-        where: the region's name, or its bounds, where only what happened there was asked for.
-        visits: how often the robot was there; `inside` is how long in all.
+        where: the name or the bounds of the region that was asked about; None for everywhere.
+        visits: how often the robot was in the region.
+        inside: for how long it was in the region in all.
         skipped: how much of the window the clock skipped.
     """
 

@@ -46,6 +46,10 @@ _XY: Final = vector("xy", 2)
 _LONGEST_NAME: Final = 100
 """Characters of the text of an error."""
 _MISSED: Final = "not_seen_where_expected"
+_MOST_STAYS: Final = 8
+"""Newest places of a thing that are listed, unless a reply becomes too long."""
+_MOST_DIFFERENCES: Final = 5
+"""Things of each kind of difference that are listed, unless a reply becomes too long."""
 _DIFFERENCES: Final = (
     "moved",
     "appeared",
@@ -68,9 +72,15 @@ _LABEL: Final = unit(lambda label: shortened(named(label), 40))
     PLAIN("times", "count"),
 )
 class ThingStay:
-    """An interval in which a thing was at a place (m): first and last seen there, and how often.
+    """An interval in which a thing was at a place.
 
-    `at_once` is how many there were; None where that is not compared.
+    Attributes:
+        start: when it was first seen there.
+        end: when it was last seen there.
+        place: in metres.
+        count: how often it was seen there.
+        inside: the named places around it, the smallest first.
+        at_once: how many such things were there; None if they are not compared.
     """
 
     start: Ns
@@ -89,11 +99,13 @@ class ThingStay:
     digits(2)("likely_now", "likely"),
 )
 class UsualPlace:
-    """A place (m) where a thing usually is.
+    """A place where a thing usually is.
 
     Attributes:
-        share: of the hours in which it was seen, 0 to 1.
-        hours: of the local day at which it is there, as "07-09, 16-23": until 09:00 and 23:00.
+        place: in metres.
+        inside: the named places around it, the smallest first.
+        share: of the hours in which the thing was seen, 0 to 1.
+        hours: when it is there by the local clock, as "07-09, 16-23": until 09:00 and 23:00.
         likely: how likely it is there now, 0 to 1.
     """
 
@@ -132,12 +144,12 @@ _USUALLY: Final = Unit(_usual_places)
 
 
 def _other_frame(frame_id: str, scope: Scope) -> JsonValue | Absent:
-    """Returns a frame that is not that of the whole reply."""
+    """Returns a frame, unless it is that of the whole reply."""
     return Absent.ABSENT if frame_id == getattr(scope.answer, "frame_id", None) else named(frame_id)
 
 
 def thing(most_stays: int) -> Keys:
-    """Returns the keys of a thing with so many of its newest places."""
+    """Returns the keys of a thing with the `most_stays` newest of its places."""
     return keys(
         NAME("label").in_short,
         COUNTS_BY_NAME("labels").if_any,
@@ -171,21 +183,23 @@ class Thing:
     """One thing that detectors saw, or one label of things that move by themselves.
 
     Attributes:
-        labels: how often each of several labels was given to it, the commonest first.
-        also_seen_as: other spellings that it was seen under, the commonest first; `misread_as`:
-            labels of other things.
-        place: its last one (m), in `frame_id`; `spread_m` is the root mean square distance of its
-            detections there.
+        label: its name.
+        also_seen_as: other spellings of the label, the commonest first.
+        place: its last place (m), in `frame_id`.
+        spread_m: root mean square distance of its detections from `place`.
         inside: the named places that it is in, the smallest first.
-        best, median: of its scores; None without any.
-        robot: x, y (m) and yaw (rad) from which it was last seen; None where that is not known.
-        moved: its places in order, where there are several.
-        at_once: how many were seen at the same time: of what moves by itself, and of several things
-            at one place; else None.
+        best, median: of its scores; None without scores.
+        robot: x, y (m) and yaw (rad) from which it was last seen; None if that is not known.
+        still_there: what is known of it since then.
+        moved: its places in order; empty if it has one place.
+        misread_as: labels of other things that were given to it.
+        labels: how often each of several labels was given to it, the commonest first.
+        at_once: how many were seen at the same time, of movers and of several things at one place;
+            else None.
         moves: whether it moves by itself.
-        near_m: how far it is from what it is to be near, where that was asked for.
-        usually: where it usually is, by the hour; None where too little is known to say, empty
-            where the hours say no more than the place where it was last.
+        near_m: its distance from the thing or point that was asked about.
+        usually: where it usually is, by the hour. None if too little is known to say; empty if the
+            hours say no more than its last place.
     """
 
     label: str
@@ -211,27 +225,27 @@ class Thing:
 
     @property
     def yaw(self) -> float | None:
-        """The heading of the robot then (rad)."""
+        """The heading (rad) of the robot when it last saw the thing."""
         return None if self.robot is None else self.robot[2]
 
     @property
     def moved_times(self) -> int | None:
-        """How often it moved, where it has several places."""
+        """How often the thing moved; None if it has one place."""
         return len(self.moved) - 1 if self.moved else None
 
     @property
     def since(self) -> Ns | None:
-        """When it was first seen at its last place, where it has several."""
+        """When the thing was first seen at its last place; None if it has one place."""
         return self.moved[-1].start if self.moved else None
 
     @property
     def before(self) -> str:
-        """The named place where it was before; empty where it was in none, or did not move."""
+        """The named place in which the thing was before; empty if none, or if it did not move."""
         return next(iter(self.moved[-2].inside), "") if len(self.moved) > 1 else ""
 
     @property
     def missed_there(self) -> StillThere | None:
-        """What is known since it was last seen, if it was missed."""
+        """What is known of the thing since it was last seen, if it was missed."""
         known = self.still_there
         return known if known is not None and known.state == _MISSED else None
 
@@ -244,11 +258,11 @@ SHORT_THING: Final = Keys(
         OBJECT("still_there", "missed_there").if_known,
     )
 )
-"""What a thing is, where it was last, since when, where before, and whether it was missed."""
+"""The label of a thing, its last place, since when, the place before, and whether it was missed."""
 
 
 def listed_things(form: Keys) -> Keys:
-    """Returns the keys of things, each with these keys."""
+    """Returns the keys of `Things`; `form` are those of each thing."""
     return keys(
         NAME("frame_id"),
         objects(form)("things").along("last_seen"),
@@ -258,9 +272,9 @@ def listed_things(form: Keys) -> Keys:
     )
 
 
-@result(*listed_things(thing(8)).keys, span=("oldest", "now"))
+@result(*listed_things(thing(_MOST_STAYS)).keys, span=("oldest", "now"))
 class Things(AnswerWithNotes):
-    """Things, those seen last first; `labels` counts all of them, also those that are not shown."""
+    """Things, the last seen first. `total` and `labels` count those that are not listed, too."""
 
     frame_id: str
     things: tuple[Thing, ...]
@@ -276,24 +290,24 @@ class Things(AnswerWithNotes):
 
 
 class Pair(NamedTuple):
-    """A number in both compared windows."""
+    """A number in each of two compared windows; None if it is not known."""
 
     this: float | None
     other: float | None
 
 
 def _unit_of_pairs(places: int) -> Unit:
-    """Returns the unit of pairs whose numbers are rounded to so many places."""
+    """Returns the unit of a pair with numbers of so many decimal places."""
     return an_object(keys(digits(places)("this"), digits(places)("with", "other")))
 
 
 def _named_pairs(places: int) -> Unit:
-    """Returns the unit of pairs by name."""
+    """Returns the unit of pairs by name, with numbers of so many decimal places."""
     return by_name(_unit_of_pairs(places), _LONGEST_NAME)
 
 
 def _spot(name: str, time: str) -> Unit:
-    """Returns the unit of a place at a time, which has this name."""
+    """Returns the unit of a stay: its place, and the time in the attribute `time` as `name`."""
     place = (_XY.spread("place"), INSIDE("inside"))
     seen = (TIME(name, time), LOCAL_OF_DAYS("local", time))
     return an_object(keys(*place, *seen, PLAIN("at_once").if_known))
@@ -307,10 +321,11 @@ def _spot(name: str, time: str) -> Unit:
     PLAIN("looks").when("missed"),
 )
 class ComparedThing:
-    """A thing in both windows: where it was in the earlier, and in the later.
+    """A thing in the earlier and in the later window.
 
     Attributes:
-        before: None where it was not known then; `after`: None where it was not seen then.
+        before: where it was in the earlier window; None if it was not known then.
+        after: where it was in the later window; None if it was not seen then.
         missed: when it was not seen where expected.
         looks: detector messages that should have had it.
     """
@@ -331,7 +346,7 @@ class ComparedThing:
     LOCAL_OF_DAYS("local", "last"),
 )
 class MoverSeen:
-    """A mover in a window: the most at once, how often it was seen, and where last."""
+    """A mover in a window: how many at most at once, how often seen, and its last place (m)."""
 
     at_once: int
     count: int
@@ -342,7 +357,7 @@ class MoverSeen:
 
 @result(_LABEL("label"), OBJECT("was", "before").if_known, OBJECT("is", "after").if_known)
 class ComparedMover:
-    """A mover in the earlier window and in the later; None where it was not seen."""
+    """A mover in the earlier and in the later window; None where it was not seen."""
 
     label: str
     before: MoverSeen | None
@@ -350,17 +365,21 @@ class ComparedMover:
 
 
 def _differences(most: int) -> Keys:
-    """Returns the keys of compared things, with so many of each kind, twice as many that moved."""
+    """Returns the keys of `ComparedThings` with at most so many of each; twice as many moved."""
     others = (OBJECTS(name).first(most, "total").if_any for name in _DIFFERENCES[1:])
     return keys(OBJECTS("moved").first(2 * most, "total").if_any, *others)
 
 
 @result()
 class ComparedThings:
-    """The things that differ between two windows; `same` counts those that do not.
+    """The things that differ between two windows.
 
-    `not_comparable`: seen in both, in the coordinates of different runs of odometry.
-    `more_or_fewer`: of those that stand together, another number.
+    Attributes:
+        moved, appeared, not_seen_where_expected, not_looked_at: in the later window.
+        same: how many things do not differ.
+        movers: what moves by itself.
+        not_comparable: seen in both, in the coordinates of different runs of odometry.
+        more_or_fewer: things at one place whose number differs.
     """
 
     moved: tuple[ComparedThing, ...] = ()
@@ -379,9 +398,13 @@ class ComparedThings:
 
 
 class StandstillPlace(NamedTuple):
-    """A place (m) and the named one it is in: seconds for which the robot stood, since when first.
+    """A place where the robot stood in one window longer than in the other.
 
-    `since` has no time where it did not stand there.
+    Attributes:
+        place: x, y in metres.
+        inside: the named places around it, the smallest first.
+        seconds: for how long it stood there in each window.
+        since: when it first stood there in each window; None if it did not.
     """
 
     place: tuple[float, float]
@@ -391,7 +414,7 @@ class StandstillPlace(NamedTuple):
 
 
 class FarFromOther(NamedTuple):
-    """A point of a path (m): its distance from the other, and when the robot was first there."""
+    """A point of a path: x, y (m), its distance from the other path, when it was first there."""
 
     place: tuple[float, float]
     inside: tuple[str, ...]
@@ -421,9 +444,9 @@ _FAR: Final = an_object(
 
 
 def compared(most: int) -> Keys:
-    """Returns the keys of a comparison, with so many of each kind that differs.
+    """Returns the keys of a `Comparison` with at most so many rows of each kind.
 
-    A part in which nothing differs is left out.
+    A part without differences is left out.
     """
     return keys(
         _unit_of_pairs(1)("duration_s", "lengths"),
@@ -441,22 +464,25 @@ def compared(most: int) -> Keys:
     )
 
 
-@result(*compared(5).keys, span=("oldest", "newest"))
+@result(*compared(_MOST_DIFFERENCES).keys, span=("oldest", "newest"))
 class Comparison(AnswerWithNotes):
     """What differs between two windows.
 
     Attributes:
-        oldest: where the earlier window begins; `newest`: where the later one ends.
-        lengths: of the windows (s), and `recorded` how much of each was recorded.
-        frame_id: of the things' places.
-        way: numbers by name: metres, m/s, seconds and counts.
-        way_frame_id: frame of the places where the robot stood, and of the points of the path.
-        stood: where it stood in one window longer than in the other.
-        farthest: the points of this path, and of the other one, that are farthest from the other
-            and from this; None where the paths are the same.
+        oldest: where the earlier window begins.
+        newest: where the later window ends.
+        lengths: of the windows (s).
+        recorded: how much of each window was recorded (s).
+        frame_id: of the places of things.
+        things: that differ.
+        way: numbers of the path by name: metres, m/s, seconds and counts.
         places: minutes in each named place.
-        errors: reports of each error.
-        silences: seconds for which each topic was silent.
+        errors: how often each error was reported.
+        silences: for how many seconds each topic was silent.
+        way_frame_id: of the path, and of the places where the robot stood.
+        stood: where it stood in one window longer than in the other.
+        farthest: the point of each path that is farthest from the other path; None if the paths are
+            the same.
     """
 
     oldest: Ns
@@ -475,14 +501,17 @@ class Comparison(AnswerWithNotes):
 
     @property
     def farthest_apart(self) -> list[tuple[str, FarFromOther]]:
-        """The farthest points, with the window that they are of."""
+        """The farthest points with the names of their windows."""
         points = zip(("this", "with"), self.farthest, strict=True)
         return [(name, point) for name, point in points if point is not None]
 
     @property
     def frames(self) -> JsonObject:
-        """The frames that places are in, where there are any; that of the path if it is another."""
-        frames: list[str | None] = [self.frame_id or None] * self.things.is_any
-        frames += [self.way_frame_id] * bool(self.stood or self.farthest_apart)
-        by_key = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
-        return {key: frame and named(frame) for key, frame in by_key}
+        """The frames of the places that are shown: of things, and of the path if it is another."""
+        frames: list[str | None] = []
+        if self.things.is_any:
+            frames.append(self.frame_id or None)
+        if (self.stood or self.farthest_apart) and self.way_frame_id not in frames:
+            frames.append(self.way_frame_id)
+        names = [frame and named(frame) for frame in frames]
+        return dict(zip(("frame_id", "way_frame_id"), names, strict=False))

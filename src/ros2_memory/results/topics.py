@@ -75,10 +75,13 @@ class TopicRow:
     SECONDS("age_s").if_known,
 )
 class TopicValue(AnswerWithNotes):
-    """One message of one topic; with `latched` it is valid at any age.
+    """One message of one topic.
 
-    `age` counts back from now for a relative question, else from the time asked about. `frame_id`
-    is that of the message's header; empty where it has none.
+    Attributes:
+        sample: its log time and value.
+        age: before now for a relative question, else before the time asked about.
+        latched: whether it is valid at any age.
+        frame_id: of the message's header; empty if it has none.
     """
 
     topic: str
@@ -128,10 +131,13 @@ def _last_time(answer: TopicRange) -> Ns | None:
     span=(_first_time, _last_time),
 )
 class TopicRange(AnswerWithNotes):
-    """Samples of a window, evenly spaced over all `total` messages in it, with the first and last.
+    """Samples of a window, evenly spaced over its messages, with the first and the last.
 
-    Their values are objects by `fields`, if any were requested. `extremes` are those of all
-    messages, for the requested numeric fields.
+    Attributes:
+        total: how many messages the window has.
+        samples: if `fields` were requested, their values are objects by field.
+        extremes: of all messages, for the requested numeric fields.
+        fields: the requested fields.
     """
 
     topic: str
@@ -143,30 +149,31 @@ class TopicRange(AnswerWithNotes):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of the table: a field that holds an object has one for each of its parts."""
-        local = ["local"] * any(self._locals())
-        return ("timestamp", *map(named, self._names()), *local)
+        """The columns of the table; a field with an object has a column for each of its parts."""
+        columns = ["timestamp", *map(named, self._names())]
+        if any(self._locals()):
+            columns.append("local")
+        return tuple(columns)
 
     @property
     def rows(self) -> list[JsonValue]:
-        """A row for each sample: its time and cells; null where a sample has no such part."""
-        names, table = self._names(), zip(self.samples, self._cells(), self._locals(), strict=True)
-        return [
-            [
-                moment(sample.time),
-                *(quote(cells.get(name), name) for name in names),
-                *([] if local is None else [local]),
-            ]
-            for sample, cells, local in table
-        ]
+        """A row for each sample: its time and cells; None in a column that a sample lacks."""
+        names = self._names()
+        rows: list[JsonValue] = []
+        for sample, cells, local in zip(self.samples, self._cells(), self._locals(), strict=True):
+            row = [moment(sample.time), *(quote(cells.get(name), name) for name in names)]
+            if local is not None:
+                row.append(local)
+            rows.append(row)
+        return rows
 
     @property
     def extremes_by_field(self) -> list[tuple[str, Extremes]]:
-        """The extremes, with the name of their field."""
+        """The extremes by field."""
         return [(extremes.field, extremes) for extremes in self.extremes]
 
     def _locals(self) -> list[str | None]:
-        """Returns the local time of each sample, where they span so much that it is shown."""
+        """Returns the local time of each sample; None if the samples do not span much time."""
         times = LocalTimes(_first_time(self), _last_time(self))
         return [times.text(sample.time) for sample in self.samples]
 
@@ -181,7 +188,7 @@ class TopicRange(AnswerWithNotes):
 
 
 def _parts(path: str, value: JsonValue) -> Iterator[tuple[str, JsonValue]]:
-    """Yields the parts of a value that are no objects with parts, by their dot-paths."""
+    """Yields the innermost parts of a value, by their dot-paths."""
     if not isinstance(value, dict) or not value:
         yield path, value
         return
@@ -209,16 +216,16 @@ class TypeFields(AnswerWithNotes):
     span=("found.sample.time", "seen_at"),
 )
 class Match(AnswerWithNotes):
-    """The newest message that met a condition; `found` is None after a search without a match.
+    """The newest message that met a condition; None after a search without a match.
 
-    Where `found` is None and there are `notes`, the search was not complete.
+    A search without a match was not complete if there are `notes`.
     """
 
     found: TopicValue | None
 
     @property
     def seen_at(self) -> Ns | None:
-        """The time that the age of the match counts from."""
+        """The time from which the age of the match counts."""
         return None if self.found is None else self.found.sample.time + (self.found.age or 0)
 
 
@@ -236,14 +243,14 @@ class Match(AnswerWithNotes):
     SECONDS("age_s", "matched.age").if_known,
 )
 class ValueWhen(AnswerWithNotes):
-    """A match on one topic, and the value of another at that time; None if it had none yet."""
+    """A match on one topic, and the value of another topic then; None if it had none yet."""
 
     matched: TopicValue
     value: TopicValue | None = None
 
     @property
     def value_age(self) -> Ns:
-        """The age of the value; 0 where the message is of the same time."""
+        """The age of the value at the match."""
         return 0 if self.value is None else self.value.age or 0
 
 
@@ -258,7 +265,7 @@ class LabelledPlace:
 
 
 def _other_topic(topic: str, scope: Scope) -> JsonValue | Absent:
-    """Returns a topic that is not that of the whole reply."""
+    """Returns a topic, unless it is that of the whole reply."""
     return Absent.ABSENT if topic == getattr(scope.answer, "topic", None) else topic
 
 
@@ -285,21 +292,22 @@ class Sighting:
 
     Attributes:
         topic: of the messages.
-        first: log time of the first of them; of the earliest one read where `begun` is False.
-        last: of the last.
-        until: of the next one, which says otherwise; as `last` where none does, and of a thing.
+        first: log time of the first message; of the earliest message read if not `begun`.
+        last: log time of the last message.
+        until: log time of the next message, which does not match. As `last` for a thing, and if
+            there is no such message.
         messages: how many there are; 0 for a goal of an action.
-        begun: whether the message before the first is known not to belong.
-        robot: where the robot was at the first; at the last where that is the sighting of a thing,
-            a goal, or began before what was read.
-        thing: where the thing itself was then, if the message has that.
-        matched: the texts of the last message that met the condition, where that is on texts.
-        value: the requested fields of the last message; None where none were, or it has none. Of a
-            goal its id and its status.
-        score: of the detection, if the message has that; the best of several.
-        skipped: how much of the time from the first to `until` the clock skipped.
+        begun: whether the message before the first is known not to match.
+        robot: the pose of the robot at the first message if `robot_at_first`, else at the last one:
+            for a thing, for a goal, and if not `begun`.
+        thing: where the thing itself was at the last message, if the message has that.
+        matched: the texts of the last message that met a condition on texts.
+        value: the requested fields of the last message; None without fields. For a goal its id and
+            its status.
+        score: the best score of the detections.
+        skipped: how much of the time from `first` to `until` the clock skipped.
         robot_at_first: whether `robot` is of the first message.
-        said: what another topic said meanwhile, if that was asked.
+        said: values of another topic meanwhile; None if they were not asked for.
     """
 
     topic: str
@@ -319,12 +327,12 @@ class Sighting:
 
     @property
     def robot_time_key(self) -> str:
-        """The key of the time that `robot` is of."""
+        """The key of the time at which the robot was there."""
         return "first_seen" if self.robot_at_first else "last_seen"
 
     @property
     def began_earlier(self) -> bool:
-        """Whether it may have begun before the first message."""
+        """Whether the sighting may have begun before its first message."""
         return not self.begun
 
 
@@ -341,13 +349,16 @@ class Sighting:
     span=("oldest", "now"),
 )
 class Sightings(AnswerWithNotes):
-    """Sightings in the requested order; `more`: there are others. `start` and `end` were searched.
+    """Sightings in the requested order.
 
-    `topic` is that of all, where one alone was searched. With `of_texts` there are `episodes` in
-    their place: of its texts, which hold until the next.
-
-    `total` is how many there are; None if the search ended before it had counted all. `unknown` is
-    for how long something was recorded, and it is not known whether matches count.
+    Attributes:
+        more: whether there are others.
+        total: how many there are; None if the search ended before all were counted.
+        start, end: of the time that was searched.
+        unknown: for how long it is not known, though something was recorded, whether matches count.
+        topic: of all sightings; empty if several topics were searched.
+        of_texts: whether there are `episodes` in place of sightings.
+        episodes: of texts that hold until the next text.
     """
 
     sightings: tuple[Sighting, ...]
@@ -369,18 +380,18 @@ class Sightings(AnswerWithNotes):
 
     @property
     def counted(self) -> tuple[int, bool]:
-        """How many there are, and whether these are all."""
+        """How many there are, and whether all were counted."""
         shown = len(self.sightings) + len(self.episodes)
         return (shown, False) if self.total is None else (self.total, True)
 
 
 BinColumn: TypeAlias = Literal["count", "duration", "minutes", "metres", "number", "time"]
-"""What the values of a column are: whole numbers, nanoseconds (shown in seconds, or in minutes),
+"""The kind of the values of a column: whole numbers, nanoseconds (shown as seconds or as minutes),
 metres, plain numbers, log times."""
 
 
 def _clock(second: int) -> str:
-    """Returns a time of day."""
+    """Returns a second of a day as `14:05:09`."""
     hours, rest = divmod(second, _MINUTE_S * _MINUTE_S)
     return f"{hours:02d}:{rest // _MINUTE_S:02d}:{rest % _MINUTE_S:02d}"
 
@@ -393,9 +404,12 @@ def _clock(second: int) -> str:
     "of_days",
 )
 class Usual:
-    """The usual first time of a day, in seconds since local midnight, over `days` days.
+    """When something first happens on a day, in seconds since local midnight.
 
-    `of_days` is the number of days with recorded data.
+    Attributes:
+        median_s, earliest_s, latest_s: over the days on which it happened.
+        days: how many these are.
+        of_days: how many days have recorded data.
     """
 
     median_s: int
@@ -420,14 +434,13 @@ class Bins(AnswerWithNotes):
 
     Attributes:
         by: the kind of the bins.
-        about: the topics or the place that was counted.
-        start: of the window, as far as the memory reaches; inclusive.
-        end: of the window, likewise.
-        columns: the name of each column after that of the bin, and what its values are.
-        rows: for each bin its name and its values; None if there is none.
+        about: the topics, or the place, that the counts are about.
+        start, end: of the window as far as the memory reaches; inclusive.
+        columns: name and kind of each column after that of the bin.
+        rows: name and values of each bin; None for a missing value.
         all: the values of all bins together.
-        usual: the usual time of the first beginning in a day, where beginnings are counted.
-        usual_exit: of the first exit in a day, where visits are counted.
+        usual: when the first one of a day begins, if beginnings are counted.
+        usual_exit: when the robot first leaves on a day, if visits are counted.
     """
 
     by: str
@@ -442,12 +455,12 @@ class Bins(AnswerWithNotes):
 
     @property
     def topic(self) -> JsonValue:
-        """What was counted: a name where it is one."""
+        """The topics or the place that the counts are about; a single one as its name."""
         return self.about[0] if len(self.about) == 1 else [*self.about]
 
     @property
     def header(self) -> tuple[str, ...]:
-        """The names of the table's columns; a time has two, the second in Unix seconds."""
+        """The names of the columns; a time has a second column at the end, in Unix seconds."""
         unix = (f"{name}_unix" for name, kind in self.columns if kind == "time")
         return (self.by, *(name for name, _ in self.columns), *unix)
 
@@ -462,16 +475,17 @@ class Bins(AnswerWithNotes):
         return self._cells(self.all)
 
     def _cells(self, values: tuple[float | None, ...]) -> list[JsonValue]:
-        kinds = [kind for _, kind in self.columns]
-        shown = [
-            None if value is None else _cell(value, kind)
-            for value, kind in zip(values, kinds, strict=True)
-        ]
-        times = (at for at, kind in zip(values, kinds, strict=True) if kind == "time")
-        return [*shown, *(None if at is None else moment(int(at)) for at in times)]
+        cells: list[JsonValue] = []
+        unix: list[JsonValue] = []
+        for value, (_, kind) in zip(values, self.columns, strict=True):
+            cells.append(None if value is None else _cell(value, kind))
+            if kind == "time":
+                unix.append(None if value is None else moment(int(value)))
+        return [*cells, *unix]
 
 
 def _cell(value: float, kind: BinColumn) -> JsonValue:
+    """Returns a value as it is shown; a time as local time."""
     match kind:
         case "count":
             return int(value)
@@ -484,5 +498,5 @@ def _cell(value: float, kind: BinColumn) -> JsonValue:
         case "number":
             return rounded(value, 6)
         case "time":
-            # As arguments take it: all of the second, of which the Unix time beside it is exact.
+            # To the second, as arguments take it: the Unix time beside it is exact.
             return local_time(int(value) // NS_PER_S * NS_PER_S).isoformat(sep=" ")
