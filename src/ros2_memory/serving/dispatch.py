@@ -115,7 +115,7 @@ class Dispatcher:
         most_questions: how many calls are kept for the page.
 
     Attributes:
-        readable: the names of the tools that a resource can use.
+        readable: the tools that a resource can use, by name.
         blocking: the queue of the tools that are declared as blocking.
         quick: the queue of all other tools.
     """
@@ -136,8 +136,7 @@ class Dispatcher:
         self.questions = QuestionLog(most_questions)
         self.memory = memory
         self._tools = {tool.name: tool for tool in tools}
-        self._readable = self._tools | {tool.name: tool for tool in readable}
-        self.readable = frozenset(self._readable)
+        self.readable = self._tools | {tool.name: tool for tool in readable}
         self._replies = replies
         self._call_timeout_s = call_timeout_s
         self._telemetry = telemetry
@@ -174,7 +173,7 @@ class Dispatcher:
             robots: the robots of a fleet that the client may ask about; None for all.
             part: returns the part of the memory that answers; tools that write are refused then.
         """
-        tools = self._readable if for_resource else self._tools
+        tools = self.readable if for_resource else self._tools
         begun = time.perf_counter_ns()
         outcome, reply = "cancelled", Reply("")
         with self._running_call() as (call, correlation_id):

@@ -99,8 +99,10 @@ def reading(path: Path) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno in _GONE:
             raise BagVanishedError(str(path), "the file is not there any more") from error
-        error_type = BagUnreachableError if _may_pass(error) else BagError
-        raise error_type(str(path), reason_of(error)) from error
+        is_transient = isinstance(error, (OSError, MemoryError, UnreachableError))
+        if is_transient or sqlite_code(error) in _DISK_ERRORS:
+            raise BagUnreachableError(str(path), reason_of(error)) from error
+        raise BagError(str(path), reason_of(error)) from error
 
 
 @contextmanager
@@ -130,13 +132,6 @@ def reason_of(error: Exception) -> str:
         return f"it cannot be opened or read: {error}"
     words = " ".join(str(error).split())[:160]
     return f"damaged: {words} ({type(error).__name__})" if words else type(error).__name__
-
-
-def _may_pass(error: Exception) -> bool:
-    """Returns whether reading the same bytes again may succeed."""
-    if isinstance(error, (OSError, MemoryError, UnreachableError)):
-        return True
-    return sqlite_code(error) in _DISK_ERRORS
 
 
 MAX_CHUNK_MB: Final = 64

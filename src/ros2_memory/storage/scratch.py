@@ -15,13 +15,18 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from ros2_memory.storage.errors import UnreachableError, UnreadableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
 
+Fill: TypeAlias = "Callable[[Path, Callable[[int], None]], tuple[Path, str]]"
+"""Makes a file in an empty folder; returns its path and a note on it.
+
+Calls the function that it is given with a number of bytes before it writes as many.
+"""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 _PREFIX = "ros2-memory-unpacked-"
 _UNLOCKED_S = 60
@@ -67,15 +72,12 @@ class Scratch:
         self._lock = threading.RLock()
 
     @contextmanager
-    def use(
-        self, key: Hashable, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
-    ) -> Iterator[tuple[Path, str]]:
+    def use(self, key: Hashable, fill: Fill) -> Iterator[tuple[Path, str]]:
         """Yields a temporary file and a note on it. The file is not deleted inside the block.
 
         Args:
             key: identifies the content of the file.
-            fill: makes the file if it is not there. It receives an empty folder, and a function to
-                call with a number of bytes before it writes as many; it returns file and note.
+            fill: makes the file if it is not there.
 
         Raises:
             UnreadableError: the file does not fit into `max_bytes`.
@@ -95,7 +97,7 @@ class Scratch:
             with self._lock:
                 copy.users -= 1
 
-    def _make_copy(self, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]) -> _Copy:
+    def _make_copy(self, fill: Fill) -> _Copy:
         """Makes a copy in a new folder; nothing is left of it after a failure."""
         try:
             if self._root is None or not self._root.exists():

@@ -136,8 +136,8 @@ class SqliteBags:
         large: the turn to hold much of a bag.
     """
 
-    def __init__(self, max_message_mb: int, large: LargeReads | None) -> None:
-        self._large = large or LargeReads()
+    def __init__(self, max_message_mb: int, large: LargeReads) -> None:
+        self._large = large
         self._limit = SizeLimit(max_message_mb << 20, self._large.acquire)
         self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
 

@@ -31,7 +31,6 @@ from ros2_memory.storage.base import (
 )
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
-    MAX_CHUNK_MB,
     ContradictionError,
     LostError,
     SizeLimit,
@@ -112,8 +111,8 @@ class McapBags:
 
     def __init__(
         self,
-        cache_mb: int = 64,
-        max_chunk_mb: int = MAX_CHUNK_MB,
+        cache_mb: int,
+        max_chunk_mb: int,
         large: LargeReads | None = None,
     ) -> None:
         self.limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
@@ -380,8 +379,8 @@ class _Reading:
         messages = self._verified_messages(content)
         messages = messages.select(np.isin(messages.channels, [*self._wanted]))
         if yielded is not None:
-            offsets = self._trusted_messages(yielded, yielded.channels).offsets
-            messages = messages.select(~np.isin(messages.offsets, offsets))
+            known = read_trusted_index(yielded, self._index_bytes(yielded), yielded.channels)
+            messages = messages.select(~np.isin(messages.offsets, known.offsets))
         yield from self._batches_of(content, messages)
 
     def _batches_of(self, content: ReadChunks, messages: MessageTable) -> Iterator[Batch]:
@@ -448,7 +447,7 @@ class _Reading:
         window = self._window
         first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
         with suppress(UnreadableError), as_unreadable():
-            messages = self._trusted_messages(chunk, self._wanted)
+            messages = read_trusted_index(chunk, self._index_bytes(chunk), self._wanted)
             times, _ = self._wanted_inside(messages, self._wanted)
             if not times.size:
                 return None
@@ -523,9 +522,6 @@ class _Reading:
 
     def _index_bytes(self, chunk: Chunk) -> bytes:
         return self._file.read(chunk.offset + chunk.length, chunk.index_length)
-
-    def _trusted_messages(self, chunk: Chunk, wanted: Collection[int]) -> MessageTable:
-        return read_trusted_index(chunk, self._index_bytes(chunk), wanted)
 
     def _record(self, data: bytes, channels: Mapping[int, Channel], place: int, time: Ns) -> Record:
         """Returns the message at a verified place of a decompressed chunk."""
