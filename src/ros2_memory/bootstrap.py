@@ -203,16 +203,16 @@ def build_housekeeper(
         background=background,
         moments_bytes=moments_bytes,
         rule_bytes={rule.name: rule.max_bytes for rule in rules},
-        watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,
-        screening=_screening_of(settings, bag_dir, reader, writer),
+        watch=_triggers_builder(settings, bag_dir, bags, own, rules) if rules else None,
+        screening=_build_screening(settings, bag_dir, reader, writer),
         static_topics=settings.data.tf_static_topics,
         grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
-        memory=_memory_days_of(settings, bag_dir, bags, own, writer),
-        cutter=_topic_cutter_of(settings, bag_dir, reader, writer),
+        memory=_build_memory_days(settings, bag_dir, bags, own, writer),
+        cutter=_build_topic_cutter(settings, bag_dir, reader, writer),
     )
 
 
-def _topic_cutter_of(
+def _build_topic_cutter(
     settings: Settings, bag_dir: Path, reader: BagReader, writer: BagWriter
 ) -> TopicCutter | None:
     """Returns the part that cuts topics with a shorter life out of bags; None without any."""
@@ -234,7 +234,7 @@ def _topic_cutter_of(
     )
 
 
-def _memory_days_of(
+def _build_memory_days(
     settings: Settings, bag_dir: Path, bags: BagReader, own: OwnRecordings, writer: BagWriter
 ) -> MemoryDays | None:
     """Returns the part that writes thinned days, or deletes them if none shall stay.
@@ -273,20 +273,20 @@ def _extractor_of(settings: Settings) -> SchemaExtractor:
     return SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
 
 
-def _watch_of(
+def _triggers_builder(
     settings: Settings,
     bag_dir: Path,
     reader: BagReader,
     own: OwnRecordings,
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
-    """Returns what makes the watch over rules that save moments, for a keeper of moments."""
+    """Returns a function that builds the triggers of `rules` for a keeper of moments."""
     from ros2_memory.recorder.process.topics import load_topics
     from ros2_memory.triggers.rules import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
     def is_recorded(topic: str) -> bool:
-        """Whether the list of topics has one now; True if the list has become invalid."""
+        """Whether the list of topics has a topic now; True if the list has become invalid."""
         try:
             return load_topics(settings.recording.topics_file).matches(topic)
         except ConfigError:
@@ -349,7 +349,7 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
     return tuple(rules)
 
 
-def _screening_of(
+def _build_screening(
     settings: Settings, bag_dir: Path, reader: BagReader, writer: BagWriter
 ) -> Screening | None:
     """Returns the part that excludes what `recording.exclude_when` names; None without rules."""
@@ -677,9 +677,8 @@ def places_of(settings: Settings) -> tuple[Place, ...]:
         if isinstance(shape.x, tuple) and isinstance(shape.y, tuple):
             return Rectangle(*shape.x, *shape.y)
         # The model allows no other shape.
-        numbers = (shape.x, shape.y, shape.radius_m)
-        x, y, radius_m = (number if isinstance(number, float) else 0.0 for number in numbers)
-        return Circle(x, y, radius_m)
+        circle = cast("tuple[float, float, float]", (shape.x, shape.y, shape.radius_m))
+        return Circle(*circle)
 
     default = settings.data.map_frame or ""
     return tuple(

@@ -154,6 +154,7 @@ def _descend_each(
     segments: Sequence[str],
     step: Callable[[object, str], object],
 ) -> object:
+    """Returns the rest of a path in each element of a list, as `descend` says."""
     if isinstance(nodes, np.ndarray):
         return ABSENT if nodes.size else []  # numbers have no fields
     values = [descend(node, segments, step) for node in nodes]

@@ -191,6 +191,7 @@ class _Walk:
         return value if all(map(is_, fields.values(), value.values())) else fields
 
     def _without_low_hypotheses(self, value: JsonObject, best: JsonObject) -> JsonValue:
+        """Returns a detection of vision_msgs without its low hypotheses; None if `best` is low."""
         if self._is_low(_hypothesis(best)):
             return None
         results = value["results"]

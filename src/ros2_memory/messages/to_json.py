@@ -220,6 +220,7 @@ class ExactJson:
         return self.write.real(number)
 
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
+        """Renders anything but plain texts, numbers and None."""
         cls: type = type(node)
         layout = _layout_of_class(cls)
         if layout is not None:

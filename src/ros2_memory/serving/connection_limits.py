@@ -113,9 +113,9 @@ class BoundedConnection(H11Protocol):
     @property
     def is_unknown(self) -> bool:
         """Returns whether no request on it was admitted so far."""
-        if not self._is_admitted and self._has_begun():
-            self._is_admitted = is_admitted(self.scope)
-        return not self._is_admitted
+        if self._is_admitted:  # an earlier request was
+            return False
+        return not self._has_begun() or not is_admitted(self.scope)
 
     def __init__(
         self,
@@ -187,7 +187,7 @@ class BoundedConnection(H11Protocol):
 
     def on_response_complete(self) -> None:
         """Handles the end of a reply; another request may follow."""
-        self._is_admitted = not self.is_unknown  # before the request is gone that tells
+        self._is_admitted = not self.is_unknown  # the next request has another scope
         super().on_response_complete()
         self._watch()
 

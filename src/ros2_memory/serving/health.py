@@ -93,8 +93,8 @@ class Health:
     async def __call__(self) -> JsonObject:
         """Returns `ok`, or `degraded` with the reasons in `problems`. Times are Unix seconds.
 
-        No problems are: an empty memory, topics that cannot be decoded, bags that a crash left open
-        and bags that a wrong clock dated. They are counted.
+        Some things are counted and are no problem: topics that cannot be decoded, bags that a crash
+        left open, and bags that a wrong clock dated. Neither is an empty memory.
         """
         with anyio.move_on_after(TIMEOUT_S), suppress(BusyError):
             return await self._queue.run(None, self._report)

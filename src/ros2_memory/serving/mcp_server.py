@@ -193,6 +193,7 @@ class EpisodicServer(MCPServer[object]):
 
         Meanwhile a client that asks for progress receives it every `PROGRESS_EVERY_S`.
         """
+        _drop_body(context)
         async with anyio.create_task_group() as tasks:
             if isinstance(context, Context):
                 meta = context.request_context.meta or {}
@@ -310,14 +311,19 @@ def _client(context: object) -> Hashable:
     request = _http_request(context)
     if request is None:
         return None
-    # It was parsed already. Starlette would keep up to 1 MiB of it for as long as the call waits.
-    request._body = b""
     session = request.query_params.get("session_id")
     if session is not None and request.url.path.startswith(MESSAGES_PATH):
         return session
     address = request.client.host if request.client else ""
     name = request.headers.get("mcp-session-id") or request.headers.get("user-agent", "")
     return address, name[:_LONGEST_NAME]
+
+
+def _drop_body(context: object) -> None:
+    """Frees the body of a request, which was parsed: Starlette would keep it during the call."""
+    request = _http_request(context)
+    if request is not None:
+        request._body = b""
 
 
 def _robots(context: object) -> frozenset[str] | None:

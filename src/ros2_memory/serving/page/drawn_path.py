@@ -182,6 +182,7 @@ def why_no_path(view: View) -> str:
     try:
         return f"{resolve_pose_topic(view)} has no poses"
     except NoDataError as error:
+        # Without the advice that is for tool calls alone.
         return error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
 
 

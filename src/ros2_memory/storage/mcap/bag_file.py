@@ -399,6 +399,7 @@ class _Reading:
         read_chunk = lru_cache(1)(self._read_chunk)
 
         def read_rows(chunk: Chunk) -> RunRows[Record | LostError] | None:
+            """Returns the wanted messages of a chunk, or the error in their place, if any."""
             read_chunk.cache_clear()  # before the next is decompressed
             try:
                 content = read_chunk(chunk)

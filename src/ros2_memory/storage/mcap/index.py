@@ -255,9 +255,11 @@ def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
     apart = [abs(following.start - chunk.end) for chunk, following in pairwise(chunks)]
     usual = _SEAM_TIMES * sorted(apart)[len(apart) // 2] if apart else 0
     seams: list[Seam] = []
-    for nth in [nth for nth, gap in enumerate(apart) if gap > usual]:
+    for nth, gap in enumerate(apart):
+        if gap <= usual:
+            continue
         before, after = chunks[nth], chunks[nth + 1]
-        if apart[nth] * _SEAM_SHARE > before.end - before.start + after.end - after.start:
+        if gap * _SEAM_SHARE > before.end - before.start + after.end - after.start:
             near = chunks[max(nth + 1 - _SEAM_CHUNKS, 0) : nth + 1 + _SEAM_CHUNKS]
             first, last = min([chunk.start for chunk in near]), max([chunk.end for chunk in near])
             seams.append(Seam(nth, first, last))

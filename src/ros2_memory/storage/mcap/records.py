@@ -71,13 +71,13 @@ def offered_as_latched(qos_profiles: str) -> bool:
 
 
 class BodyStream(ReadDataStream):
-    """The body of a record; a text in it that is not UTF-8 must not hide all else."""
+    """The body of a record. Texts that are not UTF-8 are read, too: they must not hide the rest."""
 
     def __init__(self, body: bytes) -> None:
         super().__init__(BytesIO(body))
 
     def read_prefixed_string(self) -> str:
-        """Returns a text."""
+        """Returns a text, with replacement characters for what is not UTF-8."""
         return self.read(self.read4()).decode(errors="replace")
 
 
@@ -135,22 +135,24 @@ class Declarations:
         """Returns whether a record agrees with the known schema or channel of its id, if any."""
         other = Declarations()
         other.add(opcode, body)
-        return not self._differing(other)
+        return not self._contradicts(other)
 
     def update(self, other: Declarations) -> bool:
         """Adds the records of another; returns whether one of them replaced a different one."""
-        differing = self._differing(other)
+        has_replaced = self._contradicts(other)
         self._schemas |= other._schemas
         self._channels |= other._channels
-        return differing
+        return has_replaced
 
-    def _differing(self, other: Declarations) -> bool:
-        return any(
-            self._schemas.get(number, schema) != schema for number, schema in other._schemas.items()
-        ) or any(
-            self._channels.get(number, channel) != channel
-            for number, channel in other._channels.items()
-        )
+    def _contradicts(self, other: Declarations) -> bool:
+        """Returns whether both declare the same id differently."""
+        for number, schema in other._schemas.items():
+            if self._schemas.get(number, schema) != schema:
+                return True
+        for number, channel in other._channels.items():
+            if self._channels.get(number, channel) != channel:
+                return True
+        return False
 
     @property
     def resolved(self) -> bool:
@@ -161,10 +163,10 @@ class Declarations:
         )
 
     def channels(self) -> dict[int, Channel]:
-        """Returns the channels by id; one whose schema is not in the file has an empty schema.
+        """Returns the channels by id; a channel without its schema in the file has an empty one.
 
         Raises:
-            UnreadableError: they are of more topics than any robot has.
+            UnreadableError: there are more topics, or longer names, than any robot has.
         """
         names = sum(
             len(channel.topic) + len(channel.message_encoding)
@@ -211,7 +213,7 @@ def closing_of(file: OpenFile) -> Closing:
 
 
 def is_finished(file: OpenFile) -> bool:
-    """Returns whether it is MCAP and its writer finished it."""
+    """Returns whether a file is MCAP and its writer finished it."""
     return _ends_as_mcap(file) and starts_as_mcap(file)
 
 
@@ -221,7 +223,7 @@ def _ends_as_mcap(file: OpenFile) -> bool:
 
 
 def starts_as_mcap(file: OpenFile) -> bool:
-    """Returns whether it begins with the magic of MCAP, as far as the file reaches."""
+    """Returns whether a file begins with the magic of MCAP, as far as it reaches."""
     return MAGIC.startswith(file.read(0, min(file.size, MAGIC_SIZE)))
 
 
@@ -240,7 +242,7 @@ def require_mcap(file: OpenFile) -> None:
 
 
 _BLOCK_BYTES: Final = 8 << 10
-"""Read at once: loose messages and schemas are small and lie close together."""
+"""Bytes that are read at once: messages outside chunks are small and lie close together."""
 
 
 class FileRecord(NamedTuple):

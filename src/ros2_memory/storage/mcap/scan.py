@@ -209,15 +209,16 @@ class _Scan:
         complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
         self._close_unchunked()
         contents = self.tally.contents()
+        # The summary section is overruled by the data section, and that by the chunks.
         declarations = self.repeated
-        has_other = declarations.update(self.declared)
-        has_other = declarations.update(self.in_chunks) or has_other
+        differs_in_data = declarations.update(self.declared)
+        differs_in_chunks = declarations.update(self.in_chunks)
         channels = declarations.channels()
         totals = {number: total for number, total in contents.totals.items() if number in channels}
         notes = self._notes(contents.totals, totals, complete=complete)
         if note:
             notes.insert(0, note)
-        if has_other and not note.startswith(OTHER_DECLARED):
+        if (differs_in_data or differs_in_chunks) and not note.startswith(OTHER_DECLARED):
             notes.append(OTHER_DECLARED)
         if self.redeclared:
             notes.append("it declares a channel or a type twice, differently: the last one is used")
