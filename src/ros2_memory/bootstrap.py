@@ -452,7 +452,7 @@ class SharedParts(NamedTuple):
 def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedParts:
     """Returns the parts that read and decode the bags of one memory, or of several.
 
-    `cache_mb` is the size of the cache of chunks and of that of columns; None as configured.
+    `cache_mb` is the size of each cache, of chunks and of columns; None as configured.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.

@@ -85,9 +85,9 @@ class Undecodable:
     LOCAL("local", "start", "end"),
 )
 class Gap:
-    """A time without a bag; `end` is where data begins again.
+    """A time without a bag, up to the `end`, where data begins again.
 
-    `deleted` is how much of it was recorded, and deleted by retention since.
+    `deleted` is how much of the time was recorded, and has been deleted by retention.
     """
 
     start: Ns
@@ -152,10 +152,15 @@ class SilentTopic:
     digits(2)("keeps_days").if_known,
 )
 class Budget:
-    """The bytes of all bags, the limit, and the growth per day; None where not known.
+    """The disk budget, in bytes; None for a number that is not known.
 
-    `used` is all that counts, and `state` what of it is stored beside the bags. `foreign`: the
-    bytes of bags that the recorder did not make; they are in none of the others.
+    Attributes:
+        used: by all that counts.
+        most: the limit.
+        per_day: growth.
+        max_age: after which bags are deleted (ns).
+        foreign: used by bags that the recorder did not make; in none of the other numbers.
+        state: the part of `used` that is stored beside the bags.
     """
 
     used: int
@@ -167,14 +172,14 @@ class Budget:
 
     @property
     def full_in_days(self) -> float | None:
-        """For how many days there is still room."""
+        """For how many days there is room left."""
         if self.most is None or not self.per_day:
             return None
         return max(self.most - self.used, 0) / self.per_day
 
     @property
     def keeps_days(self) -> float | None:
-        """For how many days the limit lasts; older bags are deleted then."""
+        """For how many days bags stay before they are deleted."""
         if self.most is None or not self.per_day:
             return None
         lasting = self.most / self.per_day
@@ -185,7 +190,8 @@ class Budget:
 class RememberedMoment:
     """A moment that the recorder saves: its name, and how many bags it has so far.
 
-    `start` and `end` (inclusive) are as asked. `pending`: the rest is still being written.
+    `start` and `end` (inclusive) are as requested. If it is `pending`, the other bags are still
+    being written.
     """
 
     moment: str
@@ -213,10 +219,10 @@ class FiredRule:
         name: of the rule.
         fired: how often it fired.
         moments: how many moments it made; a moment may hold several matches.
-        refused: how often nothing was saved.
-        last: log time at which it fired last; None where it never did.
-        always_since: since when it matches without an end, where that is long; else None.
-        problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
+        refused: how often it fired and nothing was saved.
+        last: log time at which it last fired; None if it never did.
+        always_since: since when it has matched all the time; None unless that is long.
+        problem: why it may have missed something, or saves nothing; None if nothing is wrong.
     """
 
     name: str
@@ -257,7 +263,7 @@ _RULES: Final = OBJECTS("rules").first(_MAX_LISTED).if_any
 
 @result(_MOMENTS, PLAIN("more").if_any, _RULES, span=("oldest", "now"))
 class MomentList:
-    """The saved moments, newest first; `more` is how many there are besides; the rules by name."""
+    """The saved moments, newest first, and the rules. `more` is how many moments are not listed."""
 
     moments: tuple[StoredMoment, ...]
     more: int
@@ -266,12 +272,12 @@ class MomentList:
 
     @property
     def oldest(self) -> Ns | None:
-        """When the first of the moments began."""
+        """When the earliest of the listed moments began."""
         return min((stored.moment.request.start for stored in self.moments), default=None)
 
     @property
     def total(self) -> int | None:
-        """How many there are, where not all are listed."""
+        """How many moments there are; None if all are listed."""
         return len(self.moments) + self.more if self.more else None
 
 
@@ -318,26 +324,26 @@ class Status(AnswerWithNotes):
     Attributes:
         now: what ages count from.
         earliest: the oldest recorded time; None if nothing is recorded.
-        latest: the newest one.
+        latest: the newest recorded time; None if nothing is recorded.
         heard: while a recorder runs, the newest time of a topic that it does not publish itself;
             else `latest`.
-        recorder: its state; None where no recorder has written here.
-        live: whether it is running.
+        recorder: the state of the recorder; None if no recorder has written here.
+        live: whether the recorder is running.
         restarts: how often it restarted `ros2 bag record`; 0 without a recorder.
         missing: topics that it should record by name, and that no publisher offers.
-        never_heard: topics it subscribed to that sent no message.
-        lost: how many messages of each topic are known to be missing of the recorder's last hour.
+        never_heard: topics that it subscribed to and that sent no message.
         fell_silent: topics that had messages, but not lately.
-        silences: when topics with a usual rate were silent although the robot was on.
-        clock_steps: when the clock was set by 2 s or more.
-        gaps: when nothing was recorded.
-        stalled: in how many of them the recorder ran on, and for how long in all.
         damaged: files that cannot be read.
         incomplete: bags that a crash left open.
         unread: files of a kind that is not read here.
         budget: the use of the disk budget.
-        moments: the newest saved moments; None where they cannot be listed.
+        moments: the newest saved moments; None if they cannot be listed.
         problems: why answers may be incomplete.
+        silences: when topics with a usual rate were silent although the robot was on.
+        clock_steps: when the clock was set by 2 s or more.
+        gaps: when nothing was recorded.
+        stalled: in how many gaps the recorder ran on, and for how long in all.
+        lost: how many messages of each topic are known to be missing of the recorder's last hour.
     """
 
     now: Ns
@@ -369,7 +375,7 @@ class Status(AnswerWithNotes):
 
     @property
     def recorder_alive(self) -> bool | None:
-        """Whether this program's recorder is running; None where it has none."""
+        """Whether the recorder of this program is running; None if it has no recorder."""
         is_ours = self.recorder != ANOTHER and bool(self.recorder or self.budget.most)
         return self.live if is_ours else None
 
@@ -379,6 +385,7 @@ class Status(AnswerWithNotes):
         return None if self.heard is None else max(self.now - self.heard, 0)
 
     def _reasons(self) -> Iterator[str]:
+        """Yields the problems, and one sentence each on silences, stalls and steps of the clock."""
         yield from self.problems
         topics = {silence.topic for silence in self.silences}
         if len(self.silences) == 1:

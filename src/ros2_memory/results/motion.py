@@ -50,7 +50,7 @@ _GEODETIC: Final = keys(digits(8)("latitude"), digits(8)("longitude"), digits(4)
 
 
 def _waypoints(mark: str) -> Keys:
-    """Returns the keys of a waypoint; `mark` is that of those that no drawn way leads to."""
+    """Returns the keys of a waypoint; the key `mark` is true if no line of the path leads to it."""
     return keys(
         TIME("timestamp", "time"),
         LOCAL("local", "time", "time"),
@@ -69,9 +69,9 @@ def _waypoints(mark: str) -> Keys:
     SECONDS("age_s").if_known,
 )
 class Position(AnswerWithNotes):
-    """Where the robot was, in the pose's own frame.
+    """Where the robot was, in the frame of the pose.
 
-    `geodetic` is set for a satellite receiver; the pose's coordinates are NaN then.
+    For a satellite receiver `geodetic` is set, and the coordinates of the pose are NaN.
     """
 
     topic: str
@@ -90,7 +90,7 @@ class Position(AnswerWithNotes):
     SECONDS("age_s").if_known,
 )
 class Velocity(AnswerWithNotes):
-    """How fast the robot moved, in the twist's own frame."""
+    """How fast the robot moved, in the frame of the twist."""
 
     topic: str
     time: Ns
@@ -109,9 +109,9 @@ class Velocity(AnswerWithNotes):
     SECONDS("age_s").if_known,
 )
 class TransformAt(AnswerWithNotes):
-    """The pose of `child` in `parent` at `time`.
+    """The pose of the frame `child` in the frame `parent`.
 
-    `clock` is what `time` is in: `stamp` (header stamps) or `log` (log time).
+    `clock` tells what `time` is: a header stamp (`stamp`) or a log time (`log`).
     """
 
     parent: str
@@ -123,13 +123,13 @@ class TransformAt(AnswerWithNotes):
 
     @property
     def rotation(self) -> Quaternion:
-        """Of the two quaternions of the rotation, the one with w >= 0."""
+        """The quaternion of the rotation with w >= 0; its negative is the same rotation."""
         x, y, z, w = self.transform.rotation
         return (-x, -y, -z, -w) if w < 0 else (x, y, z, w)
 
     @property
     def yaw(self) -> float:
-        """Its heading (rad)."""
+        """The heading of `child` in `parent` (rad)."""
         return yaw(self.rotation)
 
 
@@ -149,7 +149,7 @@ class Frames(AnswerWithNotes):
 
     @property
     def sorted_edges(self) -> list[FrameEdge]:
-        """The edges by the names of their frames."""
+        """The edges, sorted by parent and child."""
         return sorted(self.edges, key=lambda edge: (edge.parent, edge.child))
 
 
@@ -163,9 +163,15 @@ class Frames(AnswerWithNotes):
     vector("xy", 3)("from", "origin"),
 )
 class FarthestPose:
-    """The robot's pose (m) that is farthest from a point, the `origin`, of the same frame.
+    """The pose of the robot that is farthest from a point.
 
-    `inside`: the named places that it is in, the smallest first.
+    Attributes:
+        origin: x, y of the point (m), in `frame_id`.
+        frame_id: of the point and the pose.
+        distance_m: between them.
+        time: log time of the pose.
+        place: x, y of the pose (m).
+        inside: the named places around it, the smallest first.
     """
 
     origin: tuple[float, float]
@@ -197,8 +203,10 @@ class FarthestPose:
 class TrajectorySummary(AnswerWithNotes):
     """The driven path in a window, from one pose topic in log-time order.
 
-    `skipped`: how much of the time from its first to its last pose the clock skipped. `unrecorded`:
-    for how much of the rest no poses were recorded. `farthest`: from a point that was asked for.
+    Attributes:
+        skipped: how much of the time from its first to its last pose the clock skipped.
+        unrecorded: how much of the other time has no poses.
+        farthest: the pose farthest from a point; None if no point was asked about.
     """
 
     topic: str
@@ -212,18 +220,18 @@ class TrajectorySummary(AnswerWithNotes):
 
     @property
     def known(self) -> Trajectory | None:
-        """The path, if it has a valid pose."""
+        """The path; None if it has no valid pose."""
         return self.trajectory if self.trajectory.is_known else None
 
     @property
     def duration_s(self) -> float | None:
-        """The time (s) from its first to its last pose."""
+        """The time (s) from its first to its last pose; None without poses."""
         known = self.known
         return None if known is None else known.totals.duration_s - unix_from_ns(self.skipped)
 
     @property
     def recorded_s(self) -> float | None:
-        """The part of it (s) that has poses, where that is not all."""
+        """The seconds of `duration_s` with poses; None if all of it has poses."""
         lasted_s = self.duration_s if self.unrecorded else None
         return None if lasted_s is None else lasted_s - unix_from_ns(self.unrecorded)
 
@@ -250,15 +258,16 @@ class DrivenInside(AnswerWithNotes):
     Attributes:
         topic: of the poses.
         frame_id: of the waypoints.
-        where: the region's name, or its bounds.
-        visits: how often the robot was inside; `duration` is how long in all.
-        start: log time at which the first visit began; None where there was none.
-        end: at which the last one ended.
+        where: the name of the region, or its bounds.
+        visits: how often the robot was inside.
+        duration: for how long it was inside in all.
+        start: log time at which the first visit began; None without a visit.
+        end: log time at which the last visit ended; None without a visit.
         distance_m: metres driven inside.
-        avg_speed: the distance by the duration (m/s); None of a moment inside.
-        max_speed: over a second (m/s); None likewise.
-        waypoints: of the drawn path; `jump` marks the first of a visit.
-        farthest: the pose inside that is farthest from a point, where that was asked for.
+        avg_speed: distance by duration (m/s); None if the robot was inside for one pose alone.
+        max_speed: over a second (m/s); None as for `avg_speed`.
+        waypoints: of the path inside; `jump` marks the first waypoint of a visit.
+        farthest: the pose inside that is farthest from a point; None if no point was asked about.
     """
 
     topic: str
@@ -288,15 +297,15 @@ class DrivenInside(AnswerWithNotes):
     PLAIN("restarts_since", "restarts").if_any,
 )
 class Visit:
-    """A time in which the robot was near a place.
+    """A visit of the robot to a place.
 
     Attributes:
         arrived: log time of its first pose there; None if it was there before the searched time.
-        departed: of its last one; None if it is still there, by a recent pose.
+        departed: log time of its last pose there; None if it is still there, by a recent pose.
         duration: from the first to the last known pose there.
         closest_m: distance (m, in the plane) of the nearest recorded pose; the robot may have been
-            nearer between two messages. None where the place is no circle.
-        closest_at: log time of that pose; None likewise.
+            nearer between two messages. None if the place is no circle.
+        closest_at: log time of the nearest pose; None if the place is no circle.
         restarts: how often odometry was reset since.
         already_inside: it was not seen to enter: `arrived` is when the window, or its poses, begin.
         still_inside: it was not seen to leave: `departed` is when the window, or its poses, end.
@@ -324,7 +333,7 @@ class Visit:
 class PlaceVisits:
     """How long the robot was in a named place, and how often it was seen to enter and to leave.
 
-    `first` is the first entry, `last` the last exit; None without one.
+    `first` is the first entry and `last` the last exit, as log times; None if it was not seen.
     """
 
     place: str
@@ -353,18 +362,21 @@ class PlaceVisits:
     span=("oldest", "now"),
 )
 class Visits(AnswerWithNotes):
-    """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
+    """Visits to a place, newest first; or the times in every named place.
 
     Attributes:
-        where: the name of the place, where it has one.
-        circle: the place, where it is one without a name.
-        total: how many were found.
-        all_counted: whether these are all; a note says how far back they were counted.
-        duration: of all of these.
-        entries: in how many of them the robot was seen to enter; None where that is not known.
-        exits: likewise, to leave.
-        places: of every named place, where none was asked for; then there are no visits.
-        unknown: for how long something was recorded, and it is not known where the robot was.
+        frame_id: of the place.
+        total: how many visits were counted.
+        visits: the newest visits.
+        more: whether there are older ones.
+        circle: the place, if it has no name.
+        duration: of all counted visits together.
+        entries: in how many visits the robot was seen to enter; None if that is not known.
+        exits: in how many visits the robot was seen to leave; None if that is not known.
+        all_counted: False if time ran out; a note says how far back visits were counted.
+        where: the name of the place; None if it has none.
+        places: of every named place, if no place was asked about; then there are no visits.
+        unknown: for how long it is not known, though something was recorded, where the robot was.
         is_current: whether the window has a pose that shows where the robot is now.
     """
 
@@ -385,7 +397,7 @@ class Visits(AnswerWithNotes):
 
     @property
     def there_now(self) -> bool | None:
-        """Whether the robot is still there; None where no pose of the window shows it."""
+        """Whether the robot is there now; None if no pose of the window shows it."""
         if not self.is_current or self.is_of_places:
             return None
         return any(visit.departed is None for visit in self.visits)
@@ -399,5 +411,5 @@ class Visits(AnswerWithNotes):
 
     @property
     def is_of_places(self) -> bool:
-        """Whether it is about every named place."""
+        """Whether the answer is about every named place."""
         return self.places is not None

@@ -153,7 +153,7 @@ class BoundedConnection(H11Protocol):
         return self.client[0] if self.client else ""
 
     def _unknown(self) -> list[BoundedConnection]:
-        """Returns the connections without an admitted request, but for those that are ending."""
+        """Returns the open connections without an admitted request."""
         return [
             connection
             for connection in self.connections

@@ -111,7 +111,7 @@ class Batch:
         publish_times: in ns; equal to the log times where a format keeps one time only.
         places: the order in the file, which breaks ties of log times; no two messages of a file
             have the same.
-        buffer: holds the payloads, and often those of other batches and what lies between them.
+        buffer: holds the payloads; often also other batches, and bytes between the payloads.
         starts: where each payload begins in the buffer.
         sizes: the bytes of each payload, with the 4 of the encapsulation header of CDR.
     """
@@ -309,11 +309,11 @@ class BagReader(ABC):
         """Returns why no message of this channel can be decoded; None if its type is known."""
 
     def times_alone(self, path: Path) -> Collection[str]:  # noqa: ARG002 - a lake needs it
-        """Returns the topics of which the bag has log and publish times (ns), and no payloads."""
+        """Returns the topics for which the bag has log and publish times, and no payloads."""
         return frozenset()
 
     def is_file(self, path: Path) -> bool:  # noqa: ARG002 - a lake needs it
-        """Returns whether the bag is a file, which may change; those of a lake do not."""
+        """Returns whether the bag is a file, which may change; a bag of a lake does not."""
         return True
 
     @abstractmethod

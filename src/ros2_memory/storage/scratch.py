@@ -56,8 +56,8 @@ class Scratch:
     """Folders for temporary files, bounded in bytes. Safe to use from several threads.
 
     The least recently used are deleted first, never one in use. All are deleted with the reader, or
-    when the program ends. A program that is killed leaves its folders: the next deletes those that
-    nobody has locked.
+    when the program ends. A program that is killed leaves its folders: the next program deletes the
+    folders that nobody has locked.
 
     Args:
         max_bytes: what all files together may take.

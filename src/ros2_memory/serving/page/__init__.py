@@ -1,7 +1,7 @@
 """The page at `/`: the memory to be looked at, for a browser.
 
 The page itself holds no data and is served to everybody who can reach the server; it reads from
-`/page/span`, `/page/moment` and `/mcp`, which demand the token where there is one. Recorded text
+`/page/span`, `/page/moment` and `/mcp`, which demand the token if there is one. Recorded text
 may be hostile: the page shows it as text alone. Should that ever fail, its Content-Security-Policy
 allows no script, style or destination but this server's own, and no inline script at all.
 """

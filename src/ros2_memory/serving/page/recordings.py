@@ -151,7 +151,7 @@ def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
 
 
 def _has_contradictions(memory: Memory, call: Call, folders: set[str]) -> bool:
-    """Returns whether recordings in different ones of these folders have contradicting frames."""
+    """Returns whether recordings of two of these folders have contradicting frames."""
     root = str(memory.index.bag_dir)
     for contradiction in contradicting_frames(memory, call):
         involved = {_folder(path.removeprefix(f"{root}/")) for path in contradiction.recordings}

@@ -62,7 +62,7 @@ _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 _INDEX_LENGTH: Final = struct.Struct("<Q")
 _new_tuple: Final = tuple.__new__
 _MAX_CACHED_BYTES: Final = 128 << 10
-"""Longer declarations are decoded anew for each file: they are seldom those of other files."""
+"""Longer declarations are decoded anew for each file, so that the cache stays below 4 MiB."""
 
 # Plain integers: the opcodes of records are compared with them some million times.
 _DECLARES: Final = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))

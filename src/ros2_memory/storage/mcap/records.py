@@ -1,8 +1,8 @@
 """Decodes the records of an MCAP file (https://mcap.dev/spec).
 
 A file is magic, records, magic; a record is an opcode (1 byte), a length (8 bytes, little endian)
-and a body. Records that every file is full of are read with `struct`; those that the bags of one
-robot have in common, and those that are seldom read, with the `mcap` package.
+and a body. The most frequent records are read with `struct`; records that are seldom read, or equal
+in all bags of a robot, with the `mcap` package.
 
 The scan, the salvage of a file that was cut short and the reader of embedded metadata share one
 walk, `file_records`, so that all of them stop at the same byte.

@@ -1,8 +1,8 @@
 """Reads every record of an MCAP file that can be read, in file order, wherever the file ends.
 
-Chunks are opened on the way: their records come in their place, those of a last, partial chunk as
-far as they are whole. The summary section repeats the data section, but channels without a message
-may be declared there alone.
+Chunks are opened on the way: their records come in their place; a last, partial chunk gives its
+whole records. The summary section repeats the data section, but channels without a message may be
+declared there alone.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _READERS: Final[dict[int, Callable[[ReadDataStream], mcap_records.McapRecord]]] 
     Opcode.METADATA: mcap_records.Metadata.read,
 }
 _CONTENT: Final = frozenset((*_READERS, Opcode.MESSAGE))
-"""Records with content of their own; the others are indexes of these."""
+"""Records with content of their own; all others are indexes."""
 _MESSAGE_BODY: Final = struct.Struct("<HIQQ")
 """Channel, sequence, log time and publish time; the payload follows."""
 
