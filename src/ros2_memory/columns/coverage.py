@@ -196,8 +196,8 @@ class Covering:
     def _covered_segment(self, segment: Segment, rows: IntArray) -> CoveredSegment:
         """Returns what is known of a segment, of whose bags `rows_of` returns these rows."""
         bags = segment.bags
-        can_be_stored = bags.are(BagState.CLOSED)
-        left_open = np.flatnonzero(bags.are(BagState.INCOMPLETE))
+        can_be_stored = bags.in_state(BagState.CLOSED)
+        left_open = np.flatnonzero(bags.in_state(BagState.INCOMPLETE))
         # A database goes on in its journal, which may change while its own file does not.
         can_be_stored[left_open] = [file.endswith(".mcap") for file in bags.files(left_open)]
         is_stored: Mask = can_be_stored & (rows >= 0)

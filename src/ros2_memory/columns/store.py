@@ -231,7 +231,7 @@ class ColumnStore(Database):
         One more where copies of its messages can be recognised. `deletion` is that of the `state`
         of the moment: what was loaded with it is taken over once.
         """
-        loaded = [bags.taken(deletion) for bags in parts]
+        loaded = [bags.take_store_rows(deletion) for bags in parts]
         keys = [
             (relative(file, bag_dir), *stamps)
             for bags, rows in zip(parts, loaded, strict=True)

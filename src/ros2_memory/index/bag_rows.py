@@ -1,7 +1,6 @@
-"""Bags in columns: a week has 60,000 of them, of which a question looks at few.
+"""Bags as columns: a week has 60,000 of them, and a question looks at few.
 
-What is known of a bag takes some 200 bytes so; a `BagFile`, which takes four times as much, is made
-when it is asked for.
+A row takes some 200 bytes. A `BagFile` takes four times as much, so it is made on request.
 """
 
 from __future__ import annotations
@@ -34,7 +33,13 @@ _Places: TypeAlias = "NDArray[np.uint16]"
 
 
 class Summaries(NamedTuple):
-    """The summaries of one schema whose data are of one size: the rows of their bags, and data."""
+    """The summaries that share a schema and a size.
+
+    Attributes:
+        schema: how to decode them.
+        rows: the rows of their bags.
+        data: the encoded summaries, one after the other.
+    """
 
     schema: SummarySchema
     rows: _Places
@@ -42,17 +47,17 @@ class Summaries(NamedTuple):
 
 
 class BagRows:
-    """Some bags, in the order in which they are given: some hundreds, and one at least.
+    """Some hundred bags, at least one, in the given order.
 
     Args:
         bags: the bags.
-        stored: the deletion of `ColumnStore.state` with which they were loaded, and their rows in
-            the store; see `taken`.
+        stored: the `ColumnStore.state` deletion at which they were loaded, and their row numbers in
+            the store; see `take_store_rows`.
 
     Attributes:
         names: the paths of the bags.
-        folders: where the bags lie, in the order of the bags.
-        folder_of: by row, which of these.
+        folders: the folders that the bags lie in, each once.
+        folder_of: by row, the index into `folders`.
         summaries: what the bags hold.
     """
 
@@ -76,31 +81,42 @@ class BagRows:
         self._numbers: Ints = np.array(numbers, np.int64)
         self._stored = stored
 
-    def taken(self, deletion: int) -> Ints | None:
-        """Returns, once, the rows in the store; None where others may be stored meanwhile."""
-        stored, self._stored = self._stored, None
-        return stored[1] if stored is not None and stored[0] == deletion else None
+    def take_store_rows(self, deletion: int) -> Ints | None:
+        """Returns the row numbers in the store, and drops them.
 
-    def some(self, rows: Flags) -> BagRows | None:
-        """Returns the bags of some rows: itself where that are all; None where there is none."""
+        None if they were taken before, or if the store has deleted rows since they were loaded.
+        """
+        stored, self._stored = self._stored, None
+        if stored is None:
+            return None
+        loaded_at, store_rows = stored
+        return store_rows if loaded_at == deletion else None
+
+    def select(self, rows: Flags) -> BagRows | None:
+        """Returns the bags of the marked rows; None if no row is marked."""
         if rows.all():
             return self
-        stored = self._stored and (self._stored[0], self._stored[1][rows])
-        return BagRows(self.at(rows), stored) if rows.any() else None
+        if not rows.any():
+            return None
+        stored = self._stored
+        if stored is not None:
+            loaded_at, store_rows = stored
+            stored = loaded_at, store_rows[rows]
+        return BagRows(self.at(rows), stored)
 
     @property
     def sizes(self) -> Ints:
-        """Of the files, in bytes."""
+        """Size of each file in bytes."""
         return np.asarray(self._numbers[0])
 
     @property
     def contents(self) -> Ints:
-        """What changes when other messages of a file count: by bag, `Stamp.content`."""
+        """A row for each bag: the numbers of its `Stamp.content`."""
         return self._numbers[:3].T
 
     @property
     def stamps(self) -> Ints:
-        """By bag, `contents` and the log times of its first and last message."""
+        """A row for each bag: `contents`, and the log times of its first and last message."""
         return self._numbers[:5].T
 
     @property
@@ -113,17 +129,17 @@ class BagRows:
         """Log time of the last message in each bag."""
         return np.asarray(self._numbers[4])
 
-    def are(self, state: BagState) -> Flags:
+    def in_state(self, state: BagState) -> Flags:
         """Returns which bags are in a state."""
         return np.asarray(self._numbers[5] == _STATES.index(state))
 
     def with_schema(self, is_wanted: Callable[[SummarySchema], object]) -> Flags:
-        """Returns the summaries of which bags have such a schema."""
+        """Returns which bags have a summary whose schema is wanted."""
         are_wanted = np.array([bool(is_wanted(alike.schema)) for alike in self.summaries])
         return np.asarray(are_wanted[self._kind_of])
 
     def files(self, rows: Rows = _ALL) -> list[str]:
-        """Returns the paths of the bags, or of those of some rows."""
+        """Returns the paths of the bags in some rows."""
         stems, positions, numbers = self.names
         return [
             f"{series}{zeros}{number}{suffix}" if number >= 0 else f"{series}{suffix}"
@@ -144,8 +160,10 @@ class BagRows:
         return next(self.at([row]))
 
     def at(self, rows: Rows) -> Iterator[BagFile]:
-        """Yields the bags of some rows."""
-        kinds = [(schema, data, len(data) // len(of)) for schema, of, data in self.summaries]
+        """Yields the bags in some rows."""
+        kinds = [
+            (schema, data, len(data) // len(members)) for schema, members, data in self.summaries
+        ]
         for file, kind, place, (size, mtime, sidecar, start, end, state) in zip(
             self.files(rows),
             self._kind_of[rows].tolist(),
@@ -159,7 +177,7 @@ class BagRows:
 
 
 class Bags(Sequence[BagFile]):
-    """The bags in some `BagRows`, one after the other."""
+    """The bags of several `BagRows` as one sequence."""
 
     def __init__(self, parts: Iterable[BagRows]) -> None:
         self._parts = [*parts]
@@ -181,14 +199,15 @@ class Bags(Sequence[BagFile]):
     def __getitem__(self, at: int | slice[int | None, int | None]) -> BagFile | list[BagFile]:
         if isinstance(at, slice):
             return [self[nth] for nth in range(len(self))[at]]
-        part, row = self._row(range(len(self))[at])
+        part, row = self._locate(range(len(self))[at])
         return part[row]
 
     def recording(self, at: int) -> Path:
-        """Returns the recording of a bag, which is not made for that."""
-        part, row = self._row(at)
+        """Returns the recording of a bag, without making its `BagFile`."""
+        part, row = self._locate(at)
         return folder_path(part.folders[part.folder_of[row]] or "/")
 
-    def _row(self, nth: int) -> tuple[BagRows, int]:
+    def _locate(self, nth: int) -> tuple[BagRows, int]:
+        """Returns the part that has the `nth` bag, and its row there."""
         part = bisect_right(self._edges, nth) - 1
         return self._parts[part], nth - self._edges[part]

@@ -1,8 +1,8 @@
-"""The files of a bag directory: scans it again and again, and classifies what has changed.
+"""The table of a bag directory's files: scanned again and again, classified where they changed.
 
-One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, of which one counts.
-So does one of bags that somebody copied beside themselves, `run_0 (copy).mcap` beside `run_0.mcap`:
-messages of one folder are no copies of each other, so all would count twice.
+A bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`: one of them counts.
+Somebody may also have copied a bag beside itself, `run_0 (copy).mcap` beside `run_0.mcap`. One of
+the two counts: within a folder, messages are not compared, so all of them would count twice.
 """
 
 from __future__ import annotations
@@ -35,18 +35,22 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 _BLOCK_BYTES: Final = 64 << 10
+"""Size of the blocks by which two bags are compared."""
 _BLOCKS: Final = 16
+"""About how many blocks of a bag are compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownBags:
-    """What the index holds about the bag directory, by path.
+    """What the index knows about the bag directory.
+
+    `counted` and `files` lack settled files: closed bags that will not change any more. `timeline`
+    has their bags.
 
     Attributes:
-        counted: classifications of files, of all forms and links of a bag only the one that counts.
-        hidden: files whose other form counts.
-        files: notes on files. There are neither notes on closed files that do not change any more,
-            or not since their columns were stored, nor classifications of them.
+        counted: by path, the classification of each file that counts.
+        hidden: paths of files whose other form counts.
+        files: by path, the notes on a file.
         named: recordings that the last heartbeat names as being written.
         now: when the directory was scanned.
         tree: the stamps of all files.
@@ -63,14 +67,17 @@ class KnownBags:
 
     @property
     def saved(self) -> Mapping[str, Stamp]:
-        """All files in saved moments, whether they count there or not."""
+        """By path, the files in saved moments, including those that do not count."""
         return self.tree.saved
 
 
 class TableChange(NamedTuple):
-    """What a scan found changed: bags that left the table and bags that came.
+    """What one scan changed. The first scan adds all bags.
 
-    `is_new`: whether anything has changed, even if no bag. The first scan changes everything.
+    Attributes:
+        removed: bags that left the table.
+        added: bags that came.
+        is_new: whether anything changed, bags or other files.
     """
 
     removed: Sequence[BagFile]
@@ -79,19 +86,19 @@ class TableChange(NamedTuple):
 
 
 class BagTable:
-    """The known files of one bag directory. Not for several threads at once.
+    """The known files of one bag directory. Not thread-safe.
 
-    Of closed files that do not change any more, which are most of a week, only their bags and their
-    stamps are kept. Should one change, the notes on it are made as if it had been read, and it is
-    classified again.
+    Most files of a week are settled: closed, and old enough not to change any more. The table keeps
+    only their bags and stamps. If one changes after all, its notes are made anew from its bag, and
+    it is classified again.
 
     Args:
         bag_dir: the directory.
         reader: reads its bags.
-        known: returns closed files which were read earlier, in order of time: they are not read
-            again while they are unchanged.
+        known: returns closed bags that were read earlier, in order of time. They are not read
+            again while their files are unchanged.
         only: the name of the one recording that counts; see `scan.Tree`.
-        setting: the one that names the directory, for sentences.
+        setting: the setting that names the directory, for error messages.
     """
 
     def __init__(
@@ -117,33 +124,32 @@ class BagTable:
         self._compared: dict[tuple[BagFile, BagFile], bool] = {}
 
     def update(self, context: ScanContext, *, patrolling: bool) -> TableChange:
-        """Scans for what may have changed; `patrolling` also checks some of what did not.
+        """Scans the directory and classifies the files that may have changed.
 
-        Where it raises, some of what the scan has found is lost: then a new table is needed.
+        With `patrolling`, some files that look unchanged are checked too. An exception leaves the
+        table incomplete: make a new one.
         """
         before = self._timeline
         scanned = self._tree.scan(context.now, self._watched, patrolling=patrolling)
         self._reactivate_changed(scanned, context)
         is_first = not (self._files or self._timeline.segments)
-        known = self._take_known(scanned.stamps, context) if is_first else {}
-        unchanged: list[BagFile] | None = [] if is_first else None
-        changed = self._drop(scanned.gone) | self._examine(
-            scanned.stamps, known, context, unchanged
-        )
+        gone = self._drop(scanned.gone)
+        changed, settled = self._classify_changed(scanned, context, is_first=is_first)
+        changed |= gone
         hidden_before = frozenset(self._hidden)
         removed, counted = self._update_counted(changed | hidden_before, context)
         changed |= hidden_before - self._hidden
-        added: Sequence[BagFile] = [*(unchanged or ()), *counted]
+        added: Sequence[BagFile] = [*settled, *counted]
         self._timeline = self._timeline.changed(removed, added)
         self._drop_settled(context)
         is_new = bool(changed) or self._timeline is not before
         is_new |= not scanned.is_like(self._scanned)
-        # Without the stamps, of which the first scan has one for each file.
+        # The first scan has a stamp for each file: too much to keep.
         self._scanned = replace(scanned, stamps={}, before={}, gone=set())
         return TableChange(removed, self._timeline.bags if is_first else added, is_new)
 
     def snapshot(self, now: Ns) -> Snapshot:
-        """Returns what is known since the last scan."""
+        """Returns the directory as the last scan saw it."""
         copies = self._copies()
         left_out = {bag.file: bag for bag in (*copies, *self._superseded())}
         timeline = self._timeline.changed(left_out.values(), ())
@@ -173,27 +179,30 @@ class BagTable:
         )
 
     def _copies(self) -> tuple[BagFile, ...]:
-        """Returns the bags that are copies of others in their folder; compares each once."""
+        """Returns the bags that are copies of others in their folder; reads each pair once."""
         compared, self._compared = self._compared, {}
-        for pair in alike_among(self._timeline):
+        for pair in _likely_copies(self._timeline):
             with suppress(OSError):
-                self._compared[pair] = compared[pair] if pair in compared else is_copy(*pair)
+                self._compared[pair] = compared[pair] if pair in compared else _is_copy(*pair)
         return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)
 
     def _superseded(self) -> Iterable[BagFile]:
-        """Returns the bags in whose place thinned days answer."""
+        """Returns the bags that thinned days replace.
+
+        A day that has another size or mtime than was noted is not finished, and replaces nothing.
+        """
         superseded = read_superseded(self._bag_dir)
-        days = {str(self._bag_dir / name): name for name in superseded.days}
-        whole = {
-            days[day.file]
-            for day in self._timeline.named(days)
-            if (day.size, day.mtime_ns) == superseded.days[days[day.file]]
+        day_of = {str(self._bag_dir / name): name for name in superseded.days}
+        finished = {
+            day_of[bag.file]
+            for bag in self._timeline.bags_named(day_of)
+            if (bag.size, bag.mtime_ns) == superseded.days[day_of[bag.file]]
         }
-        names = [name for name, day in superseded.bags.items() if day in whole]
-        return self._timeline.named({str(self._bag_dir / name) for name in names})
+        replaced = [name for name, day in superseded.bags.items() if day in finished]
+        return self._timeline.bags_named({str(self._bag_dir / name) for name in replaced})
 
     def known(self, named: Collection[str], now: Ns) -> KnownBags:
-        """Returns what retention considers; `named` are recordings that are being written."""
+        """Returns what retention decides by; `named` recordings are being written."""
         return KnownBags(
             self._counted,
             self._hidden,
@@ -205,10 +214,10 @@ class BagTable:
         )
 
     def _reactivate_changed(self, scanned: ScanResult, context: ScanContext) -> None:
-        """Notes what is known of files that have gone, changed, or got another form."""
+        """Makes notes again on settled files that have gone, changed, or got another form."""
         new = [path for path in scanned.stamps if path not in self._files]
         paths = {*new, *map(other_form, new), *scanned.gone} - self._files.keys()
-        for bag in self._timeline.named(paths):
+        for bag in self._timeline.bags_named(paths):
             path = bag.file
             before = scanned.before.get(path) or self._tree.stamp(path)
             notes = self._files[path] = FileNotes.first(path, before, context.now)
@@ -217,24 +226,24 @@ class BagTable:
             self._classified[path] = self._counted[path] = classification
 
     def _drop(self, paths: Iterable[str]) -> set[str]:
-        """Drops the state of files; returns those that were classified."""
-        forgotten = set()
+        """Drops the notes on files; returns the files that had been classified."""
+        classified = set()
         for path in paths:
             self._watched.discard(path)
             self._files.pop(path, None)
             if self._classified.pop(path, None) is not None:
-                forgotten.add(path)
-        return forgotten
+                classified.add(path)
+        return classified
 
     def _drop_settled(self, context: ScanContext) -> None:
-        """Drops what is known of files that will not change, but for their bags and stamps."""
+        """Drops the notes on settled files: their bags and stamps stay."""
         for path in [*self._files]:
             classification = self._counted.get(path)
             if classification is not None and self._is_settled(path, classification, context):
                 del self._files[path], self._classified[path], self._counted[path]
 
     def _is_settled(self, path: str, classification: Classification, context: ScanContext) -> bool:
-        """Returns whether a bag is closed and old, and has no other form or link."""
+        """Returns whether a bag is closed and old, and has no other form."""
         notes = self._files[path]
         return (
             classification.state is FileState.CLOSED
@@ -248,11 +257,10 @@ class BagTable:
             and other_form(path) not in self._files
         )
 
-    def _take_known(self, stamps: dict[str, Stamp], context: ScanContext) -> dict[str, BagFile]:
-        """Takes those files out of `stamps` that need no look, and has the timeline hold them.
+    def _load_known(self, stamps: dict[str, Stamp], context: ScanContext) -> dict[str, BagFile]:
+        """Starts the timeline with the known bags that are settled, and removes their `stamps`.
 
-        They are as they were when they were read, have messages and an end, and are not young.
-        Returns the other ones that are as they were, by path.
+        Returns by path the other known bags whose files are unchanged.
         """
         last = context.now - max(context.three_splits, YOUNG_NS)
         kinds = tuple(kind for kind in PLAIN_KINDS if self._reader.reads(Path(f"bag{kind}")))
@@ -260,75 +268,86 @@ class BagTable:
         others: dict[str, BagFile] = {}
         segments: list[Segment] = []
         for bags in self._known():
-            are_whole = bags.with_schema(lambda schema: schema.complete and schema.topics)
+            are_settled = bags.with_schema(lambda schema: schema.complete and schema.topics)
             for row, (path, content) in enumerate(
                 zip(bags.files(), map(tuple, bags.contents.tolist()), strict=True)
             ):
                 stamp = stamps.get(path)
                 if stamp is None or stamp.content != content:
-                    are_whole[row] = False
+                    are_settled[row] = False
                 elif (
-                    not are_whole[row]
+                    not are_settled[row]
                     or stamp.mtime_ns >= last
                     or not path.endswith(kinds)
                     or (compressed and other_form(path) in compressed)
                 ):
-                    are_whole[row] = False
+                    are_settled[row] = False
                     others[path] = bags[row]
                 else:
                     del stamps[path]
-            taken = bags.some(are_whole)
-            if taken is not None:
-                segments.append(Segment(taken))
+            settled = bags.select(are_settled)
+            if settled is not None:
+                segments.append(Segment(settled))
         if segments:
             self._timeline = Timeline(segments)
         return others
 
-    def _examine(
-        self,
-        stamps: Mapping[str, Stamp],
-        known: Mapping[str, BagFile],
-        context: ScanContext,
-        unchanged: list[BagFile] | None,
-    ) -> set[str]:
+    def _classify_changed(
+        self, scanned: ScanResult, context: ScanContext, *, is_first: bool
+    ) -> tuple[set[str], list[BagFile]]:
         """Classifies files; returns those whose classification changed.
 
-        New ones that will not change are added to `unchanged` instead, if there is such a list: a
-        first scan of a week would otherwise hold all that is known of each file at once. Those that
-        are `known` are not read.
+        On the first scan, settled bags are returned apart: the table must not hold the notes on all
+        files of a week at once.
         """
-        changed = set()
-        for path, stamp in stamps.items():
-            if not self._is_to_be_classified(path, stamp, known.get(path), context):
+        known = self._load_known(scanned.stamps, context) if is_first else {}
+        changed: set[str] = set()
+        settled: list[BagFile] = []
+        for path, stamp in scanned.stamps.items():
+            if not self._needs_classification(path, stamp, known.get(path), context):
                 continue
-            notes = self._files[path]
-            try:
-                classification = classify(notes, self._reader, context)
-            except BagVanishedError:
-                self._tree.lose(path)
-                changed |= self._drop([path])
-                continue
-            if notes.must_be_watched(classification, context):
-                self._watched.add(path)
-            else:
-                self._watched.discard(path)
-            if (
-                unchanged is not None
-                and other_form(path) not in stamps
-                and self._is_settled(path, classification, context)
-                and classification.bag is not None
-            ):
-                unchanged.append(classification.bag)
-                del self._files[path]
-            elif classification != self._classified.get(path):
-                self._classified[path] = classification
+            classification = self._classify(path, context)
+            if classification != self._classified.get(path):
                 changed.add(path)
-        return changed
+            if classification is None:
+                self._drop([path])
+            elif (
+                is_first
+                and classification.bag is not None
+                and other_form(path) not in scanned.stamps
+                and self._is_settled(path, classification, context)
+            ):
+                settled.append(classification.bag)
+                changed.discard(path)
+                del self._files[path]
+            else:
+                self._classified[path] = classification
+        return changed, settled
 
-    def _is_to_be_classified(
+    def _classify(self, path: str, context: ScanContext) -> Classification | None:
+        """Classifies a file and decides whether the next scan looks at it again.
+
+        Returns None if the file has vanished.
+        """
+        notes = self._files[path]
+        try:
+            classification = classify(notes, self._reader, context)
+        except BagVanishedError:
+            self._tree.lose(path)
+            return None
+        if notes.must_be_watched(classification, context):
+            self._watched.add(path)
+        else:
+            self._watched.discard(path)
+        return classification
+
+    def _needs_classification(
         self, path: str, stamp: Stamp, known: BagFile | None, context: ScanContext
     ) -> bool:
-        """Notes how a file is now; returns whether it is new, has changed, or is watched."""
+        """Updates the notes on a file; returns whether it is new, has changed, or is watched.
+
+        The summary of a `known` bag is not read again.
+        """
         notes = self._files.get(path)
         if notes is not None:
             return notes.update(stamp, context.now) or path in self._watched
@@ -338,12 +357,11 @@ class BagTable:
         return True
 
     def _update_counted(
-        self, changed: Iterable[str], context: ScanContext
+        self, changed: Collection[str], context: ScanContext
     ) -> tuple[list[BagFile], list[BagFile]]:
-        """Updates which files count; returns the bags that left and those that came."""
+        """Updates which files count; returns the bags that left and the bags that came."""
         removed, added = [], []
-        paths = {form for path in changed for form in (path, other_form(path))}
-        for path in paths:
+        for path in {*changed, *map(other_form, changed)}:
             before, after = self._counted.pop(path, None), self._counted_form(path, context)
             if after is not None:
                 self._counted[path] = after
@@ -356,10 +374,10 @@ class BagTable:
         return removed, added
 
     def _counted_form(self, path: str, context: ScanContext) -> Classification | None:
-        """Returns a file's classification; None if there is none, or another file counts.
+        """Returns a file's classification; None if it has none, or if its other form counts.
 
-        While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
-        complete ones that have been there for three splits are kept on purpose: both count.
+        While a split is being compressed, `x.mcap` and `x.mcap.zstd` are one bag, twice. If both
+        are complete and have not grown for three splits, somebody keeps both: both count.
         """
         self._hidden.discard(path)
         classification, other = self._classified.get(path), self._classified.get(other_form(path))
@@ -381,8 +399,8 @@ def _sorted_by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
     return tuple(sorted(asides, key=lambda aside: aside.path))
 
 
-def alike_among(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
-    """Yields bags with the folder, size and summary of one with a shorter name, behind that one."""
+def _likely_copies(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
+    """Yields pairs of bags with equal folder, size and summary: the shorter name first."""
     starts = timeline.starts
     is_same = starts[1:] == starts[:-1]
     are_suspects = np.append(is_same, False) | np.append(False, is_same)
@@ -396,22 +414,22 @@ def alike_among(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
             yield original, bag
 
 
-def is_copy(original: BagFile, bag: BagFile) -> bool:
-    """Returns whether two bags of one size are the same bytes, as blocks all over them show.
+def _is_copy(original: BagFile, bag: BagFile) -> bool:
+    """Compares blocks spread over two bags of equal size.
 
-    Runs of a simulation may have the same times and sizes.
+    Equal times and sizes prove nothing: two runs of a simulation may have them.
 
     Raises:
         OSError: one of them cannot be read.
     """
-    return _blocks(original) == _blocks(bag)
+    return _read_blocks(original) == _read_blocks(bag)
 
 
-def _blocks(bag: BagFile) -> list[bytes]:
+def _read_blocks(bag: BagFile) -> list[bytes]:
     step = max(bag.size // _BLOCKS, _BLOCK_BYTES)
-    places = (*range(0, bag.size, step), max(bag.size - _BLOCK_BYTES, 0))
+    offsets = (*range(0, bag.size, step), max(bag.size - _BLOCK_BYTES, 0))
     file = os.open(bag.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
-        return [os.pread(file, _BLOCK_BYTES, place) for place in places]
+        return [os.pread(file, _BLOCK_BYTES, offset) for offset in offsets]
     finally:
         os.close(file)

@@ -1,23 +1,22 @@
 """Bags that a wrong clock dated, found by comparing them with the bags around. Pure decisions.
 
-A robot without a battery-backed clock starts in 1970 and is corrected once it has a network; clocks
-are also ahead, and are set back while a recording runs. Bags keep their times, and are found by
-them; but the span of the memory, and its newest moment, are computed without the wrong ones:
+A robot without a battery-backed clock starts in 1970 and is corrected once it has a network. Clocks
+also run ahead, and are set back during a recording. Such bags keep their times, and are found by
+them; but the span of the memory, and its newest moment, are computed without them:
 
-    before 2017          the clock was not set; simulated where no bag has another date
-    after now            the clock was ahead; this machine's own is behind where all bags are so
-    set back by a day    of the two sides the one with fewer bags around it; of equals the earlier
+    before 2017          the clock was not set; if no bag has another date, it was simulated
+    after now            the clock was ahead; if all bags are, this machine's clock is behind
+    set back by a day    the side of the step with fewer bags is wrong; of equals the earlier one
 
-A clock that is set back by less is listed and leaves the span as it is. Where this machine's own
-clock is before 2017 no date counts as being in the future.
+A clock that was set back by less is listed and leaves the span as it is. If this machine's own
+clock is before 2017, no date counts as being in the future.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
-from itertools import takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, set_back_while_written
@@ -54,9 +53,13 @@ class FaultyClock(StrEnum):
 class ClockFault(NamedTuple):
     """A bag that a wrong clock dated.
 
-    `by` is how far its last message lies after the present, or how far the clock was set back after
-    the bag `before` was begun (None: at least this far, while this bag was being written).
-    `misleads`: it is left out of the span of the memory.
+    Attributes:
+        bag: the bag.
+        kind: what is wrong with the clock.
+        by: `AHEAD`: how far the last message lies after the present (ns). `SET_BACK`: how far the
+            clock was set back (ns), at least.
+        before: the bag that was begun before the clock was set back; None if `bag` itself was.
+        misleads: whether the bag is left out of the span of the memory.
     """
 
     bag: BagFile
@@ -67,7 +70,7 @@ class ClockFault(NamedTuple):
 
     @property
     def at(self) -> Ns:
-        """The first log time after the clock was set back; of other faults that of the bag."""
+        """The first log time after the clock was set back; for other kinds, the bag's first."""
         set_back = self.bag.summary.schema.clock_set_back if self.before is None else None
         return self.bag.start if set_back is None else set_back[1]
 
@@ -109,8 +112,11 @@ class ClockFault(NamedTuple):
 class Dating:
     """What the dates of all bags show.
 
-    `earliest` and `latest` are the log times of the first and last message (inclusive) of correctly
-    dated bags; None without bags. `note` is a sentence on a clock that contradicts all of them.
+    Attributes:
+        earliest: log time of the first message in a correctly dated bag; None without bags.
+        latest: log time of the last message in such a bag (inclusive).
+        faults: the bags that a wrong clock dated.
+        note: a sentence if this machine's clock contradicts all bags.
     """
 
     earliest: Ns | None = None
@@ -125,7 +131,7 @@ class Dating:
 
     @property
     def ahead_from(self) -> Ns:
-        """The log time from which on bags are dated after now; MAX_NS if none is."""
+        """The first log time at which a bag is dated after now; MAX_NS if none is."""
         ahead = (fault for fault in self.faults if fault.kind is FaultyClock.AHEAD)
         begins = (max(fault.bag.start, fault.bag.end - fault.by) for fault in ahead)
         return min(begins, default=MAX_NS)
@@ -144,42 +150,39 @@ def check_dates(
     """Returns what the dates of all bags show.
 
     Args:
-        timeline: the bags; that of carried messages shows nothing about clocks.
-        steps: where a clock was set back while a recording ran.
+        timeline: the bags. The bag of carried messages shows nothing about clocks.
+        steps: where a clock was set back during a recording.
         now: the present by this machine's clock.
     """
     segments = timeline.recorded_segments
     limit = max_plausible(now)
-    ahead = [
-        ClockFault(bag, FaultyClock.AHEAD, bag.end - now)
-        for segment in segments
-        if segment.latest > limit
-        for bag in segment.bags.at(segment.bags.ends > limit)
-    ]
-    unset = [
-        ClockFault(bag, FaultyClock.UNSET)
-        for segment in takewhile(lambda segment: segment.first[0] < FIRST_BAGS_NS, segments)
-        for bag in segment.bags.at(
-            (segment.bags.starts < FIRST_BAGS_NS) & (segment.bags.ends <= limit)
-        )
-    ]
-    bags = sum(len(segment.bags) for segment in segments)
+    unset: list[ClockFault] = []
+    ahead: list[ClockFault] = []
+    for segment in segments:
+        bags = segment.bags
+        if segment.first[0] < FIRST_BAGS_NS:
+            is_unset = (bags.starts < FIRST_BAGS_NS) & (bags.ends <= limit)
+            unset += [ClockFault(bag, FaultyClock.UNSET) for bag in bags.at(is_unset)]
+        if segment.latest > limit:
+            late = bags.at(bags.ends > limit)
+            ahead += [ClockFault(bag, FaultyClock.AHEAD, bag.end - now) for bag in late]
+    total = sum(len(segment.bags) for segment in segments)
     note: str | None = None
-    if len(ahead) == bags and bags:
+    if len(ahead) == total and total:
         ahead = [fault._replace(misleads=False) for fault in ahead]
         note = "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
-    elif len(ahead) + len(unset) == bags:
+    elif len(ahead) + len(unset) == total:
         unset = []  # a simulated clock, or a robot that has none
     faults = [*unset, *ahead]
     faults += _step_faults(steps, {fault.bag.file for fault in faults}, timeline)
-    dating = Dating(faults=tuple(faults), note=note)
-    if len(dating.misdated) == bags:
-        dating = replace(dating, faults=tuple(fault._replace(misleads=False) for fault in faults))
-    dated = dated_segments(timeline, dating.faults)
-    return replace(
-        dating,
+    if len({fault.bag.file for fault in faults if fault.misleads}) == total:
+        faults = [fault._replace(misleads=False) for fault in faults]
+    dated = dated_segments(timeline, faults)
+    return Dating(
         earliest=dated[0].first[0] if dated else None,
         latest=max((segment.latest for segment in dated), default=None),
+        faults=tuple(faults),
+        note=note,
     )
 
 
@@ -188,10 +191,10 @@ def _step_faults(
     faulty: Collection[str],
     timeline: Timeline,
 ) -> Iterator[ClockFault]:
-    """Yields the faults of clocks that were set back, if no other fault explains the step."""
-    steps = [
-        step for step in steps if step.before.file not in faulty and step.after.file not in faulty
-    ]
+    """Yields the steps back of clocks, and the bags that a step of a day shows to be misdated.
+
+    `faulty` are the paths of bags with another fault, which explains their steps.
+    """
     faults = [
         ClockFault(
             step.after,
@@ -201,18 +204,18 @@ def _step_faults(
             misleads=False,
         )
         for step in steps
+        if step.before.file not in faulty and step.after.file not in faulty
     ]
-    within = {fault.bag.file: fault for fault in faults if fault.before is None}
+    within_bags = {fault.bag.file: fault for fault in faults if fault.before is None}
     strays: set[str] = set()
-    for step, fault in zip(steps, faults, strict=True):
-        if not _is_shown_within(fault, within):
+    for fault in faults:
+        if not _is_shown_within_bag(fault, within_bags):
             yield fault
-        if fault.before is None or step.by < FAR_BACK_NS:
+        if fault.before is None or fault.by < FAR_BACK_NS:
             continue
-        half = FAR_BACK_NS // 2
         sides = [
-            timeline.overlapping(TimeWindow.around(at, half))
-            for at in (step.after.start, step.before.end)
+            timeline.overlapping(TimeWindow.around(at, FAR_BACK_NS // 2))
+            for at in (fault.bag.start, fault.before.end)
         ]
         # Of equals the earlier one is wrong: a clock that loses its time falls back.
         for bag in min(sides, key=len):
@@ -221,47 +224,37 @@ def _step_faults(
                 yield ClockFault(bag, FaultyClock.STRAY)
 
 
-def _is_shown_within(fault: ClockFault, within: Mapping[str, ClockFault]) -> bool:
-    """Returns whether a step between two bags is the one within one of them.
+def _is_shown_within_bag(fault: ClockFault, within_bags: Mapping[str, ClockFault]) -> bool:
+    """Returns whether a step between two bags repeats the step within one of them.
 
-    A bag in which the clock was set back begins before the one before it ends, and ends after the
-    next one begins, too.
-
-    Args:
-        fault: a step.
-        within: the steps within bags, by their files.
+    A bag in which the clock was set back begins before its predecessor ends, and ends after its
+    successor begins. `within_bags` has by path the steps within bags.
     """
     if fault.before is None:
         return False
-    into, out_of = within.get(fault.bag.file), within.get(fault.before.file)
-    return (into is not None and fault.before.end <= into.at + into.by + OUT_OF_ORDER_NS) or (
-        out_of is not None and fault.bag.start >= out_of.at - OUT_OF_ORDER_NS
-    )
+    in_after, in_before = within_bags.get(fault.bag.file), within_bags.get(fault.before.file)
+    if in_after and fault.before.end <= in_after.at + in_after.by + OUT_OF_ORDER_NS:
+        return True
+    return in_before is not None and fault.bag.start >= in_before.at - OUT_OF_ORDER_NS
 
 
 def dated_segments(timeline: Timeline, faults: Sequence[ClockFault]) -> Sequence[Segment]:
-    """Returns the recorded segments without the bags that mislead, in order; remembers them."""
+    """Returns the recorded segments without the bags that mislead; remembers them."""
     misdated = [fault.bag for fault in faults if fault.misleads]
     files = frozenset(bag.file for bag in misdated)
-    known = timeline.memo.of(_DATED, dict)
-    if files not in known:
-        known[files] = _segments_without(timeline.recorded_segments, misdated, files)
-    return known[files]
-
-
-def _segments_without(
-    segments: Sequence[Segment], misdated: Sequence[BagFile], files: Collection[str]
-) -> Sequence[Segment]:
-    firsts = [segment.first for segment in segments]
-    # Of the others, what they remember serves the next snapshot.
-    touched = {bisect_right(firsts, in_time(bag)) - 1 for bag in misdated}
-    dated = (
-        segment.without(file in files for file in segment.bags.files())
-        if nth in touched
-        else segment
-        for nth, segment in enumerate(segments)
-    )
-    return [*filter(None, dated)]
+    remembered = timeline.memo.of(_DATED, dict)
+    if files not in remembered:
+        firsts = [segment.first for segment in timeline.recorded_segments]
+        touched = {bisect_right(firsts, in_time(bag)) - 1 for bag in misdated}
+        dated: list[Segment] = []
+        for nth, segment in enumerate(timeline.recorded_segments):
+            # An untouched segment keeps what it has computed.
+            rest: Segment | None = segment
+            if nth in touched:
+                rest = segment.without(file in files for file in segment.bags.files())
+            dated += () if rest is None else (rest,)
+        remembered[files] = dated
+    return remembered[files]
 
 
 def _seconds(at: Ns) -> str:

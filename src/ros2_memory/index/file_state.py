@@ -4,30 +4,29 @@ The file itself shows whether its writer has finished. Where it does not, either
 writing it or a crash left it open:
 
     open      live heartbeat  names the recording                -> active, however long unchanged
-    open      live heartbeat  names others only                  -> left open by a crash
+    open      live heartbeat  names only others                  -> left open by a crash
     open      no heartbeat    grew within the last three splits  -> active
     open      no heartbeat    has not grown for longer           -> left open by a crash
 
-A file "grew" when its mtime shows that, or when two scans saw it grow. An mtime in the future shows
-nothing (the clock was set back), so there only what was seen counts.
+A file grew if its mtime says so, or if two scans saw it grow. An mtime in the future says nothing
+(the clock was set back): then only the scans count.
 
-Where nothing is recorded (`recorder=none`) an mtime alone is no evidence, since a copy has that of
-its copying: the file is active only where two scans saw it grow, or where its newest message is no
-more than three splits older than its mtime, as in the recording of another program. Where no
-message can be read yet the mtime decides. A recording of simulated times counts as left open by a
-crash until it was seen to grow.
+With `recorder=none` an mtime alone is no evidence: a copied file has the time of its copying. Such
+a file is active if two scans saw it grow, or if its newest message is at most three splits older
+than its mtime, as when another program records. If no message can be read yet, the mtime decides. A
+recording of simulated times counts as left open by a crash until two scans saw it grow.
 
-A `.db3` has no closing mark: between two transactions of its recorder it looks finished. One that
-grew within the last three splits is active unless the `metadata.yaml` beside it, which a recorder
-writes last, lists it, or a live heartbeat names other recordings only. A `.zstd` is written after
-the bag in it was closed; it is open until its last frame is complete.
+A `.db3` has no closing mark: between two transactions it looks finished. If it grew within the last
+three splits it is active, unless the `metadata.yaml` beside it lists it (a recorder writes that
+last), or a live heartbeat names only other recordings. A `.zstd` is written after its bag was
+closed, and is open until its last frame is complete.
 
-What the recorder holds back until it was screened (`bag_dir.state_files`) counts as active,
-whatever it is, and never answers.
+A split that the recorder holds back until it is screened (`bag_dir.state_files`) counts as active,
+whatever its state, and never answers.
 
-Where a scan includes active files an active `.mcap` is a bag as well as set aside: its complete
-chunks answer, since bytes of such a file never change once they are there. Those of a `.db3` do: it
-is read as a file that nobody writes, and read meanwhile its pages would contradict each other.
+If a scan includes active files, an active `.mcap` is both a bag and set aside: its complete chunks
+answer, since their bytes never change. A `.db3` does not answer: its pages change while it is
+written, and a read meanwhile would find them in contradiction.
 """
 
 from __future__ import annotations
@@ -51,9 +50,9 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
-"""How long until an unreadable file is tried again: the fault may have been the machine's."""
+"""An unreadable file is tried again after this time: the machine may have been at fault."""
 RETRY_SOON_NS: Final[Ns] = 5 * NS_PER_S
-"""The same where it certainly was the machine's: a failed disk, or too many open files."""
+"""The same if the machine certainly was at fault: a failed disk, or too many open files."""
 
 _ACTIVE = "still being written"
 HELD_BACK: Final = "not served yet: recording.exclude_when has still to be applied"
@@ -79,10 +78,13 @@ _WATCHED: Final = frozenset({FileState.ACTIVE, FileState.DAMAGED, FileState.HELD
 
 @dataclass(frozen=True, slots=True)
 class Classification:
-    """What one file is: a bag, set aside with a reason, or without a message.
+    """What one file is: a bag, or set aside with a reason, or a bag without messages.
 
-    Only an active file that answers is both a bag and set aside. `silent` are the topics that a bag
-    without a message declares.
+    Attributes:
+        state: its state.
+        bag: the bag, if it answers.
+        aside: why the file is set aside. Only an active file that answers has both.
+        silent: the topics that a bag without messages declares.
     """
 
     state: FileState
@@ -100,7 +102,7 @@ class ScanContext:
         now: the time of the scan.
         three_splits: how long three splits take.
         open_recordings: the recordings that a live heartbeat names; None without one.
-        include_active: whether the complete chunks of a file that is being written answer.
+        include_active: whether the complete chunks of an active file answer.
         trusts_mtime: whether a young mtime shows that a file is being written, not copied.
     """
 
@@ -116,7 +118,7 @@ class ScanContext:
     def withheld(self) -> Withheld:
         """What the recorder has not released yet.
 
-        That is looked up after the directory was listed: what was found there is known by then.
+        Read after the directory is listed, so it covers every file that the listing found.
         """
         return read_withheld(self.root)
 
@@ -135,19 +137,19 @@ class ScanContext:
 
 @dataclass(slots=True)
 class FileNotes:
-    """One bag file: its metadata and, as far as it was read, its content.
+    """What the scans have learned about one bag file.
 
     Attributes:
         file: its path as a string, to save memory.
         kind: its suffix, one of `core.model.BAG_KINDS`.
         stamp: its stat result.
-        seen_at: when it was first seen like this.
+        seen_at: when a scan first saw this stat result.
         trusted: whether a later change would show in its mtime.
         grew_at: when a scan last saw it grow.
-        closing: whether its writer has finished; None while unknown.
-        summary: its content; None while unknown.
+        closing: whether its writer has finished; None if not read yet.
+        summary: its content; None if not read yet.
         fault: why it cannot be read.
-        is_transient: the fault may be the machine's, not the file's.
+        is_transient: whether the machine may be at fault, not the file.
     """
 
     file: str
@@ -163,7 +165,7 @@ class FileNotes:
 
     @classmethod
     def first(cls, file: str, stamp: Stamp, now: Ns) -> FileNotes:
-        """Returns the notes on a bag file that was not known before."""
+        """Returns the notes on a bag file that no scan saw before."""
         return cls(file, bag_kind(file) or "", stamp, now, settled(stamp.mtime_ns, now))
 
     @property
@@ -172,18 +174,19 @@ class FileNotes:
         return Path(self.file)
 
     def restore(self, summary: BagSummary) -> None:
-        """Sets what was read earlier from a closed file, which has not changed since."""
+        """Sets the content of a closed file that was read earlier and has not changed."""
         self.closing, self.summary = Closing.CLOSED, summary
 
     def update(self, stamp: Stamp, now: Ns) -> bool:
-        """Updates the stamp, and drops what may be outdated; returns whether it dropped it."""
+        """Notes a new stat result; returns whether the file has to be read again."""
         if stamp.inode != self.stamp.inode:
             self.grew_at = None  # another file under the same name
         elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
-            self.grew_at = now  # also again after the clock was set back
+            # A time after now: the clock was set back since.
+            self.grew_at = now
         patience = RETRY_SOON_NS if self.is_transient else RETRY_NS
         is_retried = self.fault is not None and abs(now - self.seen_at) >= patience
-        # Also by its ctime alone: size and mtime may be those of the bag that it replaced.
+        # The ctime counts too: a file may have the size and mtime of the one that it replaced.
         is_outdated = is_retried or not self.trusted or stamp != self.stamp
         if is_outdated:
             self.closing, self.summary, self.fault = None, None, None
@@ -199,11 +202,11 @@ class FileNotes:
         return self.was_seen_growing(context) or -YOUNG_NS < age <= context.three_splits
 
     def was_seen_growing(self, context: ScanContext) -> bool:
-        """Returns whether two scans saw the file grow, within the last three splits."""
+        """Returns whether a scan saw the file grow within the last three splits."""
         return self.grew_at is not None and context.now - self.grew_at <= context.three_splits
 
     def must_be_watched(self, classification: Classification, context: ScanContext) -> bool:
-        """Returns whether the next scan must look at the file in an unchanged directory."""
+        """Returns whether the next scan must look at the file even if its directory is the same."""
         if classification.state is FileState.UNREAD:
             return False
         return (
@@ -218,7 +221,7 @@ class FileNotes:
 
 
 def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classification:
-    """Returns the state of a file; reads only what the notes do not have.
+    """Returns what a file is. Reads what the notes lack, and adds it to them.
 
     Raises:
         BagVanishedError: the file does not exist any more.
@@ -230,9 +233,9 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
     try:
         if notes.closing is None and notes.fault is None:
             # An open MCAP is 0 bytes until its first chunk is full.
-            empty = notes.stamp.size == 0
-            notes.closing = Closing.OPEN if empty else reader.closing(notes.path)
-        if _is_active(notes, context) and not _is_copy(notes, reader, context):
+            is_empty = notes.stamp.size == 0
+            notes.closing = Closing.OPEN if is_empty else reader.closing(notes.path)
+        if _is_active(notes, context) and not _is_young_copy(notes, reader, context):
             return _classify_active(notes, reader, context)
         if notes.summary is None and notes.fault is None:
             notes.summary = reader.summarize(notes.path)
@@ -246,7 +249,7 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
 
 
 def reason_unread(path: Path) -> str:
-    """Returns why a storage does not read a bag file, and what to do."""
+    """Returns why the storage does not read a bag file, and what to do about it."""
     kind = bag_kind(path.name) or ""
     if not path.name.endswith(kind):
         return f"the name of a bag file must end in {kind}, in lower case: rename it"
@@ -254,7 +257,7 @@ def reason_unread(path: Path) -> str:
 
 
 def files_in_metadata(path: Path) -> frozenset[str]:
-    """Returns the bag files that a metadata.yaml lists; none where it cannot be read."""
+    """Returns the bag files that a metadata.yaml lists; none if it cannot be read."""
     try:
         return frozenset(read_listing(path).names)
     except (OSError, ValueError):
@@ -275,8 +278,8 @@ def _is_active(notes: FileNotes, context: ScanContext) -> bool:
     )
 
 
-def _is_copy(notes: FileNotes, reader: BagReader, context: ScanContext) -> bool:
-    """Returns whether a file looks as being written only because it was copied just now.
+def _is_young_copy(notes: FileNotes, reader: BagReader, context: ScanContext) -> bool:
+    """Returns whether a file has a young mtime only because it was copied.
 
     Raises:
         BagVanishedError: the file does not exist any more.
@@ -292,7 +295,7 @@ def _is_copy(notes: FileNotes, reader: BagReader, context: ScanContext) -> bool:
 
 
 def _classify_active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classification:
-    """Returns the state of an active file; as a bag, too, as far as it can be one.
+    """Returns what an active file is: set aside, and a bag as well if its chunks answer.
 
     Raises:
         BagVanishedError: the file does not exist any more.
@@ -303,12 +306,12 @@ def _classify_active(notes: FileNotes, reader: BagReader, context: ScanContext) 
         return Classification(FileState.ACTIVE, aside=aside)
     summary = _summary_so_far(notes, reader)
     if summary is None and notes.stamp.size:
-        # It may become a bag. Whether it is one shows once it is no longer active.
+        # It cannot be read now, but may be a bag once it is closed.
         return Classification(FileState.ACTIVE, aside=aside)
     if summary is None or summary.empty:
         return Classification(FileState.ACTIVE, aside=replace(aside, answers=True))
     if not summary.complete:
-        # The first note is on the early end of the file, which goes on.
+        # The first note says that the file ends early: this one is still growing.
         summary = summary.replaced(notes=summary.notes[1:])
     bag = _bag_file(notes, BagState.ACTIVE, summary)
     answering = replace(aside, reason=_ANSWERS, answers=True, until=bag.end)
@@ -316,7 +319,7 @@ def _classify_active(notes: FileNotes, reader: BagReader, context: ScanContext) 
 
 
 def _summary_so_far(notes: FileNotes, reader: BagReader) -> BagSummary | None:
-    """Returns what can be read of a file that may be growing; None where nothing can.
+    """Returns the summary of a file that may be growing; None if nothing can be read of it.
 
     Raises:
         BagVanishedError: the file does not exist any more.

@@ -1,10 +1,11 @@
 """Gaps: where no topic has a message for longer than the recorded data explains. Pure decisions.
 
-From one bag to the next, or within a bag, as its summary states. What explains a pause is how often
-topics have a message that usually have one: the second most frequent of them, since one may fall
-silent by itself. Between bags a longer pause is a gap however rare topics are: from one split of a
-recording to the next, in which the recorder ran on, twice the longer one, or 20 s; 20 s where they
-have rare topics alone.
+A pause lies between two bags, or within one. The usual period of the topics around it explains a
+pause: the period of the second most frequent topic, since one topic may fall silent by itself.
+
+Between bags, a long pause is a gap even if the topics are rare. From one split of a recording to
+the next the recorder ran on: there, long means twice the longer split, and 20 s at most. If the
+two splits have only rare topics, it means 20 s.
 """
 
 from __future__ import annotations
@@ -25,21 +26,24 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_rows import BagRows
 
-SHORTEST_GAP_NS: Final[Ns] = NS_PER_S
-"""Between two recordings, where topics are frequent."""
+_SHORTEST_GAP_NS: Final[Ns] = NS_PER_S
+"""The shortest gap between two recordings with frequent topics."""
 _GAP_PERIODS: Final = 3
+"""A topic is missed after this many of its periods."""
 _GAP_SPLITS: Final = 2
-_LONGEST_LEAST_NS: Final[Ns] = 20 * NS_PER_S
+"""A recorder that runs on may pause for this many splits."""
+_ALWAYS_A_GAP_NS: Final[Ns] = 20 * NS_PER_S
+"""A longer pause between bags is a gap in any case."""
 
 
 class Pause(NamedTuple):
-    """A time (log times of two messages) of more than `SHORTEST_PAUSE_NS` without a message.
+    """A time of more than `SHORTEST_PAUSE_NS` without a message.
 
     Attributes:
-        start: of the message before it.
-        end: of the message after it.
-        bags: the bag that it lies in, or those before and after it.
-        ran_on: whether one recorder recorded both messages.
+        start: log time of the last message before it.
+        end: log time of the first message after it.
+        bags: the bag that it lies in, or the bags before and after it.
+        ran_on: whether one run of a recorder recorded both messages.
     """
 
     start: Ns
@@ -49,7 +53,7 @@ class Pause(NamedTuple):
 
     @property
     def span(self) -> Span:
-        """Its first and its last moment (log time, ns)."""
+        """Start and end."""
         return self.start, self.end
 
     @property
@@ -59,24 +63,24 @@ class Pause(NamedTuple):
 
 
 def pauses_between(bags: BagRows) -> Iterator[Pause]:
-    """Yields the pauses between bags, which are in order of time and may overlap."""
+    """Yields the pauses between bags. The bags are in order of time and may overlap."""
     reach = np.minimum(np.maximum.accumulate(bags.ends), MAX_NS - SHORTEST_PAUSE_NS)
     for row in np.flatnonzero(bags.starts[1:] > reach[:-1] + SHORTEST_PAUSE_NS).tolist():
         yield pause_between(bags[int(bags.ends[: row + 1].argmax())], bags[row + 1])
 
 
 def pause_between(before: BagFile, after: BagFile) -> Pause:
-    """Returns the pause between two bags, of one recorder if they are splits that follow."""
+    """Returns the pause between two bags; consecutive splits are of one run of a recorder."""
     name, next_name = split_of(before.file), split_of(after.file)
     ran_on = name is not None and next_name == (name.series, name.number + 1)
     return Pause(before.end, after.start, (before, after), ran_on)
 
 
 class Rhythm:
-    """How often the topics of bags have a message.
+    """Tells gaps from other pauses by how often topics usually have a message.
 
     Args:
-        periods: the usual period of each topic of a memory that has one.
+        periods: by topic, its usual period (ns); topics without one are missing.
     """
 
     def __init__(self, periods: Mapping[str, Ns]) -> None:
@@ -88,39 +92,41 @@ class Rhythm:
 
     def suspects(self, pauses: Iterable[Pause]) -> list[Pause]:
         """Returns the pauses of running recorders that may be steps of the clock."""
-        return [pause for pause in pauses if pause.ran_on and self._is_longer(pause, topics=1)]
+        return [pause for pause in pauses if pause.ran_on and self._is_unusual(pause, topics=1)]
 
     @property
     def shortest_gap(self) -> Ns:
-        """How long a pause between two recordings may be without being a gap."""
-        return max(SHORTEST_GAP_NS, _GAP_PERIODS * min(self._periods.values(), default=0))
+        """The length (ns) that a pause between two recordings must exceed to be a gap."""
+        return max(_SHORTEST_GAP_NS, _GAP_PERIODS * min(self._periods.values(), default=0))
 
     def _is_gap(self, pause: Pause) -> bool:
         if any(is_thinned(bag.file) for bag in pause.bags):
-            # There each topic has a message in every slot of 7 s, or as often as it had.
-            return pause.length > _LONGEST_LEAST_NS
-        if self._is_longer(pause, topics=2):
+            # A thinned day keeps a message of each topic in every slot of 7 s.
+            return pause.length > _ALWAYS_A_GAP_NS
+        if self._is_unusual(pause, topics=2):
             return True
         if len(pause.bags) == 1:
             return False
-        longer = max(bag.end - bag.start for bag in pause.bags)
-        if not any(self._periods.keys() & bag.summary.schema.positions for bag in pause.bags):
-            longer = _LONGEST_LEAST_NS  # how long a split was, rare topics do not show
-        least = min(_GAP_SPLITS * longer, _LONGEST_LEAST_NS) if pause.ran_on else 0
-        return pause.length > max(least, self.shortest_gap)
+        least = self.shortest_gap
+        if pause.ran_on:
+            split = max(bag.end - bag.start for bag in pause.bags)
+            if not any(self._periods.keys() & bag.summary.schema.positions for bag in pause.bags):
+                split = _ALWAYS_A_GAP_NS  # rare topics do not show how long a split was
+            least = max(least, min(_GAP_SPLITS * split, _ALWAYS_A_GAP_NS))
+        return pause.length > least
 
-    def _is_longer(self, pause: Pause, topics: int) -> bool:
-        """Returns whether a pause is longer than its bags explain, by so many topics at least.
+    def _is_unusual(self, pause: Pause, topics: int) -> bool:
+        """Returns whether a pause is longer than the topics around it usually pause.
 
-        What explains it is how often the second most frequent of the topics has a message that are
-        heard up to it or from it on; and the most frequent on either side alone, as others may have
-        fallen silent, or have been so, for longer.
+        The most frequent topics are asked first, until two of them were heard next to the pause,
+        and one on each of its sides. The rarest of these sets the limit. With fewer than `topics`
+        heard, nothing is known.
         """
         summaries = [bag.summary for bag in pause.bags]
         usual = self._periods.keys() & chain.from_iterable(
             summary.schema.positions for summary in summaries
         )
-        sides, heard, explained = {pause.start, pause.end}, 0, 0
+        unheard_sides, heard, longest_usual = {pause.start, pause.end}, 0, 0
         for topic in sorted(usual, key=self._periods.__getitem__):
             limit = _GAP_PERIODS * self._periods[topic]
             spans = [
@@ -128,13 +134,15 @@ class Rhythm:
                 for summary in summaries
                 if topic in summary.schema.positions
             ]
-            beside = {
-                at
-                for at in pause.span
-                if any(first - limit <= at <= last + limit for first, last in spans)
+            sides = {
+                side
+                for side in pause.span
+                if any(first - limit <= side <= last + limit for first, last in spans)
             }
-            if beside:
-                sides, heard, explained = sides - beside, heard + 1, limit
-            if heard > 1 and not sides:
+            if sides:
+                unheard_sides -= sides
+                heard += 1
+                longest_usual = limit
+            if heard > 1 and not unheard_sides:
                 break
-        return heard >= topics and not sides and pause.length > explained
+        return heard >= topics and not unheard_sides and pause.length > longest_usual

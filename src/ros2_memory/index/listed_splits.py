@@ -1,7 +1,7 @@
-"""Files that a recording's `metadata.yaml` lists and that are not there.
+"""Files that a recording's `metadata.yaml` lists and that are missing.
 
-rosbag2 writes metadata.yaml at a clean end, with every file of the recording. Files that were lost
-since, or never copied, leave no other trace.
+rosbag2 writes metadata.yaml at a clean end and lists every file of the recording. A file that was
+lost since, or never copied, leaves no other trace.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ _MISSING: Final = "metadata.yaml lists it, but it is missing"
 
 
 class Absent(NamedTuple):
-    """What one recording's metadata.yaml lists and is not there.
+    """What one recording lacks of what its metadata.yaml lists.
 
     Attributes:
-        folder: the recording's.
+        folder: the path of the recording.
         files: names of the missing files.
-        messages: how many messages it counts that no file here holds.
-        unreadable: it cannot be read, so nothing was compared.
+        messages: how many of the counted messages no file here holds.
+        unreadable: whether metadata.yaml cannot be read, so that nothing was compared.
     """
 
     folder: str
@@ -50,7 +50,10 @@ class Absent(NamedTuple):
 
 
 class _Stamp(NamedTuple):
-    """Of a metadata.yaml; the mtime of its folder shows names that were added and deleted."""
+    """The stat result of a metadata.yaml, and the mtime of its folder.
+
+    The mtime of the folder changes when files are added or deleted.
+    """
 
     mtime_ns: Ns
     size: int
@@ -61,11 +64,12 @@ class _FolderListing(NamedTuple):
     """A recording's metadata.yaml compared with the bag files in its folder.
 
     Attributes:
-        first: names (without `.zstd`) and messages of the missing files before any that is there.
-        later: those of all others that are missing.
-        bags: how many of the files that are there hold a message by it; None: it lists no file.
-        messages: of these, or of all files where `is_total`; None where that is not known.
-        is_total: it has no number for each file.
+        first: the missing files before the first file that is there: names without `.zstd`, and
+            numbers of messages.
+        later: the other missing files.
+        bags: how many files that are there should hold a message; None if no file is listed.
+        messages: how many messages these should hold; None if unknown.
+        is_total: `messages` counts all files: metadata.yaml has no number for each file.
     """
 
     first: tuple[tuple[str, int], ...] = ()
@@ -76,19 +80,19 @@ class _FolderListing(NamedTuple):
 
 
 Listings: TypeAlias = "dict[str, tuple[_Stamp, _FolderListing]]"
-"""By folder: how it was when its metadata.yaml was read, and what that listed."""
+"""By folder: its stamp when its metadata.yaml was read, and the comparison."""
 
 
 def listing_to_json(stamp: _Stamp, listing: _FolderListing) -> str:
-    """Returns what was read of a folder as one line."""
+    """Returns the listing of a folder as one line."""
     return json.dumps([stamp, listing])
 
 
 def listing_from_json(text: str) -> tuple[_Stamp, _FolderListing]:
-    """Returns what was read of a folder.
+    """Returns the listing of a folder from its line.
 
     Raises:
-        ValueError, TypeError, OverflowError: the text is nothing of that kind.
+        ValueError, TypeError, OverflowError: the text has another form.
     """
     (mtime, size, folder), (first, later, bags, messages, is_total) = json.loads(text)
     return _Stamp(mtime, size, folder), _FolderListing(
@@ -101,11 +105,11 @@ def listing_from_json(text: str) -> tuple[_Stamp, _FolderListing]:
 
 
 def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Absent]:
-    """Returns what is missing of the recordings of a snapshot; `known` are listings of before.
+    """Returns what recordings of a snapshot lack; adds what it reads to the `known` listings.
 
-    A recorder of ours deletes splits of its recordings, whose metadata.yaml still lists them. Those
-    that it noted are not missing, nor are those before the first split that is left: versions
-    before the notes deleted the oldest.
+    Our recorder deletes splits that metadata.yaml still lists. A split that it noted as deleted is
+    not missing. Nor is one before the first split that is left: older versions deleted the oldest
+    splits without a note.
     """
     if not snapshot.metadata_folders:
         return []
@@ -116,26 +120,25 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
         for name, tally in segment.tallies.items():
             bags[name] += tally.bags
             messages[name] += tally.messages
-    absent, deleted = [], read_deleted(bag_dir)
+    absent: list[Absent] = []
+    deletions = read_deleted(bag_dir)
     for folder, listing in _folder_listings(snapshot, bag_dir, known):
         if listing is None or listing.bags is None:
             absent.append(Absent(folder, unreadable=True))
             continue
-        # Asked only where the first file is missing: it takes longer than all else here.
-        is_own = bool(listing.first) and _may_be_deleted(own, bag_dir, Path(folder))
-        of_recording = deleted.get(folder.removeprefix(f"{bag_dir}/"))
-        gone = frozenset[str]() if of_recording is None else frozenset(of_recording.files)
+        # The slowest check of all, needed only if the first file is missing.
+        is_own = bool(listing.first) and _may_delete_splits(own, bag_dir, Path(folder))
+        deletion = deletions.get(folder.removeprefix(f"{bag_dir}/"))
+        deleted = frozenset[str]() if deletion is None else frozenset(deletion.files)
         present = Tally(bags[folder], messages[folder])
-        absent.append(_absent_from(folder, listing, present, gone, is_own=is_own))
-    return [
-        recording
-        for recording in absent
-        if recording.files or recording.messages or recording.unreadable
-    ]
+        lack = _compare(folder, listing, present, deleted, is_own=is_own)
+        if lack.files or lack.messages:
+            absent.append(lack)
+    return absent
 
 
 def absent_files(absent: Sequence[Absent]) -> list[SetAside]:
-    """Returns missing files as closed files that cannot be read."""
+    """Returns the missing files as files that cannot be read."""
     return [
         SetAside(Path(recording.folder) / name, _MISSING)
         for recording in absent
@@ -144,7 +147,10 @@ def absent_files(absent: Sequence[Absent]) -> list[SetAside]:
 
 
 def describe_absent(absent: Sequence[Absent]) -> Iterator[str]:
-    """Yields sentences on what is missing: counted, with the first few recordings named."""
+    """Yields a sentence on missing files and messages, and one on unreadable listings.
+
+    The first few recordings are named.
+    """
     missing = [recording for recording in absent if not recording.unreadable]
     if missing:
         parts = []
@@ -163,30 +169,32 @@ def _names(absent: Sequence[Absent]) -> str:
     return listed(names[:MAX_NAMED], len(names))
 
 
-def _may_be_deleted(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:
-    """Returns whether the recorder of the bag directory deletes splits of a recording."""
+def _may_delete_splits(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:
+    """Returns whether our recorder may have deleted splits of a recording without a note."""
     try:
         if own.exists():
             return own.owns(folder)
-        # Versions before the list of own recordings may have deleted any.
+        # Versions without a list of own recordings deleted splits of any.
         return (bag_dir / HEARTBEAT_FILE).exists()
     except OSError:
         return True
 
 
-def _absent_from(
-    folder: str, listing: _FolderListing, present: Tally, gone: Collection[str], *, is_own: bool
+def _compare(
+    folder: str, listing: _FolderListing, present: Tally, deleted: Collection[str], *, is_own: bool
 ) -> Absent:
     """Returns what a folder lists and its bags do not hold.
 
-    `gone` are names of files that retention deleted.
+    `present` counts its bags and their messages, `deleted` names the files that retention deleted.
     """
     expected = listing.later if is_own else (*listing.first, *listing.later)
-    missing = [(name, count) for name, count in expected if name not in gone]
+    missing = [(name, count) for name, count in expected if name not in deleted]
     lost = sum(count for _, count in missing)
-    # A bag that is damaged or cut by a handover holds fewer that count, and is not compared. Nor is
-    # the number of all files together, where some were deleted.
-    is_comparable = present.bags == listing.bags and not (listing.is_total and (is_own or gone))
+    # A bag that is damaged, or cut by a handover, holds fewer messages than are listed. A total
+    # also counts the files that were deleted.
+    is_comparable = present.bags == listing.bags
+    if listing.is_total and (is_own or deleted):
+        is_comparable = False
     if listing.messages is not None and is_comparable:
         lost += max(listing.messages - present.messages, 0)
     return Absent(folder, tuple(name for name, _ in missing), lost)
@@ -195,9 +203,9 @@ def _absent_from(
 def _folder_listings(
     snapshot: Snapshot, bag_dir: Path, known: Listings
 ) -> Iterator[tuple[str, _FolderListing | None]]:
-    """Yields the folders with a metadata.yaml that is not being written, and what that lists.
+    """Yields folders with a metadata.yaml that is not being written, and their listings.
 
-    None where the folder or the file cannot be read. What was read is added to `known`.
+    A listing is None if the folder or the file cannot be read. Others are added to `known`.
     """
     now = snapshot.scanned_at
     for folder in snapshot.metadata_folders:
@@ -222,14 +230,14 @@ def _folder_listings(
 
 
 def _stamp_of(folder: str) -> _Stamp:
-    # As texts: a path for each folder takes longer than to look at it.
+    # A `Path` for each folder would take longer than the system calls.
     status = os.lstat(f"{folder}/{METADATA_FILE}")
     changed = os.stat(folder).st_mtime_ns  # noqa: PTH116
     return _Stamp(status.st_mtime_ns, status.st_size, changed)
 
 
 def _read_listing(bag_dir: Path, folder: str) -> _FolderListing:
-    """Reads a folder with a metadata.yaml.
+    """Compares a folder with its metadata.yaml.
 
     Raises:
         OSError: the folder or the file cannot be read.

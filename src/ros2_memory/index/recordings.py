@@ -1,12 +1,12 @@
 """Which bags are of one recording, and which recordings overlap in time.
 
-A recording is mostly a folder. Bags that somebody copied into one folder are of several: each file
-is a recording of its own, and so are files that `ros2 bag record` numbered (`run_0.mcap`,
-`run_1.mcap`) and that follow each other.
+Most recordings are a folder. Where somebody copied bags of several recordings into one folder, each
+file is a recording. Files that `ros2 bag record` numbered (`run_0.mcap`, `run_1.mcap`), and that
+follow each other in time, are one recording together.
 
-Recordings that were copied into one folder, two robots' for instance, answer as one memory. Where
-one recording took over from another they overlap too: that is written down in `handover.json`,
-each message counts once, and there is nothing to report.
+Recordings in one bag directory answer as one memory, even if they are of two robots: overlaps show
+that. A recording that took over from another overlaps it as well. But `handover.json` says so, each
+message counts once, and there is nothing to report.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from __future__ import annotations
 import re
 from functools import partial
 from heapq import nlargest
-from itertools import chain, pairwise
-from operator import itemgetter
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -37,36 +36,35 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.snapshot import Snapshot
 
-_OF_NAME: Final = rf"(?:/.*|(?:_\d+)?(?:{'|'.join(map(re.escape, BAG_KINDS))}))?"
-"""What may follow the name of a recording in a path: what is in its folder, or a bag's suffix."""
-
 LONG_NS: Final[Ns] = 30 * NS_PER_S
-"""No handover takes longer; a shorter overlap counts where it is half of a recording."""
+"""A longer overlap always counts: no handover takes that long."""
 SHORT_NS: Final[Ns] = NS_PER_S
+"""A longer overlap counts if it is at least half of the shorter recording."""
 _IN_MOMENTS: Final = f"/{MOMENTS_FOLDER}/"
 _MOMENT: Final = re.compile(rf"(?P<bag_dir>.*){_IN_MOMENTS}\d{{8}}T\d{{6}}Z[^/]*/(?P<recording>.+)")
 _MAX_READ: Final = 200
-"""How many pairs are checked for a handover; each costs two files."""
+"""How many pairs are checked for a handover; each check reads two files."""
 _OVERLAPS: Final[Key[tuple[Overlapping, ...]]] = Key()
-"""Of a timeline: its pairs, but for their handovers."""
+"""Of a timeline: the pairs that overlap for long, including handovers."""
 
 
 def paths_named(path: str) -> re.Pattern[str]:
-    """Returns what the paths of a recording match.
+    """Returns a pattern for the paths of a recording and of the files in it.
 
-    `path` is that of a folder, a bag, or the bags of one series (`run` for `run_0.mcap` and its
-    like).
+    `path` is a folder, a bag with or without its suffix, or a series of bags (`run` for
+    `run_0.mcap`, `run_1.mcap`).
     """
-    return re.compile(re.escape(path) + _OF_NAME)
+    suffixes = "|".join(map(re.escape, BAG_KINDS))
+    return re.compile(rf"{re.escape(path)}(?:/.*|(?:_\d+)?(?:{suffixes}))?")
 
 
 def recordings_of(
     snapshot: Snapshot, is_wanted: Callable[[SummarySchema], object] = lambda _: True
 ) -> dict[str, list[BagFile]]:
-    """Returns the bags of each recording, by its path: a folder, or that of a bag less its suffix.
+    """Returns the bags of each recording whose schema is wanted.
 
-    With `data.recording` each of these names, below the bag directory, is one recording. Only the
-    bags with a schema that `is_wanted`.
+    The key is the path of the recording: a folder, or a bag without its suffix. `data.recording`
+    takes this path, relative to the bag directory.
     """
     recordings: dict[str, list[BagFile]] = {}
     for bags, paths in _with_recordings(snapshot, snapshot.timeline.recorded_segments):
@@ -79,7 +77,7 @@ def recordings_of(
 def _with_recordings(
     snapshot: Snapshot, segments: Iterable[Segment]
 ) -> Iterator[tuple[BagRows, Sequence[str]]]:
-    """Yields the bags of segments, and of each one the path of its recording."""
+    """Yields the bags of each segment, and for each bag the path of its recording."""
     loose = loose_bags(snapshot)
     for bags in (segment.bags for segment in segments):
         paths = [bags.folders[nth] for nth in bags.folder_of.tolist()]
@@ -89,27 +87,27 @@ def _with_recordings(
 
 
 def name_of(path: str, bags: Sequence[BagFile], root: str) -> str:
-    """Returns the name, below the bag directory `root`, under which a recording is found.
+    """Returns the name by which `data.recording` selects a recording of the bag directory `root`.
 
     `path` and `bags` are an item of `recordings_of`.
     """
     if path != root:
         return path.removeprefix(f"{root}/")
-    # Its bags lie in the folder itself.
+    # The bag directory itself is the recording: its bags name it.
     name = stem_of(bags[0].file).removeprefix(f"{root}/")
     return name if len(bags) == 1 else name.rpartition("_")[0]
 
 
 def loose_bags(snapshot: Snapshot) -> dict[str, str]:
-    """Returns the recording of each bag that lies loose in a folder, by path of the bag.
+    """Returns by path the recording of each bag whose folder is not one recording.
 
-    A folder with a metadata.yaml is one recording, and so is one whose bags are
-    named after it, or with a number alone.
+    A folder is one recording if it has a metadata.yaml, or if its bags are named after it, or just
+    by a number.
     """
     series: dict[str, list[BagFile]] = {}
     whole = {*snapshot.metadata_folders}
     for bags in (segment.bags for segment in snapshot.timeline.recorded_segments):
-        # Those of one stem are alike in this.
+        # All bags of a stem are loose, or none is: one of each is looked at.
         positions = bags.names.positions
         firsts = bags.files(np.unique(positions, return_index=True)[1])
         are_loose = [
@@ -126,13 +124,13 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
 
 
 def is_named_after_folder(file: str) -> bool:
-    """Returns whether a bag is named as a split of the recording of its folder, or by a number."""
+    """Returns whether a bag has the name of its folder and a number, or just a number."""
     folder, _, name = file.rpartition("/")
     return name.startswith(f"{folder.rpartition('/')[2]}_") or name.partition(".")[0].isdigit()
 
 
 def _series_of(file: str) -> str:
-    """Returns the path of a bag without its suffixes, and without its number where it has one."""
+    """Returns the path of a bag without its suffixes and its number."""
     name = split_of(file)
     return name.series[:-1] if name and name.series.endswith("_") else stem_of(file)
 
@@ -147,7 +145,7 @@ def _are_splits(bags: Sequence[BagFile]) -> bool:
 
 
 class Overlapping(NamedTuple):
-    """Two recordings, by their paths, and when (log times, inclusive) they overlap."""
+    """Two recordings, and the log times (inclusive) between which they overlap."""
 
     first: Path
     second: Path
@@ -156,7 +154,7 @@ class Overlapping(NamedTuple):
 
     @property
     def names(self) -> tuple[str, str]:
-        """The names of the two, with those of their parents where these are equal."""
+        """The names of the two, with their parents' names if the two are equal."""
         depth = 1 if self.first.name != self.second.name else 2
         first, second = ("/".join(path.parts[-depth:]) for path in (self.first, self.second))
         return first, second
@@ -165,75 +163,77 @@ class Overlapping(NamedTuple):
 def overlapping_recordings(
     snapshot: Snapshot, joined_with: Callable[[Path], tuple[str, ...]]
 ) -> tuple[Overlapping, ...]:
-    """Returns the pairs of recordings that overlap and that no handover joins, in order of time.
+    """Returns the pairs of recordings that overlap without a handover, in order of time.
 
-    `joined_with` returns the names of recordings that handovers join with one.
-    Thinned days and bags that a wrong clock dated are left out. Those in a saved moment count with
-    the recording that they were saved from.
+    `joined_with` returns the names of the recordings that handovers join with one. Thinned days and
+    bags that a wrong clock dated are left out. A bag in a saved moment counts for the recording
+    that it was saved from.
     """
     overlaps = snapshot.timeline.memo.of(_OVERLAPS, partial(_long_overlaps, snapshot))
-    return tuple(pair for pair in overlaps if not _took_over(pair, joined_with))
+    return tuple(pair for pair in overlaps if not _is_handover(pair, joined_with))
 
 
 def _long_overlaps(snapshot: Snapshot) -> tuple[Overlapping, ...]:
-    """Returns the pairs that share most time, in order of time, also those of handovers."""
-    lengths, overlaps = _sweep(snapshot)
-    pairs = []
+    """Returns the pairs that overlap for long, in order of time; the longest if there are many."""
+    lengths, overlaps = _overlaps_of(snapshot)
+    shared: dict[Overlapping, Ns] = {}
     for (first, second), overlap in overlaps.items():
         shorter = min(lengths[first], lengths[second])
-        shared = overlap.shared
-        if shared > LONG_NS or (shared > SHORT_NS and 2 * shared >= shorter):
+        is_half = 2 * overlap.shared >= shorter
+        if overlap.shared > LONG_NS or (overlap.shared > SHORT_NS and is_half):
             pair = Overlapping(Path(first), Path(second), overlap.start, overlap.end)
-            pairs.append((shared, pair))
-    longest = nlargest(_MAX_READ, pairs, key=itemgetter(0))
-    return tuple(sorted((pair for _, pair in longest), key=lambda pair: pair.start))
+            shared[pair] = overlap.shared
+    longest = nlargest(_MAX_READ, shared, key=shared.__getitem__)
+    return tuple(sorted(longest, key=lambda pair: pair.start))
 
 
 class _Overlap(NamedTuple):
-    """When two recordings have bags at once: first and last log time, and how much between them."""
+    """When two recordings have bags at once.
+
+    Attributes:
+        start: the first log time.
+        end: the last log time.
+        shared: how much of the time between is shared (ns).
+    """
 
     start: Ns
     end: Ns
     shared: Ns
 
     def extended(self, start: Ns, end: Ns) -> _Overlap:
-        """Returns it with a time that begins later; a part of that may be in it already."""
+        """Returns the overlap with one more span, which does not begin before `self.start`."""
         more = max(end - max(start, self.end), 0)
         return _Overlap(self.start, max(end, self.end), self.shared + more)
 
 
-def _sweep(snapshot: Snapshot) -> tuple[dict[str, Ns], dict[tuple[str, str], _Overlap]]:
-    """Returns how long each recording is, and where two of them have bags at once."""
+def _overlaps_of(snapshot: Snapshot) -> tuple[dict[str, Ns], dict[tuple[str, str], _Overlap]]:
+    """Returns by path the length (ns) of each recording, and by pair of paths their overlap."""
     lengths: dict[str, Ns] = {}
     overlaps: dict[tuple[str, str], _Overlap] = {}
-    ends: dict[str, Ns] = {}  # of the recordings that may last into the next bag
-    bags_of_segments = (
-        zip(paths, bags.starts.tolist(), bags.ends.tolist(), strict=True)
-        for bags, paths in _with_recordings(snapshot, snapshot.whole_segments)
-    )
-    for path, start, end in chain.from_iterable(bags_of_segments):
-        recording = _recorded_folder(path) if _IN_MOMENTS in path else path
-        for other in [name for name in ends if name != recording]:
-            if ends[other] <= start:
-                del ends[other]
-                continue
-            pair = (min(other, recording), max(other, recording))
-            overlap = overlaps.get(pair, _Overlap(start, start, 0))
-            overlaps[pair] = overlap.extended(start, min(ends[other], end))
-        before = ends.get(recording)
-        added = end - max(start, before or start)
-        lengths[recording] = lengths.get(recording, 0) + max(added, 0)
-        ends[recording] = max(before or end, end)
+    ends: dict[str, Ns] = {}  # when recordings end that may overlap the next bag
+    for bags, paths in _with_recordings(snapshot, snapshot.whole_segments):
+        for path, start, end in zip(paths, bags.starts.tolist(), bags.ends.tolist(), strict=True):
+            recording = _saved_from(path) if _IN_MOMENTS in path else path
+            for other in [name for name in ends if name != recording]:
+                if ends[other] <= start:
+                    del ends[other]
+                    continue
+                pair = (min(other, recording), max(other, recording))
+                overlap = overlaps.get(pair, _Overlap(start, start, 0))
+                overlaps[pair] = overlap.extended(start, min(ends[other], end))
+            before = ends.get(recording, start)
+            lengths[recording] = lengths.get(recording, 0) + max(end - max(start, before), 0)
+            ends[recording] = max(before, end)
     return lengths, overlaps
 
 
-def _recorded_folder(folder: str) -> str:
-    """Returns the folder of the recording that a folder in a saved moment has bags of."""
+def _saved_from(folder: str) -> str:
+    """Returns the path of the recording from which a folder of a saved moment was saved."""
     match = _MOMENT.fullmatch(folder)
     return f"{match['bag_dir']}/{match['recording']}" if match else folder
 
 
-def _took_over(pair: Overlapping, joined_with: Callable[[Path], tuple[str, ...]]) -> bool:
+def _is_handover(pair: Overlapping, joined_with: Callable[[Path], tuple[str, ...]]) -> bool:
     """Returns whether a handover joins the two recordings."""
     first, second = pair.first, pair.second
     is_named = second.name in joined_with(first) or first.name in joined_with(second)

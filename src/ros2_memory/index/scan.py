@@ -1,7 +1,7 @@
 """Scanning the bag directory: which bag files are there, and which may have changed.
 
-A directory is listed again only when its mtime shows that names came or went. That does not show
-what was written *into* a file, so the caller names files to be looked up in every scan.
+A directory is listed again only if its mtime shows that names came or went. The mtime does not show
+writes *into* a file, so the caller names files to be looked up in every scan.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 PATROL: Final = 256
-"""Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
+"""How many closed files each patrolling scan checks, in turn: an overwrite changes no directory."""
 
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
-"""Two changes within one tick of the file system share an mtime: a young one proves nothing."""
+"""Two changes within one tick of the file system share an mtime: a young mtime proves nothing."""
 
 BAG_DIR_SETTING: Final = "recording.bag_dir (MEMORY_BAG_DIR)"
 """The setting that names the bag directory, unless another one does."""
@@ -50,15 +50,15 @@ _LINK = "a symbolic link, which is not followed: move or mount the bags into the
 
 
 def settled(mtime_ns: Ns, now: Ns) -> bool:
-    """Returns whether a later change would show in the mtime; also of one far in the future."""
+    """Returns whether a later change would change the mtime; an mtime in the future is settled."""
     return abs(now - mtime_ns) >= YOUNG_NS
 
 
 class Stamp(NamedTuple):
     """The stat result of a file.
 
-    `sidecar_ns` is the mtime of the `handover.json` beside it, 0 without one: that decides which
-    messages of the file count.
+    `sidecar_ns` is the mtime of the `handover.json` beside it, 0 without one. That file decides
+    which messages of a bag count.
     """
 
     size: int
@@ -75,33 +75,33 @@ class Stamp(NamedTuple):
 
     @property
     def content(self) -> tuple[int, Ns, Ns]:
-        """What changes when other messages count: size, mtime and mtime of the sidecar."""
+        """Size, mtime and mtime of the sidecar: if these are the same, so is the content."""
         return self.size, self.mtime_ns, self.sidecar_ns
 
 
 def sidecar_ns_of(status: os.stat_result) -> Ns:
-    """Returns the `sidecar_ns` of stamps beside a `handover.json`; a link is as good as none."""
+    """Returns the `sidecar_ns` for the stat result of a `handover.json`; a link does not count."""
     return 0 if stat.S_ISLNK(status.st_mode) else limited(status.st_mtime_ns)
 
 
 _UNSEEN: Final = Stamp(-1, 0, 0, 0)
 _ROW: Final = np.dtype([("size", "i8"), ("mtime", "i8"), ("ctime", "i8"), ("inode", "u8")])
-"""The stamp of a file in a directory, whose sidecar is that of all."""
+"""A stamp without `sidecar_ns`, which all files of a directory share."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanResult:
-    """What one scan found. Paths are strings, as `os.scandir` gives them: there are so many.
+    """What one scan found. Paths are strings, as `os.scandir` gives them: there are many.
 
     Attributes:
-        stamps: the bag files that are new, have changed, or may change without a trace; and the
-            watched ones.
-        before: how those were when they were last looked at, and those that are gone.
-        gone: the files that are not known any more.
+        stamps: by path, the bag files that are new, have changed, are watched, or may change
+            without a trace.
+        before: by path, the previous stamps of these files, and of those that are gone.
+        gone: paths of files that went since the last scan.
         damaged: directories that cannot be listed, and bag names that are no files; in no order.
         links: symbolic links; in no order.
-        problem: what is wrong with the bag directory itself. Either it does not exist, and all its
-            files are gone; or it cannot be listed at the moment, and all its files count as before.
+        problem: what is wrong with the bag directory itself. If it does not exist, all its files
+            are gone. If it cannot be listed at the moment, all its files count as before.
         metadata_folders: folders with a metadata.yaml.
     """
 
@@ -123,11 +123,22 @@ class ScanResult:
 
 @dataclass(slots=True)
 class _Folder:
-    """A directory as it was last listed: of its bags, the names and their stamps, one by one.
+    """A directory as it was last listed.
 
     Attributes:
-        linked: inodes of files with several hard links.
-        newer: stamps of bags that were looked at since, by path.
+        path: its path.
+        mtime_ns: its mtime before it was listed.
+        trusted: whether an equal mtime means that it need not be listed again.
+        device: the device that it is on.
+        folders: paths of the directories in it.
+        names: names of the bags in it, separated by slashes.
+        rows: the stamps of these bags, in this order.
+        linked: inodes of bags with several hard links.
+        newer: by path, stamps of bags that were looked up since.
+        links: symbolic links in it.
+        odd: names of bags that are no files, or cannot be read.
+        sidecar_ns: as in `Stamp`.
+        has_metadata: whether it has a metadata.yaml.
     """
 
     path: str
@@ -146,30 +157,30 @@ class _Folder:
 
     @property
     def stamps(self) -> dict[str, Stamp]:
-        """Of all bags, by path."""
+        """The stamps of all bags, by path."""
         names = self.names.split("/") if self.names else []
-        return self._with_stamps(names, self.rows)
+        return self._stamps_by_path(names, self.rows)
 
     def stamps_of(self, paths: Iterable[str]) -> dict[str, Stamp]:
-        """Of those of some bags that it has, by path: a folder may have a week of others."""
+        """Returns the stamps of some bags, by path: the folder may have a week of others."""
         wanted, names = {path.rpartition("/")[2] for path in paths}, self.names.split("/")
         rows = [row for row, name in enumerate(names) if name in wanted]
-        return self._with_stamps([names[row] for row in rows], self.rows[rows])
+        return self._stamps_by_path([names[row] for row in rows], self.rows[rows])
 
-    def _with_stamps(self, names: Sequence[str], rows: NDArray[np.void]) -> dict[str, Stamp]:
+    def _stamps_by_path(self, names: Sequence[str], rows: NDArray[np.void]) -> dict[str, Stamp]:
         root, sidecar = self.path.rstrip("/"), self.sidecar_ns
-        found = {
+        stamps = {
             f"{root}/{name}": Stamp(size, mtime, ctime, inode, sidecar)
             for name, (size, mtime, ctime, inode) in zip(names, rows.tolist(), strict=True)
         }
-        return found | self.newer
+        return stamps | self.newer
 
-    def keep(self, stamps: dict[str, Stamp]) -> None:
-        """Has the directory hold these bags."""
+    def set_bags(self, stamps: dict[str, Stamp]) -> None:
+        """Sets the bags that the directory has."""
         self.names = "/".join([path.rpartition("/")[2] for path in stamps])
         self.rows = np.array([stamp[:-1] for stamp in stamps.values()], _ROW)
 
-    def find_sidecar(self) -> None:
+    def read_sidecar(self) -> None:
         """Looks up the `handover.json` in the directory."""
         try:
             status = os.lstat(f"{self.path}/{HANDOVER_FILE}")
@@ -180,17 +191,17 @@ class _Folder:
             return
         self.sidecar_ns = sidecar_ns_of(status)
 
-    def enter(
+    def add_entry(
         self, entry: os.DirEntry[str], stamps: dict[str, Stamp], before: Mapping[str, Stamp]
     ) -> None:
-        """Adds what the directory has under a name: of a bag, its stamp to `stamps`.
+        """Adds an entry of the directory; the stamp of a bag goes into `stamps`.
 
-        Of one that cannot be looked at that is the one from `before`.
+        A bag that cannot be looked up keeps its stamp from `before`.
         """
         kind = bag_kind(entry.name)
         # Nearly all entries are bags: they are checked first.
         if kind and entry.is_file(follow_symlinks=False):
-            self._enter_bag(entry, stamps, before)
+            self._add_bag(entry, stamps, before)
         elif entry.is_symlink():
             if not entry.name.startswith("."):
                 self.links.append(Path(entry.path))
@@ -202,7 +213,7 @@ class _Folder:
         elif kind:
             self.odd.append(SetAside(Path(entry.path), "not a regular file"))
 
-    def _enter_bag(
+    def _add_bag(
         self, entry: os.DirEntry[str], stamps: dict[str, Stamp], before: Mapping[str, Stamp]
     ) -> None:
         try:
@@ -212,7 +223,7 @@ class _Folder:
         except OSError as error:
             reason = f"cannot be read: {error.strerror or error}"
             self.odd.append(SetAside(Path(entry.path), reason))
-            # A known file is not gone because of that.
+            # A known file is not gone because it cannot be looked up.
             self.trusted = False
             stamps[entry.path] = before.get(entry.path, _UNSEEN)
         else:
@@ -222,20 +233,19 @@ class _Folder:
 
 
 class Tree:
-    """The directories under one root, as the last scan saw them. Not for several threads at once.
+    """The directories under one root, as the last scan saw them. Not thread-safe.
 
     The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
-    with a dot are left out, and so is `lost+found`. Of the hard links of one file one is found:
-    that nearest to the root, one in a saved moment only where there is no other.
+    with a dot are left out, and so is `lost+found`. A file with several hard links is found once:
+    at the path nearest to the root, and in a saved moment only if it has no other path.
 
     Args:
         root: the directory.
-        only: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
-            and its like): nothing else is found then. Of several, what all of them name.
-        setting: the one that names the root, for sentences.
+        only: paths below it; see `paths_named`. Files that one of them does not match are left out.
+        setting: the setting that names the root, for error messages.
 
     Attributes:
-        saved: all files in saved moments, also those that are found elsewhere.
+        saved: by path, all files in saved moments, including second links.
     """
 
     def __init__(
@@ -244,8 +254,8 @@ class Tree:
         self._root = str(root)
         self._setting = setting
         self._only = only
-        paths = (f"{self._root.rstrip('/')}/{name.strip('/')}" for name in only)
-        self._named = [(path, paths_named(path).fullmatch) for path in paths]
+        paths = [f"{self._root.rstrip('/')}/{name.strip('/')}" for name in only]
+        self._only_paths = [(path, paths_named(path)) for path in paths]
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
         self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}/"
@@ -257,24 +267,17 @@ class Tree:
     def scan(self, now: Ns, watched: Iterable[str], *, patrolling: bool = False) -> ScanResult:
         """Returns what is new, changed or gone since the last scan, and the `watched` files.
 
-        `now` decides which mtimes are too young to be trusted; `patrolling` also looks at some
-        files of directories that did not change. Raises nothing: a directory that cannot be listed
-        is part of the result, and its known files count as being there.
+        `now` decides which mtimes are too young to be trusted. `patrolling` also looks up some
+        files of unchanged directories. Raises nothing: a directory that cannot be listed is part of
+        the result, and its known files count as being there.
         """
         before, self._folders = self._folders, {}
         result = ScanResult()
-        fault = self._descend(before, now, result)
+        fault = self._visit_all(before, now, result)
         if fault is not None and not _is_gone(fault) and before:
             self._folders = before
-            return ScanResult(problem=self._problem(fault))
-        problem = self._unmounted() if fault is None else self._problem(fault)
-        folders = self._folders.values()
-        if (
-            problem is None
-            and self._only
-            and not any(folder.names or folder.odd for folder in folders)
-        ):
-            problem = f"no bag is named {self._only[-1]} (data.recording)"
+            return ScanResult(problem=self._describe_fault(fault))
+        problem = self._find_problem() if fault is None else self._describe_fault(fault)
         if problem is not None:
             self._folders = {}
             result = ScanResult(problem=problem)
@@ -290,15 +293,14 @@ class Tree:
             self._look_up(self._next_patrol(), result, settled_at=now)
         for file in result.gone & self.saved.keys():
             del self.saved[file]
-        moments = self._moments
-        self.saved.update(
-            (file, stamp) for file, stamp in result.stamps.items() if file.startswith(moments)
-        )
+        for file, stamp in result.stamps.items():
+            if file.startswith(self._moments):
+                self.saved[file] = stamp
         self._leave_out_second_links(before, result)
         return result
 
     def _leave_out_second_links(self, before: dict[str, _Folder], result: ScanResult) -> None:
-        """Keeps one hard link of each file: the others are gone, until the first one is."""
+        """Reports second links of files as gone, and a link as new once it is the first one."""
         is_same = len(before) == len(self._folders) and all(
             self._folders.get(path) is folder for path, folder in before.items()
         )
@@ -311,7 +313,7 @@ class Tree:
 
     def _find_second_links(self) -> set[str]:
         """Returns all but the first link of each file that has several."""
-        # A folder that was listed before a file got its second link does not show that.
+        # A file may have got its second link after its own folder was listed.
         linked = {inode for folder in self._folders.values() for inode in folder.linked}
         links: dict[tuple[int, int], list[str]] = {}
         for folder in self._folders.values() if linked else ():
@@ -340,14 +342,14 @@ class Tree:
         return _UNSEEN if folder is None else folder.stamps_of([path]).get(path, _UNSEEN)
 
     def lose(self, path: str) -> None:
-        """Has the next scan return a file if it is there, whatever the mtime of its folder."""
+        """Makes the next scan report a file as new if it is there."""
         folder = self._folders.get(_folder_of(path))
         if folder is not None:
             folder.newer[path] = _UNSEEN
             folder.trusted = False
 
     def _next_patrol(self) -> list[str]:
-        """Returns the next known files, in turn."""
+        """Returns the next files to check, in turn."""
         if not self._patrol:
             self._unpatrolled = self._unpatrolled or [*self._folders]
             while self._unpatrolled and len(self._patrol) < PATROL:
@@ -357,28 +359,30 @@ class Tree:
         del self._patrol[-PATROL:]
         return following
 
-    def _unmounted(self) -> str | None:
-        """Returns what is wrong where the root is on another disk than bags were, and has none.
-
-        A mount point looks like this when its disk has been unmounted.
-        """
+    def _find_problem(self) -> str | None:
+        """Returns what is wrong if no bag was found: the disk was unmounted, or `only` is wrong."""
         device = self._folders[self._root].device
-        if any(folder.names for folder in self._folders.values()):
+        folders = self._folders.values()
+        if any(folder.names for folder in folders):
             self._device = device
-        return None if self._device in {None, device} else _OTHER_DISK
+        elif self._device not in {None, device}:
+            return _OTHER_DISK
+        elif self._only and not any(folder.odd for folder in folders):
+            return f"no bag is named {self._only[-1]} (data.recording)"
+        return None
 
-    def _problem(self, error: OSError) -> str:
-        """Returns a sentence on a bag directory that cannot be listed; an absolute path is cut."""
+    def _describe_fault(self, error: OSError) -> str:
+        """Returns a sentence on a bag directory that cannot be listed, without absolute paths."""
         root = Path(self._root)
-        named = f".../{root.name}" if root.is_absolute() else self._root
+        name = f".../{root.name}" if root.is_absolute() else self._root
         if isinstance(error, FileNotFoundError):
-            return f"the bag directory does not exist (yet): check {named}, from {self._setting}"
+            return f"the bag directory does not exist (yet): check {name}, from {self._setting}"
         if isinstance(error, NotADirectoryError):
             return f"the bag directory is a file, not a directory: correct {self._setting}"
         return f"the bag directory cannot be read: {error.strerror or error}"
 
-    def _descend(self, before: dict[str, _Folder], now: Ns, result: ScanResult) -> OSError | None:
-        """Visits every folder; returns the error where the root cannot be listed."""
+    def _visit_all(self, before: dict[str, _Folder], now: Ns, result: ScanResult) -> OSError | None:
+        """Visits every folder; returns the error if the root cannot be listed."""
         waiting = [self._root]
         while waiting:
             path = waiting.pop()
@@ -387,14 +391,14 @@ class Tree:
             except OSError as error:
                 if path == self._root:
                     return error
-                # A folder that went since its parent was listed changes that parent's mtime.
+                # Its parent has a new mtime then, and is listed by the next scan.
                 if _is_gone(error):
                     continue
                 reason = f"the directory cannot be listed: {error.strerror or error}"
                 result.damaged.append(SetAside(Path(path), reason))
                 if path not in before:
                     continue
-                # A disk that fails hides its files; it has not lost them.
+                # A failing disk hides its files: they are not gone.
                 folder = replace(before[path], trusted=False)
             self._folders[path] = folder
             waiting.extend(folder.folders)
@@ -409,10 +413,10 @@ class Tree:
         return None
 
     def _visit(self, path: str, known: _Folder | None, now: Ns, result: ScanResult) -> _Folder:
-        """Returns the folder as it is known if nothing came or went, else as it is listed now.
+        """Returns the known folder if nothing came or went, else lists it anew.
 
-        Its mtime is read first: what changes during the listing is then found by the next scan.
-        Only the root may be a link: anything else that is one has just replaced a folder.
+        The mtime is read first: so the next scan finds what changes during the listing. Only the
+        root may be a link: any other has just replaced a folder.
         """
         status = os.stat(path, follow_symlinks=path == self._root)  # noqa: PTH116 - a Path costs more
         if not stat.S_ISDIR(status.st_mode):
@@ -421,36 +425,40 @@ class Tree:
         if known and known.trusted and (known.mtime_ns, known.device) == (mtime_ns, device):
             return known
         folder = _Folder(path, mtime_ns, trusted=settled(mtime_ns, now), device=device)
-        folder.find_sidecar()
+        folder.read_sidecar()
         before, stamps = {} if known is None else known.stamps, dict[str, Stamp]()
         with os.scandir(path) as entries:
             for entry in entries:
-                if not self._named or all(
-                    is_inside(entry.path) or path.startswith(f"{entry.path}/")
-                    for path, is_inside in self._named
-                ):
-                    folder.enter(entry, stamps, before)
-        folder.keep(stamps)
+                if self._may_lead_to_bags(entry.path):
+                    folder.add_entry(entry, stamps, before)
+        folder.set_bags(stamps)
         for file, stamp in stamps.items():
             known_stamp = before.get(file, _UNSEEN)
-            is_looked_at = stamp is not known_stamp
-            if is_looked_at and (stamp != known_stamp or not settled(stamp.mtime_ns, now)):
+            is_looked_up = stamp is not known_stamp
+            if is_looked_up and (stamp != known_stamp or not settled(stamp.mtime_ns, now)):
                 result.stamps[file], result.before[file] = stamp, known_stamp
         return folder
+
+    def _may_lead_to_bags(self, path: str) -> bool:
+        """Returns whether each path of `only` matches a path, or lies below it."""
+        return all(
+            pattern.fullmatch(path) or only.startswith(f"{path}/")
+            for only, pattern in self._only_paths
+        )
 
     def _look_up(
         self, paths: Iterable[str], result: ScanResult, settled_at: Ns | None = None
     ) -> None:
-        """Adds files as they are now; with `settled_at` those alone that may have changed."""
+        """Adds the current stamps of files; with `settled_at`, only if they may have changed."""
         for folder_path, files in groupby(sorted(paths, key=_folder_of), _folder_of):
             folder, in_folder = self._folders.get(folder_path), [*files]
             stamps = {} if folder is None else folder.stamps_of(in_folder)
             for path in in_folder:
                 if path not in result.stamps and path not in result.gone:
                     before = stamps.get(path, _UNSEEN)
-                    self._look_at(path, folder, before, result, settled_at)
+                    self._look_up_file(path, folder, before, result, settled_at)
 
-    def _look_at(
+    def _look_up_file(
         self,
         path: str,
         folder: _Folder | None,
@@ -461,10 +469,10 @@ class Tree:
         try:
             stamp = Stamp.of(os.lstat(path), folder.sidecar_ns if folder else 0)
         except OSError as error:
-            # Its folder looks unchanged, and may soon look the same with the file back in it.
             if _is_gone(error):
                 result.gone.add(path)
                 result.before[path] = before
+                # The mtime of its folder may be the same, and the file may soon be back.
                 self.lose(path)
             elif folder is not None:
                 folder.trusted = False
@@ -476,7 +484,7 @@ class Tree:
 
 
 def _is_gone(error: OSError) -> bool:
-    """Returns whether a path does not exist; after other errors it may."""
+    """Returns whether an error proves that a path does not exist."""
     return error.errno in {errno.ENOENT, errno.ENOTDIR}
 
 
@@ -485,7 +493,7 @@ def _folder_of(path: str) -> str:
 
 
 def _is_folder(link: Path) -> bool:
-    """Returns whether a link leads to a directory; also where that is unknown."""
+    """Returns whether a link leads to a directory; True if that cannot be looked up."""
     try:
         return link.is_dir()
     except OSError:

@@ -1,12 +1,12 @@
-"""Some consecutive bags of a timeline, and what follows from their summaries.
+"""A segment: consecutive bags of a timeline, and what follows from their summaries.
 
-Everything is computed when it is first asked for, and serves for as long as the bags stay together.
-A query looks at few topics of many bags, so the numbers of their summaries are joined.
+Everything is computed on first use, and kept as long as the segment. A query looks at few topics of
+many bags, so the numbers of all summaries are read as arrays.
 """
 
 from __future__ import annotations
 
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
@@ -18,6 +18,7 @@ from ros2_memory.analysis.silences import SHORTEST_NS, Pacing, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import enclosing
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.holes import Pause, pauses_between
@@ -33,11 +34,11 @@ if TYPE_CHECKING:
 
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
-"""A topic with a message this often, or less often, is rare."""
+"""A topic is rare if its mean spacing is at least this."""
 _JITTER_NS: Final[Ns] = 50 * NS_PER_MS
 """The mean spacing may be shorter by this: publishers and transports are not exact."""
 _FEW_MESSAGES: Final = 5
-"""Fewer have no usual spacing: a map may be published twice when its node starts."""
+"""Fewer messages have no usual spacing: a map may be published twice when its node starts."""
 
 
 _LOGS: Final = FOXGLOVE_LOGS | {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
@@ -45,15 +46,15 @@ _FEWEST: Final = 3
 """A bag with fewer messages of a topic shows no period."""
 _PER_OCTAVE: Final = 2
 _OCTAVES: Final = 64 * _PER_OCTAVE
-"""A period of 64 bits is in one of so many parts of octaves."""
-_NONE: Final = (0, MAX_NS, MIN_NS)
-"""Count, first and last log time of a topic of which a bag has no message."""
+"""Periods (64 bits) are sorted into this many bins, two for each octave."""
+_NO_MESSAGES: Final = (0, MAX_NS, MIN_NS)
+"""Count, first and last log time of a topic in a bag without a message of it."""
 
 
 class TopicExtent(NamedTuple):
     """A bag, and the log times (inclusive) of the first and last message of a topic in it.
 
-    A bag in which the topic has two types has two extents.
+    If the topic has two types in a bag, the bag has two extents.
     """
 
     bag: BagFile
@@ -62,7 +63,7 @@ class TopicExtent(NamedTuple):
 
 
 class TopicColumn(NamedTuple):
-    """What the bags of a segment hold of one topic, in bag order, a row for each of its types.
+    """What the bags of a segment hold of one topic: a row for each bag and type, in bag order.
 
     `bags` are positions in the segment; times are inclusive.
     """
@@ -74,7 +75,7 @@ class TopicColumn(NamedTuple):
 
 
 class TopicTotals(NamedTuple):
-    """What summaries add up to for one topic under one type; times are inclusive."""
+    """First and last log time (inclusive) of a topic's messages, and their number."""
 
     first: Ns
     last: Ns
@@ -87,8 +88,18 @@ class TopicTotals(NamedTuple):
         )
 
 
+NO_TOTALS: Final = TopicTotals(MAX_NS, MIN_NS, 0)
+"""The totals of no message."""
+
+
 class Pace(NamedTuple):
-    """What a recording holds of a topic, and the times (inclusive) between which it has bags."""
+    """What a recording holds of a topic.
+
+    Attributes:
+        topic: the totals of the topic.
+        begin: log time of the first message in the recording.
+        end: log time of the last one (inclusive).
+    """
 
     topic: TopicTotals
     begin: Ns
@@ -98,8 +109,8 @@ class Pace(NamedTuple):
     def is_rare(self) -> bool:
         """Whether the topic has a message every `RARE_NS` or less often, as a map has.
 
-        That is the spacing between its first and last message, so that telemetry which fell silent
-        stays frequent. Few messages are rare if the recording went on for long enough.
+        Measured between the first and the last message, so that telemetry which fell silent stays
+        frequent. A few messages are also rare if the recording went on for long enough.
         """
         messages, span = self.topic.messages, self.topic.last - self.topic.first
         if span >= (messages - 1) * (RARE_NS - _JITTER_NS):
@@ -113,19 +124,19 @@ class Pace(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """How many bags, and how many messages they hold."""
+    """A number of bags, and the number of their messages."""
 
     bags: int = 0
     messages: int = 0
 
 
 def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
-    """Returns the sort key of bags: the times inside them; the path only breaks ties."""
+    """Returns the sort key of bags: first and last log time; the path breaks ties."""
     return bag.start, bag.end, bag.file
 
 
 class Segment:
-    """Some consecutive bags of a timeline; never without any."""
+    """Consecutive bags of a timeline, at least one."""
 
     def __init__(self, bags: Iterable[BagFile] | BagRows) -> None:
         self.bags = bags if isinstance(bags, BagRows) else BagRows(bags)
@@ -147,42 +158,43 @@ class Segment:
 
     @cached_property
     def recorded(self) -> Segment | None:
-        """The bags without that of carried messages: mostly itself; None where no other is left."""
-        return self._without(is_carried, CARRY_FOLDER)
+        """The segment without the bag of carried messages; None if no other bag is left."""
+        return self._without_folder(CARRY_FOLDER, is_carried)
 
     @cached_property
     def unthinned(self) -> Segment | None:
-        """The bags that have every message that was recorded; itself where all do."""
-        return self._without(is_thinned, MEMORY_FOLDER)
+        """The segment without thinned days; None if no other bag is left."""
+        return self._without_folder(MEMORY_FOLDER, is_thinned)
 
-    def _without(self, is_left_out: Callable[[str], bool], name: str) -> Segment | None:
-        """Returns the bags but for some that lie in a folder of a name, if they are there."""
+    def _without_folder(self, name: str, is_inside: Callable[[str], bool]) -> Segment | None:
+        """Returns the segment without the bags inside a folder."""
+        # Few segments have such a folder: most need not look at the path of each bag.
         if not any(f"/{folder}".endswith(f"/{name}") for folder in self.bags.folders):
             return self
-        return self.without(map(is_left_out, self.bags.files()))
+        return self.without(map(is_inside, self.bags.files()))
 
     def without(self, are_left_out: Iterable[bool]) -> Segment | None:
-        """Returns the bags but for some: itself where that are all; None where none is left."""
-        rest = self.bags.some(~np.fromiter(are_left_out, np.bool_, len(self.bags)))
+        """Returns the segment without some bags; None if no bag is left."""
+        rest = self.bags.select(~np.fromiter(are_left_out, np.bool_, len(self.bags)))
         if rest is self.bags:
-            return self  # what it remembers serves the next timeline
+            return self  # with all that it has computed
         return None if rest is None else Segment(rest)
 
     @cached_property
     def disk_use(self) -> tuple[int, int]:
-        """The bytes of the bags, and how many of them a crash left open."""
-        left_open = self.bags.are(BagState.INCOMPLETE)
+        """The size of the bags in bytes, and how many of them a crash left open."""
+        left_open = self.bags.in_state(BagState.INCOMPLETE)
         return int(self.bags.sizes.sum()), int(left_open.sum())
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
-        """By folder, the log times of the first and last message (inclusive) of its bags."""
-        _, firsts, lasts = _added(self._by_folder, [0], axis=0)[0].T.tolist()
+        """By folder, the log times of the first and last message (inclusive) in its bags."""
+        _, firsts, lasts = _sum_groups(self._by_folder, [0], axis=0)[0].T.tolist()
         return dict(zip(self.bags.folders, zip(firsts, lasts, strict=True), strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
-        """By folder, the tally of the bags in it."""
+        """By folder, the number of its bags and of their messages."""
         messages = self._by_folder[:, :, 0].sum(axis=0)
         rows = zip(np.bincount(self.bags.folder_of).tolist(), messages.tolist(), strict=True)
         return {folder: Tally(*row) for folder, row in zip(self.bags.folders, rows, strict=True)}
@@ -196,19 +208,21 @@ class Segment:
 
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:
-        """The bags that are not readable as a whole, or that contradict themselves."""
+        """The bags that cannot be read whole, or that contradict themselves."""
         bags = self.bags
         has_remarks = bags.with_schema(attrgetter("remarks"))
-        return tuple(bags.at(has_remarks | bags.are(BagState.INCOMPLETE)))
+        return tuple(bags.at(has_remarks | bags.in_state(BagState.INCOMPLETE)))
 
     @cached_property
     def set_back(self) -> tuple[StepBack, ...]:
         """Where the clock was set back within a bag."""
-        return tuple(
-            StepBack(bag, bag, back[0])
-            for bag in self._bags_with("clock_set_back")
-            if (back := bag.summary.schema.clock_set_back) is not None
-        )
+        steps: list[StepBack] = []
+        for bag in self._bags_with("clock_set_back"):
+            set_back = bag.summary.schema.clock_set_back
+            if set_back is not None:
+                by, _ = set_back
+                steps.append(StepBack(bag, bag, by))
+        return tuple(steps)
 
     @cached_property
     def schemas(self) -> tuple[SummarySchema, ...]:
@@ -217,56 +231,56 @@ class Segment:
 
     @cached_property
     def _headers(self) -> tuple[TopicHeader, ...]:
-        """All topics, each type of one by itself."""
+        """All topics; a topic with two types appears twice."""
         return tuple(dict.fromkeys(chain.from_iterable(schema.topics for schema in self.schemas)))
 
-    def _bags_with(self, name: str) -> Iterator[BagFile]:
-        """Yields the bags of whose schemas an attribute is not empty: mostly none."""
-        return self.bags.at(self.bags.with_schema(attrgetter(name)))
+    def _bags_with(self, attribute: str) -> Iterator[BagFile]:
+        """Yields the bags whose schema has a non-empty attribute: mostly none."""
+        return self.bags.at(self.bags.with_schema(attrgetter(attribute)))
 
     @cached_property
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
-        """By topic and type, the totals of the bags."""
+        """By topic and type, the totals of all bags."""
         totals: dict[str, dict[str, TopicTotals]] = {}
-        of_headers = _added(self._by_folder, [0], axis=1)[:, 0].tolist()
-        for (topic, type_name, *_), (messages, first, last) in zip(
-            self._headers, of_headers, strict=True
-        ):
-            add_totals(totals.setdefault(topic, {}), type_name, (first, last, messages))
+        numbers = _sum_groups(self._by_folder, [0], axis=1)[:, 0].tolist()
+        for header, (messages, first, last) in zip(self._headers, numbers, strict=True):
+            by_type = totals.setdefault(header.topic, {})
+            known = by_type.get(header.type, NO_TOTALS)
+            by_type[header.type] = known | TopicTotals(first, last, messages)
         return totals
 
     @cached_property
     def spans(self) -> dict[str, Span]:
         """By topic, the log times of its first and last message (inclusive)."""
         return {
-            topic: reduce(TopicTotals.__or__, by_type.values())[:2]
+            topic: enclosing((totals.first, totals.last) for totals in by_type.values())
             for topic, by_type in self.totals.items()
         }
 
     def recordings(self, topic: str) -> dict[Path, TopicTotals]:
-        """Returns what the bags of each recording that holds the topic have of it, of any type."""
+        """Returns the totals of a topic for each recording that holds it, over all types."""
         headers = [nth for nth, header in enumerate(self._headers) if header.topic == topic]
         if not headers:
             return {}
-        [of_topic] = _added(self._by_folder[headers], [0], axis=0).tolist()
+        [by_folder] = _sum_groups(self._by_folder[headers], [0], axis=0).tolist()
         return {
             path: TopicTotals(first, last, messages)
-            for path, (messages, first, last) in zip(self._recording_paths, of_topic, strict=True)
+            for path, (messages, first, last) in zip(self._recording_paths, by_folder, strict=True)
             if messages
         }
 
     @cached_property
     def _by_folder(self) -> Ints:
-        """Count, first and last by topic of one type, and folder."""
-        numbers = self.bags.folder_of[self._order]
-        order = np.argsort(numbers, kind="stable")
-        begins = np.searchsorted(numbers[order], np.arange(len(self.bags.folders)))
-        return _added(self._numbers(self._headers)[:, order], begins, axis=1)
+        """Count, first and last log time of each header in each folder."""
+        folders = self.bags.folder_of[self._order]
+        order = np.argsort(folders, kind="stable")
+        begins = np.searchsorted(folders[order], np.arange(len(self.bags.folders)))
+        return _sum_groups(self._numbers(self._headers)[:, order], begins, axis=1)
 
     @cached_property
     def _recording_paths(self) -> list[Path]:
-        """The recordings of the bags, in the order of their folders."""
-        # A path for each bag of a week would take longer than all else.
+        """The recordings, in the order of their folders."""
+        # Made once: paths for all bags of a week would take longer than all else.
         return [Path(folder or "/") for folder in self.bags.folders]
 
     def extents(
@@ -274,7 +288,7 @@ class Segment:
     ) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic in a window, in order, once for each type.
 
-        Of all bags, or `among` some of them.
+        Only bags marked in `among` count, if that is given.
         """
         column = self.column(topic)
         if column is None:
@@ -286,7 +300,7 @@ class Segment:
         yield from map(TopicExtent, self.bags.at(rows), firsts.tolist(), lasts.tolist())
 
     def column(self, topic: str) -> TopicColumn | None:
-        """Returns what the bags hold of a topic; None where nothing."""
+        """Returns what the bags hold of a topic; None if they do not have it."""
         headers = [header for header in self._headers if header.topic == topic]
         if not headers:
             return None
@@ -296,26 +310,26 @@ class Segment:
         return TopicColumn(bags, firsts, lasts, counts)
 
     def _numbers(self, headers: Sequence[TopicHeader]) -> Ints:
-        """Returns count, first and last by topic of one type, and bag; `_NONE` without messages.
+        """Returns count, first and last log time of each header in each bag.
 
-        The bags are in the order of `_order`.
+        The bags are in the order of `_order`. A bag without the topic has `_NO_MESSAGES`.
         """
-        # Counts beside counts, and times beside times: so they are added up at once.
+        # In memory all counts lie together, and all times: so they are added up quickly.
         numbers = np.empty((3, len(headers), len(self.bags)), np.int64).transpose(1, 2, 0)
         end = 0
         for schema, bags, joined in self.bags.summaries:
             begin, end = end, end + bags.size
-            at = {header: position for position, header in enumerate(schema.topics)}
-            rows = [row for row, header in enumerate(headers) if header in at]
+            position_of = {header: position for position, header in enumerate(schema.topics)}
+            rows = [row for row, header in enumerate(headers) if header in position_of]
             if len(rows) < len(headers):
-                numbers[:, begin:end] = _NONE
-            positions = [at[headers[row]] for row in rows]
+                numbers[:, begin:end] = _NO_MESSAGES
+            positions = [position_of[headers[row]] for row in rows]
             numbers[rows, begin:end] = numbers_of(schema, joined, bags.size, positions)
         return numbers
 
     @cached_property
     def _order(self) -> NDArray[np.uint16]:
-        """The positions of the bags as `_numbers` has them."""
+        """The positions of the bags in the order of `_numbers`."""
         return np.concatenate([alike.rows for alike in self.bags.summaries])
 
     @cached_property
@@ -337,7 +351,7 @@ class Segment:
     @cached_property
     def pacings(self) -> dict[str, Pacing]:
         """By topic, how often the bags hold it."""
-        numbers, lengths = self._between_absences()
+        numbers, lengths = self._parts_between_absences()
         counts = numbers[:, :, 0]
         spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
         rows = zip(spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
@@ -346,43 +360,44 @@ class Segment:
     @cached_property
     def runs(self) -> dict[str, tuple[Span, ...]]:
         """By topic, when the bags hold it; see `analysis.silences`."""
-        numbers, _ = self._between_absences()
+        numbers, _ = self._parts_between_absences()
         return dict(zip(sorted(self.types), _runs(numbers), strict=True))
 
-    def _between_absences(self) -> tuple[Ints, Ints]:
-        """Returns count, first and last by topic (sorted) and bag, and the length of the bags.
+    def _parts_between_absences(self) -> tuple[Ints, Ints]:
+        """Cuts bags at the absences that their summaries state.
 
-        In all (ns), of the bags that hold each topic. Between absences a bag is as many: what
-        follows each comes behind all bags. A count is 0 where a bag holds none.
+        Returns count, first and last log time of each topic (sorted) in each part of a bag: the
+        first part of every bag, then all later parts. And for each topic the length (ns) of the
+        bags that hold it, without its absences.
         """
         headers, topics = sorted(self._headers, key=attrgetter("topic")), sorted(self.types)
         numbers = self._numbers(headers)
         if len(headers) > len(topics):
             names = [header.topic for header in headers]
-            numbers = _added(numbers, [*map(names.index, topics)], axis=0)
+            numbers = _sum_groups(numbers, [*map(names.index, topics)], axis=0)
         lengths = (numbers[:, :, 0] > 0) @ (self.bags.ends - self.bags.starts)[self._order]
-        parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
+        later_parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
         has_absences = self.bags.with_schema(attrgetter("absences"))[self._order]
         for row in np.flatnonzero(has_absences).tolist():
-            for topic, pauses in self.bags[int(self._order[row])].summary.schema.absences:
-                nth = topics.index(topic)
-                count, _, last = numbers[nth, row].tolist()
-                for start, end, sent in reversed(pauses):
-                    parts.append((nth, (count - sent, end, last)))
-                    count, last = sent, start
-                    lengths[nth] -= end - start
-                numbers[nth, row, [0, 2]] = count, last
-        if parts:
-            more = np.empty((len(topics), len(parts), 3), np.int64)
-            more[:] = _NONE
-            for at, (nth, part) in enumerate(parts):
-                more[nth, at] = part
+            for topic, absences in self.bags[int(self._order[row])].summary.schema.absences:
+                topic_row = topics.index(topic)
+                count, _, last = numbers[topic_row, row].tolist()
+                for start, end, count_before in reversed(absences):
+                    later_parts.append((topic_row, (count - count_before, end, last)))
+                    count, last = count_before, start
+                    lengths[topic_row] -= end - start
+                numbers[topic_row, row, [0, 2]] = count, last
+        if later_parts:
+            more = np.empty((len(topics), len(later_parts), 3), np.int64)
+            more[:] = _NO_MESSAGES
+            for column, (topic_row, part) in enumerate(later_parts):
+                more[topic_row, column] = part
             numbers = np.concatenate((numbers, more), axis=1)
         return numbers, lengths
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
-        """Which topics the bags hold together, each combination once."""
+        """The sets of topics that some bag holds together."""
         return frozenset(frozenset(schema.positions) for schema in self.schemas)
 
     @cached_property
@@ -392,7 +407,7 @@ class Segment:
 
     @cached_property
     def pauses_within(self) -> tuple[Pause, ...]:
-        """The pauses of each bag; other bags may have messages in them."""
+        """The pauses within each bag. Other bags may have messages meanwhile."""
         return tuple(
             Pause(start, end, (bag,), ran_on=not is_thinned(bag.file))
             for bag in self._bags_with("pauses")
@@ -411,29 +426,31 @@ def is_log(type_name: str) -> bool:
 
 
 def wider(span: Span | None, other: Span) -> Span:
-    """Returns the span that holds both; the other where there is only that."""
+    """Returns the span from the earlier start to the later end; `other` if the first is None."""
     if span is None:
         return other
     (first, last), (other_first, other_last) = span, other
     return min(first, other_first), max(last, other_last)
 
 
-def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, Ns, int]) -> None:
-    """Adds first and last log time and count of a type to its totals."""
-    before, added = totals.get(type_name), TopicTotals(*more)
-    totals[type_name] = added if before is None else before | added
-
-
-def _added(numbers: Ints, begins: Sequence[int] | NDArray[np.intp], axis: int) -> Ints:
-    """Returns count, first and last of some rows together, each from one of `begins` on."""
-    added = (np.add, np.minimum, np.maximum)
+def _sum_groups(numbers: Ints, begins: Sequence[int] | NDArray[np.intp], axis: int) -> Ints:
+    """Adds up counts, first and last log times along an axis, in groups that begin at `begins`."""
+    counts, firsts, lasts = numbers.transpose(2, 0, 1)
     return np.stack(
-        [add.reduceat(numbers[:, :, nth], begins, axis) for nth, add in enumerate(added)], axis=2
+        [
+            np.add.reduceat(counts, begins, axis),
+            np.minimum.reduceat(firsts, begins, axis),
+            np.maximum.reduceat(lasts, begins, axis),
+        ],
+        axis=2,
     )
 
 
 def _runs(numbers: Ints) -> Iterator[tuple[Span, ...]]:
-    """Yields the runs of each topic, by count, first and last; see `analysis.silences`."""
+    """Yields for each topic the spans in which it has messages; see `analysis.silences`.
+
+    `numbers` has count, first and last log time by topic and part of a bag.
+    """
     _, firsts, lasts = numbers.transpose(2, 0, 1)
     order = np.argsort(firsts, axis=1, kind="stable")
     begins = np.take_along_axis(firsts, order, axis=1)
@@ -446,19 +463,22 @@ def _runs(numbers: Ints) -> Iterator[tuple[Span, ...]]:
 
 
 def _spacings(counts: Ints, spans: Ints) -> list[dict[int, Spacing]]:
-    """Returns the spacings of each topic, by the part of an octave of the period."""
-    topics, bags = np.nonzero((counts >= _FEWEST) & (spans > 0))
-    spans, intervals = spans[topics, bags], counts[topics, bags] - 1
+    """Returns for each topic its spacings, by the bin of the period (half an octave).
+
+    `counts` and `spans` (ns) are by topic and part of a bag.
+    """
+    topics, parts = np.nonzero((counts >= _FEWEST) & (spans > 0))
+    spans, intervals = spans[topics, parts], counts[topics, parts] - 1
     octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
     keys = topics * _OCTAVES + octaves
     sums = np.zeros((3, len(counts) * _OCTAVES), np.int64)
-    # Mostly the next bag has the same key.
+    # Mostly the next part has the same key: adding runs first is quicker.
     begins = np.flatnonzero(np.diff(keys, prepend=-1))
-    for added, values in zip(sums, (np.ones_like(spans), spans, intervals), strict=True):
-        np.add.at(added, keys[begins], np.add.reduceat(values, begins))
+    for total, values in zip(sums, (np.ones_like(spans), spans, intervals), strict=True):
+        np.add.at(total, keys[begins], np.add.reduceat(values, begins))
     spacings: list[dict[int, Spacing]] = [{} for _ in counts]
-    there = np.flatnonzero(sums[0])
-    for key, spacing in zip(there.tolist(), sums[:, there].T.tolist(), strict=True):
+    used = np.flatnonzero(sums[0])
+    for key, spacing in zip(used.tolist(), sums[:, used].T.tolist(), strict=True):
         topic, octave = divmod(key, _OCTAVES)
         spacings[topic][octave] = Spacing(*spacing)
     return spacings

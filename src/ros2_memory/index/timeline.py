@@ -1,14 +1,13 @@
 """Bags in time order, and what follows from their summaries.
 
-A week is 60,000 bags, and another one closes every ten seconds. So the bags are kept in segments:
-what is computed for a segment serves every later timeline that still has it, and only the segment
-that changes is computed again.
+A week is 60,000 bags, and another one closes every ten seconds. So the bags are kept in segments: a
+new timeline shares the unchanged segments, with all that was computed for them.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 
@@ -18,15 +17,22 @@ from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
 from ros2_memory.core.arrays import Ints, joined_codes, run_starts
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
+from ros2_memory.core.spans import (
+    COPY_HORIZON_NS,
+    Spans,
+    enclosing,
+    overlap_spans,
+    united,
+    without,
+)
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.bag_rows import Bags
 from ros2_memory.index.segment import (
+    NO_TOTALS,
     Pace,
     Segment,
     TopicExtent,
     TopicTotals,
-    add_totals,
     in_time,
     is_log,
     wider,
@@ -38,16 +44,17 @@ if TYPE_CHECKING:
 
 
 MAX_FILE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
-"""The longest span that a file is taken to hold when one end of it is known."""
+"""The longest time that a file is taken to hold if only one end of it is known."""
 SEGMENT_BAGS: Final = 1024
-"""The most bags in a segment: few enough to compute in some milliseconds; a week has 60."""
+"""The most bags in a segment: it is computed in some milliseconds, and a week has 60 segments."""
 
 
 class Timeline:
     """Bags sorted by (start, end, path). Immutable; `changed` returns the next one.
 
     Attributes:
-        memo: what was derived from these bags; a new bag makes a new timeline.
+        segments: the bags.
+        memo: what was derived from these bags. A new bag makes a new timeline.
     """
 
     def __init__(self, segments: Sequence[Segment] = ()) -> None:
@@ -61,7 +68,7 @@ class Timeline:
         return cls(_segments_of(bags))
 
     def changed(self, removed: Iterable[BagFile], added: Iterable[BagFile]) -> Timeline:
-        """Returns a timeline without some bags and with others; itself if there are none.
+        """Returns the timeline without some bags and with others.
 
         Raises:
             ValueError: a removed bag is not in it.
@@ -73,19 +80,19 @@ class Timeline:
             return Timeline.of(added)
         touched: dict[int, list[BagFile]] = {}
 
-        def bags_around(bag: BagFile) -> list[BagFile]:
-            at = self._position(bag)
-            if at not in touched:
-                touched[at] = [*self.segments[at].bags]
-            return touched[at]
+        def bags_beside(bag: BagFile) -> list[BagFile]:
+            position = max(bisect_right(self._firsts, in_time(bag)) - 1, 0)
+            if position not in touched:
+                touched[position] = [*self.segments[position].bags]
+            return touched[position]
 
         for bag in removed:
-            bags_around(bag).remove(bag)
+            bags_beside(bag).remove(bag)
         for bag in added:
-            bags_around(bag).append(bag)
+            bags_beside(bag).append(bag)
         segments: list[Segment] = []
-        for at, segment in enumerate(self.segments):
-            segments += _segments_of(touched[at]) if at in touched else [segment]
+        for position, segment in enumerate(self.segments):
+            segments += _segments_of(touched[position]) if position in touched else [segment]
         return Timeline(segments)
 
     @cached_property
@@ -94,33 +101,31 @@ class Timeline:
 
     @cached_property
     def _reaches(self) -> list[Ns]:
-        """For each segment the latest log time in it and all before it: ascending."""
+        """For each segment the latest log time up to its end; ascending."""
         return list(accumulate((segment.latest for segment in self.segments), max))
 
-    def named(self, files: Collection[str]) -> list[BagFile]:
-        """Returns the bags of these paths that are in it."""
-        folders, found = {file.rpartition("/")[0] for file in files}, list[BagFile]()
+    def bags_named(self, files: Collection[str]) -> list[BagFile]:
+        """Returns the bags at these paths; a path without a bag is passed over."""
+        folders = {file.rpartition("/")[0] for file in files}
+        bags: list[BagFile] = []
         for segment in self.segments:
             if not folders.isdisjoint(segment.bags.folders):
                 paths = segment.bags.files()
-                found += segment.bags.at([row for row, path in enumerate(paths) if path in files])
-        return found
-
-    def _position(self, bag: BagFile) -> int:
-        return max(bisect_right(self._firsts, in_time(bag)) - 1, 0)
+                bags += segment.bags.at([row for row, path in enumerate(paths) if path in files])
+        return bags
 
     def segments_in(self, window: TimeWindow) -> Sequence[Segment]:
-        """Returns the segments that can contain something of a window, in order."""
+        """Returns the segments that may have messages in a window, in order."""
         begin = bisect_left(self._reaches, window.start)
         end = bisect_left(self._firsts, window.stop, key=lambda first: first[0])
         return self.segments[begin:end]
 
     def totals(self, topic: str) -> dict[str, TopicTotals]:
-        """Returns by type what all bags hold of a topic."""
+        """Returns by type the totals of a topic over all bags."""
         totals: dict[str, TopicTotals] = {}
         for segment in self.segments:
             for type_name, more in segment.totals.get(topic, {}).items():
-                add_totals(totals, type_name, more)
+                totals[type_name] = totals.get(type_name, NO_TOTALS) | more
         return totals
 
     def recordings(self, topic: str) -> dict[Path, Span]:
@@ -128,14 +133,14 @@ class Timeline:
         if topic not in self._recordings:
             spans: dict[Path, Span] = {}
             for segment in self.segments:
-                for folder, totals in segment.recordings(topic).items():
-                    spans[folder] = wider(spans.get(folder), totals[:2])
+                for path, totals in segment.recordings(topic).items():
+                    spans[path] = wider(spans.get(path), (totals.first, totals.last))
             self._recordings[topic] = spans
         return self._recordings[topic]
 
     @cached_property
     def handed_over(self) -> frozenset[str]:
-        """The folders of bags with a `handover.json`; of those of a lake all."""
+        """The folders of bags with a `handover.json`; in a lake, all folders."""
         return frozenset(chain.from_iterable(segment.handed_over for segment in self.segments))
 
     @cached_property
@@ -145,35 +150,36 @@ class Timeline:
 
     @property
     def starts(self) -> Ints:
-        """Log time of the first message in each of all bags."""
-        return np.concatenate(
-            [np.empty(0, np.int64), *(part.bags.starts for part in self.segments)]
-        )
+        """Log time of the first message in each bag."""
+        starts = (segment.bags.starts for segment in self.segments)
+        return np.concatenate([np.empty(0, np.int64), *starts])
 
     @property
     def latest(self) -> Ns:
-        """Log time of the last message in any of the bags; the earliest time without any."""
+        """Log time of the last message in any bag; `MIN_NS` without bags."""
         return max((segment.latest for segment in self.segments), default=MIN_NS)
 
     @property
     def ends(self) -> Ints:
-        """Log time of the last message in each of all bags."""
-        return np.concatenate([np.empty(0, np.int64), *(part.bags.ends for part in self.segments)])
+        """Log time of the last message in each bag."""
+        ends = (segment.bags.ends for segment in self.segments)
+        return np.concatenate([np.empty(0, np.int64), *ends])
 
     @property
     def folder_numbers(self) -> Ints:
-        """For each of all bags a number; those of one folder have the same."""
+        """A number for each bag, which all bags of its folder share."""
         bags = (segment.bags for segment in self.segments)
-        return joined_codes((part.folder_of, part.folders) for part in bags)[0]
+        numbers, _ = joined_codes((part.folder_of, part.folders) for part in bags)
+        return numbers
 
     @cached_property
     def recorded_segments(self) -> tuple[Segment, ...]:
-        """The bags that show when there was a recording, in order, some at a time.
+        """The segments without the bag of carried messages, unless there is no other bag.
 
-        The bag of carried messages does not: it holds what is left of deleted bags. It is among
-        them only where there is no other.
+        That bag does not show when there was a recording: it holds what is left of deleted bags.
         """
-        return tuple(filter(None, (segment.recorded for segment in self.segments))) or self.segments
+        recorded = (segment.recorded for segment in self.segments)
+        return tuple(segment for segment in recorded if segment is not None) or self.segments
 
     @cached_property
     def recorded(self) -> Bags:
@@ -182,7 +188,7 @@ class Timeline:
 
     @cached_property
     def thinned(self) -> tuple[BagFile, ...]:
-        """The days of which only some messages stayed, in order."""
+        """The thinned days, in order."""
         bags = chain.from_iterable(
             segment.bags
             for segment in self.segments
@@ -192,25 +198,26 @@ class Timeline:
 
     @cached_property
     def thinned_times(self) -> Spans:
-        """The times of which a thinned day has some messages, and no other bag has all."""
+        """The times of thinned days in which no other bag has all messages."""
         days = united((day.start, day.end + 1) for day in self.thinned)
         if not days:
             return days
-        around = self.overlapping(TimeWindow(days[0][0], days[-1][1]))
-        whole = [bag for bag in around if not is_derived(bag.file)]
-        # Between the bags of a moment nothing is missing.
-        return without(days, united([(bag.start, bag.end + 1) for bag in whole], NS_PER_S))
+        begin, stop = enclosing(days)
+        around = self.overlapping(TimeWindow(begin, stop))
+        whole = [(bag.start, bag.end + 1) for bag in around if not is_derived(bag.file)]
+        # Bags of a saved moment that are at most a second apart lack nothing in between.
+        return without(days, united(whole, NS_PER_S))
 
     @property
     def disk_use(self) -> tuple[int, int]:
-        """The bytes of the recorded bags, and how many of them a crash left open."""
+        """The size of the recorded bags in bytes, and how many of them a crash left open."""
         parts = [segment.disk_use for segment in self.recorded_segments]
         return sum(size for size, _ in parts), sum(left_open for _, left_open in parts)
 
     @property
     def closed(self) -> int:
-        """How many of the bags are closed."""
-        closed = (segment.bags.are(BagState.CLOSED).sum() for segment in self.segments)
+        """How many bags are closed."""
+        closed = (segment.bags.in_state(BagState.CLOSED).sum() for segment in self.segments)
         return sum(map(int, closed))
 
     @cached_property
@@ -231,15 +238,15 @@ class Timeline:
         return frozenset(chain.from_iterable(segment.transient_local for segment in self.segments))
 
     def topics(self) -> tuple[str, ...]:
-        """Returns the topics of which some bag holds a message, sorted."""
+        """Returns the topics with a message in some bag, sorted."""
         return tuple(self.types)
 
     def types_of(self, topic: str) -> tuple[str, ...]:
-        """Returns the message types of the topic, sorted; empty where it has no message."""
+        """Returns the message types of the topic, sorted; empty if it has no message."""
         return self.types.get(topic, ())
 
     def is_transient_state(self, topic: str) -> bool:
-        """Returns whether the topic is transient local, and no log as `/rosout` is everywhere."""
+        """Returns whether the topic is transient local and no log (`/rosout` is both)."""
         return topic in self.transient_local and not self.is_log(topic)
 
     def is_log(self, topic: str) -> bool:
@@ -247,16 +254,18 @@ class Timeline:
         return all(map(is_log, self.types_of(topic)))
 
     def pace(self, topic: str, recording: Path) -> Pace:
-        """Returns how often a recording has messages of a topic; it must hold some."""
+        """Returns how often a recording, which must hold the topic, has messages of it."""
         folder = str(recording)
-        segments = [segment for segment in self.segments if folder in segment.bags.folders]
-        totals = filter(None, (segment.recordings(topic).get(recording) for segment in segments))
-        extents = (segment.folder_spans[folder] for segment in segments)
-        return Pace(reduce(TopicTotals.__or__, totals), *reduce(wider, extents))
+        totals, spans = NO_TOTALS, list[Span]()
+        for segment in self.segments:
+            if folder in segment.bags.folders:
+                totals |= segment.recordings(topic).get(recording, NO_TOTALS)
+                spans.append(segment.folder_spans[folder])
+        return Pace(totals, *enclosing(spans))
 
     @cached_property
     def silent(self) -> frozenset[str]:
-        """The topics that some bag declares without a message; another may hold some."""
+        """The topics that some bag declares without a message; other bags may hold some."""
         return frozenset(chain.from_iterable(segment.silent for segment in self.segments))
 
     def overlapping(self, window: TimeWindow) -> tuple[BagFile, ...]:
@@ -272,39 +281,39 @@ class Timeline:
         if not self.segments:
             return []
         folders, starts, ends = self.folder_numbers, self.starts, self.ends
-        # A run is bags of one folder in a row. Two sorts of its bags show all that it shares: those
-        # that begin before an earlier run has ended, and the one that ends last.
+        # A run is a row of bags of one folder. Two kinds of its bags show all that it shares: bags
+        # that begin before an earlier run has ended, and the bag that ends last.
         begins = run_starts(folders)
         sizes = np.diff(begins, append=folders.size)
-        reached = np.append(MIN_NS, np.maximum.accumulate(ends)[begins[1:] - 1])
+        earlier_ends = np.append(MIN_NS, np.maximum.accumulate(ends)[begins[1:] - 1])
         nearest = np.maximum(starts, MIN_NS + COPY_HORIZON_NS) - COPY_HORIZON_NS
-        is_near = nearest <= np.repeat(reached, sizes)
+        is_near = nearest <= np.repeat(earlier_ends, sizes)
         is_last = ends == np.repeat(np.maximum.reduceat(ends, begins), sizes)
         rows = np.flatnonzero(is_near | is_last)
-        return overlap_spans(
-            zip(*(of[rows].tolist() for of in (starts, ends, folders)), strict=True)
-        )
+        spans = (starts[rows].tolist(), ends[rows].tolist(), folders[rows].tolist())
+        return overlap_spans(zip(*spans, strict=True))
 
     def faulty(self, window: TimeWindow) -> list[BagFile]:
-        """Returns the bags whose faults may bear on the window, in order.
+        """Returns the bags whose faults may concern the window, in order.
 
-        Those of a bag that a crash left open reach to the last time that its file was written to,
-        if that was within a day.
+        A bag that a crash left open may lack messages up to its mtime, if that is within a day.
         """
         faulty = []
         for segment in self.segments:
-            for bag in segment.faulty if segment.first[0] < window.stop else ():
-                is_cut = bag.state is BagState.INCOMPLETE
-                is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
-                if window.overlaps(bag.start, bag.mtime_ns if is_cut and is_late else bag.end):
+            if segment.first[0] >= window.stop:
+                break
+            for bag in segment.faulty:
+                end = bag.end
+                if bag.state is BagState.INCOMPLETE and end < bag.mtime_ns <= end + MAX_FILE_NS:
+                    end = bag.mtime_ns
+                if window.overlaps(bag.start, end):
                     faulty.append(bag)
         return faulty
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
-        """Yields the bags that hold the topic (in a window), in order, once for each type.
+        """Yields the bags that may hold messages of the topic in a window, in order.
 
-        Those are the bags that can contain some of its messages in the window, by its first and
-        last time in each bag.
+        By the first and last time of the topic in each bag. A bag comes once for each type.
         """
         if window.empty:
             return
@@ -318,17 +327,18 @@ class Timeline:
         segment = next(
             segment for segment in self.segments if type_name in segment.types.get(topic, ())
         )
-        holds = segment.bags.with_schema(
-            lambda schema: any(header[:2] == (topic, type_name) for header in schema.topics)
+        holds_topic = segment.bags.with_schema(
+            lambda schema: any(
+                (header.topic, header.type) == (topic, type_name) for header in schema.topics
+            )
         )
-        return segment.bags[int(holds.argmax())]
+        return segment.bags[int(holds_topic.argmax())]
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:
-    """Returns segments of bags given in any order."""
-    runs: list[list[BagFile]] = []
-    for bag in sorted(bags, key=in_time):
-        if not runs or len(runs[-1]) == SEGMENT_BAGS:
-            runs.append([])
-        runs[-1].append(bag)
-    return [Segment(run) for run in runs]
+    """Returns the segments of bags that are given in any order."""
+    ordered = sorted(bags, key=in_time)
+    return [
+        Segment(ordered[begin : begin + SEGMENT_BAGS])
+        for begin in range(0, len(ordered), SEGMENT_BAGS)
+    ]

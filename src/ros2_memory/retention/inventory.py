@@ -239,7 +239,7 @@ class Inventory:
                 self._settled_bags[path] = stored
             else:
                 new[path] = stamp
-        for bag in known.timeline.named(new):
+        for bag in known.timeline.bags_named(new):
             stamp = new[bag.file]._replace(size=bag.size, mtime_ns=bag.mtime_ns)
             self._settled_bags[bag.file] = self._stored(bag.file, bag, stamp, known.now)
         if before.keys() - self._settled_bags.keys():

@@ -106,7 +106,7 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     ]
     for rows in (segment.bags for segment in timeline.segments):
         odd = [bag for bag in rows if bag.summary.notes]
-        some = rows.some(rows.with_schema(lambda schema: schema.notes))
+        some = rows.select(rows.with_schema(lambda schema: schema.notes))
         assert [*(some or ())] == odd
         assert (some is rows) == (len(odd) == len(rows))
         assert rows.files() == [bag.file for bag in rows]
