@@ -1,4 +1,4 @@
-"""Access to single bags within one call: what is read of them, and notes on those that fail."""
+"""Reads single bags within one call, and notes what cannot be read."""
 
 from __future__ import annotations
 
@@ -42,10 +42,15 @@ _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
 class BagAccess:
     """Reads the bags of one snapshot, with a deadline.
 
-    A bag that cannot be read raises nothing here: a note reports it, and the other bags answer.
+    A damaged bag raises nothing: a note reports it, and the other bags answer.
+
+    Args:
+        memory: has the bags.
+        call: asks for them.
+        reach: as in `View`.
 
     Attributes:
-        snapshot: the index as it was when the call began; the same for the whole call.
+        snapshot: the index as the call began.
         notes: what the reply reports besides its answer.
     """
 
@@ -59,13 +64,13 @@ class BagAccess:
         self._deadline = call.deadline
 
     def end_early(self, left_s: float) -> None:
-        """Ends reading so long before the call's time is over, or after half of it."""
+        """Ends reading `left_s` before the call's deadline, but not before half of its time."""
         deadline = self.call.deadline
         at_s = deadline.at_s - min(left_s, deadline.budget_s / 2)
         self._deadline = replace(deadline, at_s=at_s)
 
     def finish_within(self, budget_s: float) -> None:
-        """Gives a call the rest of its time, at least so much, to say what it found."""
+        """Restores the call's deadline, or sets a later one if less than `budget_s` is left."""
         deadline = self.call.deadline
         is_enough = deadline.left_s() >= budget_s
         self._deadline = deadline if is_enough else Deadline.after(budget_s)
@@ -74,7 +79,7 @@ class BagAccess:
         """Checks that the call has time left.
 
         Raises:
-            QueryTimeoutError: it has none.
+            QueryTimeoutError: its time is over.
         """
         if self._deadline.expired():
             budget_s = self.call.deadline.budget_s
@@ -84,16 +89,16 @@ class BagAccess:
             )
 
     def filling_progress(self) -> str:
-        """Returns how many bags are stored as columns, as part of a sentence on lack of time.
+        """Returns a clause on the bags that are not stored as columns, for a lack of time.
 
-        Others are read for every question, which takes long where there are many. Empty where that
-        is less than 1 % of them: then it is not the cause.
+        These bags are read for every question, which takes long. Empty if they are less than 1 % of
+        all bags: then they are not the cause.
         """
         coverage = self.memory.scanner.coverage(self.snapshot.timeline)
         if coverage is None:
             return ""
         bags = self.snapshot.timeline.closed
-        missing = sum(bag.state is BagState.CLOSED for bag in coverage.missing)
+        missing = len([bag for bag in coverage.missing if bag.state is BagState.CLOSED])
         if missing * 100 <= bags:
             return ""
         return (
@@ -102,10 +107,10 @@ class BagAccess:
         )
 
     def track_sources(self, messages: Iterator[StoredMessage]) -> Iterator[StoredMessage]:
-        """Yields the messages, and records what kind of bags they are from.
+        """Yields the messages, and records for the reply from which kinds of bags they are.
 
-        A bag that a crash left open makes the answer incomplete; of one that is still being
-        written the reply has to report that it was used.
+        A bag that a crash left open makes the answer incomplete. A reply that uses a bag which is
+        still being written says so.
         """
         for message in messages:
             self._track_source(message.bag)
@@ -118,12 +123,12 @@ class BagAccess:
             self.call.used_active = True
 
     def track_all_sources(self) -> None:
-        """Records that an answer is about all bags of the index, also those being written."""
+        """Records that the answer is about all bags, including bags that are being written."""
         if any(aside.until is not None for aside in self.snapshot.active):
             self.call.used_active = True
 
     def channels(self, bag: BagFile) -> Sequence[Channel]:
-        """Returns the channels one bag declares; none, with a note, where it is damaged."""
+        """Returns the channels that a bag declares; none, with a note, if it is damaged."""
         self.check_deadline()
         try:
             return self.memory.reader.channels(bag.path)
@@ -134,9 +139,9 @@ class BagAccess:
     def decode(
         self, stored: StoredMessage, failures: list[UndecodableError] | None = None
     ) -> object:
-        """Returns the decoded message; None where its type or its bytes are not understood.
+        """Returns the decoded message; None if its type or its bytes are not understood.
 
-        Why is added to `failures`, if they are given: who gives them reports them, and such an
+        If `failures` is given, the reason is added to it. The caller has to report it, and the
         answer is not remembered.
         """
         try:
@@ -144,25 +149,23 @@ class BagAccess:
         except UndecodableError as error:
             if failures is not None:
                 self.notes.added += 1
-                # A new one, since the one that was raised keeps the message by its traceback.
+                # The raised error would keep the message alive by its traceback.
                 failures.append(UndecodableError(error.topic, error.type_name, error.reason))
             return None
 
     def _note_unreadable(self, bag: BagFile, error: BagError, window: TimeWindow) -> None:
-        """Notes that a bag, or a part of it, is not in the answer; unless it is of no such time."""
+        """Notes that a bag, or a part of it, is not in the answer, if it lies in the window."""
         self.memory.scanner.met_damage(bag, error)
-        is_whole = isinstance(error, BagContradictionError)
-        first, until = (bag.start, bag.end) if is_whole or error.lost is None else error.lost
-        if not window.overlaps(first, until):
-            return
-        if not is_whole:
-            self.notes.complete = False
+        lost = error.lost or (bag.start, bag.end)
         kind, reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE, error.reason
         if isinstance(error, BagVanishedError):
             kind, reason = _DELETED, ""
-        elif is_whole:
-            kind = _CONTRADICTS_ITSELF
-        self.notes.add(Note(kind, short_name(bag.path), reason, first, until))
+        elif isinstance(error, BagContradictionError):
+            kind, lost = _CONTRADICTS_ITSELF, (bag.start, bag.end)
+        if window.overlaps(*lost):
+            # All messages of a bag that contradicts itself were read.
+            self.notes.complete &= kind is _CONTRADICTS_ITSELF
+            self.notes.add(Note(kind, short_name(bag.path), reason, *lost))
 
     def read(
         self,
@@ -175,14 +178,13 @@ class BagAccess:
     ) -> Iterator[StoredMessage]:
         """Yields one bag's messages in log-time order; a note reports what cannot be read.
 
-        There is no note where all that is lost lies before `since`: that part is read to recognise
-        copies only.
+        Messages before `since` are read only to recognise copies: there is no note on them.
         """
         self.check_deadline()
         part, reader = _indexed_part(bag, window), self.memory.reader
         records: Iterator[Record] | None = None
         is_thin = is_thinned(bag.file)
-        # The time between two records is the reader's; what happens at `yield` is the caller's.
+        # The stage "read" is the time of the reader, without that of the caller between messages.
         clock, spent, count = time.perf_counter_ns, 0, 0
         while True:
             begin = clock()
@@ -221,29 +223,37 @@ class BagAccess:
     ) -> Iterator[Table]:
         """Yields one bag's messages of a topic in a window as tables; a note reports what is lost.
 
-        With `around` all messages of the bag are yielded, and notes are still on the window alone:
-        what lies around it is read to recognise copies only, or not, if these are known.
-        With `hashed` they have the hashes of all payloads, else those of latched channels alone.
-        Without `columns` they have times, and rows for messages that cannot be decoded, too.
+        What was read whole of a bag that does not change any more is remembered.
 
-        What was read whole of a bag that does not change is remembered.
+        Args:
+            bag: the bag.
+            topic: of the messages.
+            window: of log time.
+            hashed: whether tables have the hashes of all payloads, not only of latched channels.
+            columns: whether they have more than times. Without columns, messages that cannot be
+                decoded have rows, too.
+            around: whether all messages of the bag are read, to recognise copies. There are notes
+                on the window alone.
         """
         self.check_deadline()
         part = _indexed_part(bag, TimeWindow.everything() if around else window)
-        remembered = self.memory.scanner.caches.decoded
+        cache = self.memory.scanner.caches.decoded
         key = (bag.identity, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
-        remembered_tables = remembered.get(key) if is_lasting else None
-        read_now = undecoded(
-            self.memory.reader,
-            bag.path,
-            part,
-            topics=[topic],
-            hashed=lambda channel: hashed or channel.latched,
-            columns=columns,
-        )
-        read_groups = map(Group.tables, read_now)
-        groups = read_groups if remembered_tables is None else iter(remembered_tables)
+        cached = cache.get(key) if is_lasting else None
+        groups: Iterator[list[Table]]
+        if cached is None:
+            read_now = undecoded(
+                self.memory.reader,
+                bag.path,
+                part,
+                topics=[topic],
+                hashed=lambda channel: hashed or channel.latched,
+                columns=columns,
+            )
+            groups = map(Group.tables, read_now)
+        else:
+            groups, is_lasting = iter(cached), False
         read: list[list[Table]] = []
         size = 0
         while True:
@@ -251,7 +261,7 @@ class BagAccess:
                 with self.call.stages.timed("read"):
                     tables = next(groups, None)
             except BagError as error:
-                is_lasting = False  # each answer notes what is lost
+                is_lasting = False  # each answer has to note what is lost
                 self._note_unreadable(bag, error, window)
                 if error.lost is None:
                     return
@@ -264,12 +274,12 @@ class BagAccess:
                 read.append(tables)
             yield from tables
             self.check_deadline()
-        if is_lasting and remembered_tables is None and size <= DECODED_BYTES:
-            remembered.put(key, read, size)
+        if is_lasting and size <= DECODED_BYTES:
+            cache.put(key, read, size)
 
 
 def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:
-    """Returns the part of a window that the snapshot covers: an active bag grows meanwhile."""
+    """Returns the part of a window that the snapshot covers: an active bag has grown since."""
     if bag.state is not BagState.ACTIVE:
         return window
     return window.intersect(TimeWindow.until(bag.end))

@@ -1,10 +1,9 @@
-"""When the clock that dates messages was set, by what bags show."""
+"""Steps of the clock that dates messages: when bags show that it was set."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from dataclasses import replace
-from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -48,9 +47,9 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 _MOST_SUSPECTS: Final = 32
-"""The newest suspects are looked at; each costs some milliseconds."""
+"""Only the newest suspects are looked at: each costs some milliseconds."""
 _MOST_STAMPED: Final = 8
-"""Topics of which header stamps are looked at."""
+"""The header stamps of this many topics are looked at."""
 _STAMP: Final = "header.stamp"
 _STEPS_BYTES: Final = 1_000
 """About how much memory the steps of a pause take."""
@@ -59,9 +58,9 @@ _STEPS_BYTES: Final = 1_000
 def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep, ...]:
     """Returns when the clock was set (in a window), in order of time.
 
-    Back by 2 s or more by the order of log times. Forward where no message of a recording was
-    logged for a while: by 2 s or more where the robot drove through that, by 0.5 s or more where
-    header stamps of two topics go on in their cadence.
+    A step back of 2 s or more shows in the order of log times. A step forward looks like a pause of
+    a recording: of 2 s or more if the robot drove through it, of 0.5 s or more if the header stamps
+    of two topics go on in their cadence.
     """
     window = TimeWindow.everything() if window is None else window
     _note_pauses(view, window)
@@ -69,31 +68,34 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
 
 
 def without_steps(view: View, gaps: Sequence[Span]) -> Sequence[Span]:
-    """Returns those gaps, of which there is one at least, in order, that are no clock step."""
+    """Returns the gaps that are no step of the clock. `gaps` are sorted and not empty."""
     around = TimeWindow(gaps[0][0], gaps[-1][1])
-    steps = {step.at for step in _known_steps(view, around) or () if step.by > 0}
+    steps = {step.at for step in _steps_in_time(view, around) or () if step.by > 0}
     return [(start, end) for start, end in gaps if start not in steps]
 
 
 def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     """Returns how much time passed between moments of a window; notes name the steps in it."""
-    known = _known_steps(view, window)
-    if known is None:
+    around = _steps_in_time(view, window)
+    if around is None:
         return Elapsed()
-    steps = [step for step in known if window.overlaps(step.at, step.at + max(step.by - 1, 0))]
+    steps = [step for step in around if window.overlaps(step.at, step.at + max(step.by - 1, 0))]
     _note_pauses(view, window)
     for at, by in steps:
-        view.notes.add(
-            f"the clock was set {seconds(by)} ahead at {unix_text(at)}: durations are without that"
-            if by > 0
-            else f"the clock was set back by {seconds(-by)} or more at {unix_text(at)}: durations "
-            "across that are too short by as much"
-        )
+        when = unix_text(at)
+        if by > 0:
+            note = f"the clock was set {seconds(by)} ahead at {when}: durations are without that"
+        else:
+            note = (
+                f"the clock was set back by {seconds(-by)} or more at {when}: durations across "
+                "that are too short by as much"
+            )
+        view.notes.add(note)
     return Elapsed(steps)
 
 
-def _known_steps(view: View, window: TimeWindow) -> list[ClockStep] | None:
-    """Returns the steps in and near a window; None, with a note, where the call's time is over."""
+def _steps_in_time(view: View, window: TimeWindow) -> list[ClockStep] | None:
+    """Returns the steps in and near a window; None, with a note, if the call's time is over."""
     try:
         return _steps_around(view, window)
     except QueryTimeoutError:
@@ -104,36 +106,38 @@ def _known_steps(view: View, window: TimeWindow) -> list[ClockStep] | None:
 
 
 def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
-    """Returns the trajectory of a path on which a step of the clock is no gap, and takes no time.
+    """Returns the trajectory of a path without the steps of the clock: no gaps, and no time.
 
-    A step is a gap among poses that are often enough for it; see `odometry`.
+    A step counts as a gap if it is longer than the usual time between poses explains; see
+    `odometry`.
     """
     skipped = elapsed.skipped_between(path.first, path.last)
     if not skipped or trajectory.poses < 2:
         return trajectory
     totals = trajectory.totals
-    least = GAP_PERIODS * totals.duration_s / (trajectory.poses - 1)
-    crossed = [
+    usual_s = GAP_PERIODS * totals.duration_s / (trajectory.poses - 1)
+    counted_as_gaps = [
         stop - begin
         for begin, stop in elapsed.skipped
-        if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
+        if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > usual_s
     ]
-    gaps, gap_ns = max(0, totals.gaps - len(crossed)), totals.gap_ns - sum(crossed)
-    elapsed_s = totals.duration_s - unix_from_ns(skipped)
-    crossing = replace(
+    gaps = max(0, totals.gaps - len(counted_as_gaps))
+    gap_ns = totals.gap_ns - sum(counted_as_gaps)
+    without_gaps = replace(
         totals,
         gaps=gaps,
         gap_m=totals.gap_m if gaps else 0.0,
         gap_ns=gap_ns if gap_ns > GAP_NS else 0,
     )
+    elapsed_s = totals.duration_s - unix_from_ns(skipped)
     avg_speed = mean_speed(totals.distance_m, elapsed_s) or trajectory.avg_speed
-    return replace(trajectory, totals=crossing, avg_speed=avg_speed)
+    return replace(trajectory, totals=without_gaps, avg_speed=avg_speed)
 
 
 def while_recorded(trajectory: Trajectory, elapsed: Elapsed, path: PathSlice) -> Trajectory:
-    """Returns a trajectory whose mean speed is over the time in which its poses were recorded.
+    """Returns a trajectory whose mean speed leaves out the time of gaps (`gap_ns`).
 
-    What was driven in the rest, `gap_ns`, is not part of its length either.
+    Its length leaves out the metres across gaps as well.
     """
     gap_ns = trajectory.totals.gap_ns
     recorded = elapsed.between(path.first, path.last) - gap_ns
@@ -148,7 +152,7 @@ def while_recorded(trajectory: Trajectory, elapsed: Elapsed, path: PathSlice) ->
 
 
 def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
-    """Returns the steps in a window, and others near it."""
+    """Returns the steps in a window, and some near it, in order of time."""
     steps = [
         ClockStep(fault.at, -fault.by)
         for fault in view.snapshot.dating.faults
@@ -159,8 +163,8 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         steps += _steps_of_pause(view, pause)
     distinct: list[ClockStep] = []
     for step in sorted(steps):
-        # Recordings that overlap show one step back to some milliseconds; it is a minimum, and the
-        # longer one is nearer to the truth.
+        # Overlapping recordings show one step back some milliseconds apart. Each shows at least how
+        # far it was, so the longest is nearest to the truth.
         apart = OUT_OF_ORDER_NS if step.by < 0 and distinct and distinct[-1].by < 0 else 0
         if distinct and step.at - distinct[-1].at <= apart:
             distinct[-1] = ClockStep(distinct[-1].at, min(distinct[-1].by, step.by))
@@ -170,18 +174,14 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
 
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:
-    """Returns the pauses that bags show in a window, and those that deleted bags showed."""
-    shown = {pause.span: pause for pause in view.snapshot.suspects if window.overlaps(*pause.span)}
-    deleted = {
-        pause: Pause(*pause, (), ran_on=True)
-        for pause in read_thinned(view.bag_dir).pauses
-        if window.overlaps(*pause)
-    }
-    return sorted({**deleted, **shown}.values())
+    """Returns the suspect pauses in a window, including those that deleted bags showed."""
+    suspects = {span: Pause(*span, (), ran_on=True) for span in read_thinned(view.bag_dir).pauses}
+    suspects |= {pause.span: pause for pause in view.snapshot.suspects}
+    return sorted(pause for span, pause in suspects.items() if window.overlaps(*span))
 
 
 def _note_pauses(view: View, window: TimeWindow) -> None:
-    """Notes how many pauses were not looked at, if there are such."""
+    """Notes if there are too many pauses to look at all of them."""
     pauses = len(_suspects(view, window))
     if pauses > _MOST_SUSPECTS:
         view.notes.add(
@@ -191,40 +191,43 @@ def _note_pauses(view: View, window: TimeWindow) -> None:
 
 
 def _steps_of_pause(view: View, pause: Pause) -> tuple[ClockStep, ...]:
-    """Returns the step that a pause is, if any, which is looked at once if its bags are closed."""
+    """Returns the step in a pause, if any; remembers it if the bags around are closed."""
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
     bags = view.timeline.overlapping(around)
     topic = view.pose_topic if view.pose_topic in view.timeline.topics() else None
     key = (topic, pause.start, pause.end, *[bag.identity for bag in bags])
-    remembered = view.memory.scanner.caches.clock_steps
-    steps = remembered.get(key)
+    cache = view.memory.scanner.caches.clock_steps
+    steps = cache.get(key)
     if steps is None:
         with view.notes.isolated():
             step = _find_step(view, topic, pause)
             is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
         steps = () if step is None else (step,)
         if is_final:
-            remembered.put(key, steps, _STEPS_BYTES)
+            cache.put(key, steps, _STEPS_BYTES)
     return steps
 
 
 def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
-    """Returns the step that a pause is, by header stamps, else by the poses of a topic."""
+    """Returns the step in a pause, by header stamps, else by the poses of a topic."""
     step = _step_by_stamps(view, pause)
-    is_long = pause.end - pause.start >= SHORTEST_STEP_NS
-    if step is not None or not is_long or topic is None or _is_late(view, topic, pause):
+    if step is not None or topic is None or pause.length < SHORTEST_STEP_NS:
         return step
+    if _had_stalled(view, topic, pause):
+        return None
     before = TimeWindow.before(pause.start, BESIDE_NS)
     after = TimeWindow(pause.end, pause.end + BESIDE_NS)
-    bags = [view.timeline.overlapping(window) for window in (before, after)]
     # A recording that ended before the pause tells nothing about one that began after it.
-    through = set.intersection(*({bag.recording for bag in side_bags} for side_bags in bags))
-    sides = [_poses(view, topic, window, through) for window in (before, after)]
-    return step_over(pause.span[0], *sides)
+    recordings = {bag.recording for bag in view.timeline.overlapping(before)}
+    recordings &= {bag.recording for bag in view.timeline.overlapping(after)}
+    poses_before, poses_after = (
+        _poses_of_recordings(view, topic, window, recordings) for window in (before, after)
+    )
+    return step_over(pause.span[0], poses_before, poses_after)
 
 
 def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
-    """Returns the step that a pause is by the header stamps of topics on both sides of it."""
+    """Returns the step in a pause, by the header stamps of topics on both sides of it."""
     around = TimeWindow(pause.start - STAMPS_BESIDE_NS, pause.end + STAMPS_BESIDE_NS)
     counts: Counter[str] = Counter()
     for bag in view.timeline.overlapping(around):
@@ -232,31 +235,33 @@ def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
     changes: list[Ns] = []
     for topic, _ in counts.most_common(_MOST_STAMPED):
         if view.timeline.is_log(topic):
-            continue  # they have no header, and are mostly latched: their parts are many
-        by_recording = _stamps(view, topic, around).values()
-        found = (delay_change(pause.span, *stamped) for stamped in by_recording)
-        changes += islice((change for change in found if change is not None), 1)
+            continue  # logs have no header, and are slow to scan: they are latched, in many parts
+        for times, stamps in _stamps_by_recording(view, topic, around).values():
+            change = delay_change(pause.span, times, stamps)
+            if change is not None:
+                changes.append(change)
+                break
     return step_by_delays(pause.span[0], changes)
 
 
-def _is_late(view: View, topic: str, pause: Pause) -> bool:
-    """Returns whether messages that follow a pause were sent in it: the recorder had stalled."""
+def _had_stalled(view: View, topic: str, pause: Pause) -> bool:
+    """Returns whether messages that were logged after a pause were sent during it."""
     after = TimeWindow(pause.end, pause.end + BESIDE_NS)
     first = view.stream.first((topic,), after)
     sent = [] if first is None else [first.record.publish_time]
-    for _, stamps in _stamps(view, topic, after).values():
+    for _, stamps in _stamps_by_recording(view, topic, after).values():
         sent += stamps.tolist()
     return any(pause.start + ALIKE_NS < at < pause.end - ALIKE_NS for at in sent)
 
 
-def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, Ints]:
-    """Returns the log times and header stamps of a topic in a window, of each recording."""
+def _stamps_by_recording(view: View, topic: str, window: TimeWindow) -> dict[Path, Ints]:
+    """Returns for each recording the log times and header stamps (ns) of a topic in a window."""
     by_recording: dict[Path, list[Ints]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
         return _STAMP in parts.topic.layout.slots
 
-    def stamped(rows: Rows) -> Ints | None:
+    def read_stamps(rows: Rows) -> Ints | None:
         column = rows.table.columns.get(_STAMP)
         if column is None or isinstance(column, Texts):
             return None
@@ -264,12 +269,14 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, Ints]:
         return np.stack((rows.times, stamps if rows.index is None else stamps[rows.index]))
 
     for rows in scan(view, topic, window, may_match=may_match):
-        by_recording[rows.recording] += of_columns(view, rows, stamped) or []
+        by_recording[rows.recording] += of_columns(view, rows, read_stamps) or []
     return {path: np.concatenate(parts, axis=1) for path, parts in by_recording.items() if parts}
 
 
-def _poses(view: View, topic: str, window: TimeWindow, recordings: Collection[Path]) -> Poses:
-    """Returns the poses of some recordings in a window that are at a place."""
+def _poses_of_recordings(
+    view: View, topic: str, window: TimeWindow, recordings: Collection[Path]
+) -> Poses:
+    """Returns the poses of some recordings in a window, without invalid positions."""
     blocks = pose_rows(view, topic, window, [], among=recordings.__contains__)
     try:
         poses = joined_poses([rows.poses for rows in blocks])

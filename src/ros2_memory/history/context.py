@@ -1,4 +1,4 @@
-"""What queries are asked of, `Memory` with its settings, and what one call carries, `Call`."""
+"""What a query gets: `Memory`, the recorded past with its settings, and `Call`, the question."""
 
 from __future__ import annotations
 
@@ -49,13 +49,14 @@ _FOREIGN: Final[Key[ForeignBags]] = Key()
 
 @dataclass(frozen=True, slots=True)
 class QuerySettings:
-    """The part of the configuration that queries need.
+    """The part of the configuration that queries need; docs/reference has the meaning of each key.
 
-    Units are the last word of each name. `kept` is how much the recorder keeps; None where nothing
-    is recorded, and nothing deleted. `labels` has other spellings by the name that is to be shown.
-    `screened`: no split answers before it was searched for what is to be excluded. `recording`: the
-    name of the recording that alone answers; empty where all do. `places_file`: where the places
-    were read.
+    Attributes:
+        screened: whether a split answers only after it was searched for what is to be excluded.
+        recording: the only recording that answers; empty if all do.
+        kept: how much the recorder keeps; None if nothing is recorded or deleted.
+        labels: other spellings of a label, by the spelling that is shown.
+        places_file: the file that `places` were read from.
     """
 
     position_tolerance_m: float = 0.5
@@ -80,9 +81,9 @@ class QuerySettings:
 
     @property
     def closed_after_s(self) -> float:
-        """How old (s) a message is at most when the split that holds it answers.
+        """The age (s) by which a message answers, because its split is closed.
 
-        A split that is searched first waits for the next one, and for the search.
+        A split that is screened first waits for the next split, and for the search.
         """
         return 2.5 * self.split_duration_s if self.screened else self.split_duration_s
 
@@ -101,7 +102,7 @@ class SnapshotSource(Protocol):
         """The result of the last scan, however old; None before the first."""
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """Returns a current snapshot, which reaches the log time `reach` if there is data."""
+        """Returns a current snapshot; scans again if it does not reach the log time `reach`."""
 
     def refresh(self) -> Snapshot:
         """Scans now, and returns the result."""
@@ -110,17 +111,23 @@ class SnapshotSource(Protocol):
         """Returns the last heartbeat of the directory's recorder, if it can be read."""
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
-        """Returns the names of the recordings beside one that handovers join with it."""
+        """Returns the names of the recordings in the same folder that handovers join with one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
-    `scanner` scans topics, from its store where that has the bags; every answer is the same without
-    the store. `large` is the turn to hold much of a bag, which the reader takes. `memo` has what
-    was found out about the bags and stays true. `fixed` is the snapshot that answers, where it is
-    to be one and the same for several.
+    Attributes:
+        index: the index of the bags.
+        reader: reads them.
+        extractor: reads decoded messages.
+        clock: the wall clock.
+        limits: the settings.
+        scanner: scans topics, quickly if its store has the bags. The store changes no answer.
+        large: the turn to hold a large part of a bag in memory.
+        memo: what was found out about the bags and stays true.
+        fixed: the snapshot that answers all queries; None for the current one.
     """
 
     index: SnapshotSource
@@ -134,13 +141,13 @@ class Memory:
     fixed: Snapshot | None = None
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """Returns what the index has, to a log time `reach` if there is data; or what is fixed."""
+        """Returns the fixed snapshot, else a current one that reaches the log time `reach`."""
         return self.fixed or self.index.snapshot(reach)
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """Returns the bags that retention neither deletes nor counts: not made by the recorder.
+        """Returns the bags that retention leaves alone, as another recorder made them.
 
-        None where nothing is deleted, or bags of any origin are, or no recorder has listed its own.
+        None if retention deletes nothing, or any bags, or if no recorder has listed its own.
         """
         if self.limits.kept is None or not self.limits.kept.keeps_foreign:
             return None
@@ -149,28 +156,28 @@ class Memory:
         return bags.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
-        """Returns the splits that metadata.yaml of a recording lists and that are missing."""
+        """Returns the splits that a recording's metadata.yaml lists and that are missing."""
         return absent_splits(snapshot, self.index.bag_dir, self._listings())
 
     def store_listings(self, snapshot: Snapshot) -> None:
-        """Stores what metadata.yaml of each recording lists, for the programs that start later."""
+        """Stores what each metadata.yaml lists, so that the next start need not read them."""
         store = self.scanner.store
         if store is None:
             return
         self.absent_splits(snapshot)
-        listings, folders = self._listings(), snapshot.metadata_folders
+        listings, root = self._listings(), str(self.index.bag_dir)
         store.put_listings(
             {
-                relative(folder, str(self.index.bag_dir)): listing_to_json(*listings[folder])
-                for folder in folders
+                relative(folder, root): listing_to_json(*listings[folder])
+                for folder in snapshot.metadata_folders
                 if folder in listings
             }
         )
 
     def _listings(self) -> Listings:
-        """Returns what was stored of each metadata.yaml; one that is damaged is read again."""
+        """Returns the listings that were read or stored. A damaged one is read again."""
 
-        def stored() -> Listings:
+        def load() -> Listings:
             listings: Listings = {}
             texts = {} if self.scanner.store is None else self.scanner.store.listings()
             for folder, text in texts.items():
@@ -178,13 +185,13 @@ class Memory:
                     listings[str(self.index.bag_dir / folder)] = listing_from_json(text)
             return listings
 
-        return self.memo.of(_LISTINGS, stored)
+        return self.memo.of(_LISTINGS, load)
 
     def heartbeat(self) -> Heartbeat | None:
-        """Returns the last heartbeat of the recorder of these bags; None if there is none.
+        """Returns the last heartbeat of the recorder of these bags; None without one.
 
-        None for bags of another day, too (`recorder=none`, `data.now=latest`), unless it beats
-        today: one that was copied with them is not about their recorder.
+        If old bags are replayed (`recorder=none`, `data.now=latest`), only a live heartbeat counts:
+        an old one was copied with the bags.
         """
         heartbeat = self.index.heartbeat()
         replays = self.limits.kept is None and self.limits.now == "latest"
@@ -193,9 +200,9 @@ class Memory:
         return heartbeat
 
     def now(self, wall: Ns, latest: Ns | None, call: Call | None = None) -> Ns:
-        """Returns what ages count from: the wall clock, or the newest recorded time.
+        """Returns the time that ages count from: the wall clock's, or the newest recorded one.
 
-        A `call` that has ages in its answer notes the latter.
+        A `call` whose answer has ages remembers the latter.
         """
         if self.limits.now == "wall" or latest is None:
             return wall
@@ -205,7 +212,7 @@ class Memory:
 
 
 class _StageTimer:
-    # A class: as generators, the timers of a question about one moment took 10 % of its time.
+    # No `contextmanager`: its generators took 10 % of the time of a question about one moment.
 
     __slots__ = ("_begin", "_stage", "_stages")
 
@@ -220,7 +227,11 @@ class _StageTimer:
 
 
 class Stages:
-    """How long one call spent where (`index`, `read`, `extract`, `wait`); `spent` has ns."""
+    """How long one call spent in each stage: `index`, `read`, `extract`, `wait`.
+
+    Attributes:
+        spent: by stage, ns.
+    """
 
     __slots__ = ("spent",)
 
@@ -232,7 +243,7 @@ class Stages:
         self.spent[stage] = self.spent.get(stage, 0) + spent
 
     def timed(self, stage: str) -> _StageTimer:
-        """Returns a context manager that adds the time that its block takes."""
+        """Returns a context manager that adds the time of its block to a stage."""
         return _StageTimer(self, stage)
 
     def as_ms(self) -> dict[str, float]:
@@ -241,27 +252,29 @@ class Stages:
 
 
 WAIT: Final = "wait"
-"""The stage of a call that waits until it may hold much of a bag; it is part of another one."""
+"""The stage in which a call waits for its turn to hold much of a bag; part of another stage."""
 READING_S: Final = 4.0
-"""How long a call reads bags that are not stored, before its answer is partial."""
+"""After reading bags that are not stored for so long, a call gives a partial answer."""
 
 
 @dataclass(slots=True)
 class Call:
-    """One call: when it must be over, and where its time went.
+    """One call: its deadline, where its time went, and what its answer is made of.
 
     Attributes:
+        deadline: when it must be over.
+        stages: where its time went.
         used_active: whether the answer is partly from a bag that is still being written.
-        used_thinned: whether it is partly from a day of which only some messages stayed.
-        asked: the times that the question is about, where these are known: the rest does not count
-            for that.
-        robots: those of a fleet that it may ask about; None for all.
-        rows_in: rows that end outside of it are dropped by who asks, so they may be left out; they
-            count all the same. None for all.
-        now: what the answer's ages count from, where that is not the wall clock.
-        older: up to which log time (inclusive) there are bags that it was not shown, as those of a
-            lake are shown some days at a time; None where it was shown all, `MAX_NS` before any.
-        stored: whether it makes what follows from what is stored, and leaves out other bags.
+        used_thinned: whether the answer is partly from a thinned day, at a time in `asked`.
+        asked: the times that the question is about; empty if unknown.
+        robots: the robots of a fleet that it may ask about; None for all.
+        rows_in: the window in which a row of the reply must end to be shown; other rows are counted
+            only. None for all.
+        now: the time that the answer's ages count from, if not the wall clock's.
+        older: the last log time of bags that the call was not shown: a lake is shown some days at a
+            time. None if it was shown all bags, `MAX_NS` before the first snapshot.
+        stored: whether it fills the store with what follows from stored bags. Other bags are left
+            out then.
     """
 
     deadline: Deadline = field(default_factory=Deadline.never)
@@ -276,20 +289,20 @@ class Call:
     stored: bool = False
 
     def saw(self, snapshot: Snapshot) -> None:
-        """Lowers `older` to that of a snapshot that the call was shown; None once one had all."""
+        """Updates `older` by a snapshot that the call was shown."""
         if snapshot.older is None or self.older is None:
             self.older = None
         else:
             self.older = min(self.older, snapshot.older)
 
     def note_thinned(self, first: Ns, last: Ns) -> None:
-        """Records that messages between two log times are from a thinned day."""
+        """Records that messages between two log times were read from a thinned day."""
         self.used_thinned |= not self.asked or any(
             window.overlaps(first, last) for window in self.asked
         )
 
     def wants(self, row_end: Ns) -> bool:
-        """Returns whether a row that ends then may not be left out."""
+        """Returns whether a row of the reply that ends then must be shown."""
         return self.rows_in is None or self.rows_in.contains(row_end)
 
     def within(self, budget_s: float) -> Call:
@@ -297,10 +310,10 @@ class Call:
         return replace(self, deadline=self.deadline.within(budget_s))
 
     def partial_after(self, budget_s: float) -> Deadline:
-        """Returns when an answer is given with what was read until then, `budget_s` from now.
+        """Returns the deadline after which the call answers with what it has read.
 
-        To wait for others does not count. A call that may take as long as it needs
-        (`Deadline.never()`) is answered whole.
+        It is `budget_s` seconds from now; waiting for other calls does not count. A call without a
+        deadline (`Deadline.never()`) reads everything.
         """
         if self.deadline.at_s == math.inf:
             return self.deadline
@@ -310,7 +323,7 @@ class Call:
         return time.monotonic() - unix_from_ns(self.stages.spent.get(WAIT, 0))
 
     def reading(self, large: LargeReads) -> AbstractContextManager[None]:
-        """Returns the block in which this call reads, and may have to wait for its turn."""
+        """Returns a context manager for reading: it waits for the call's turn if need be."""
         return large.during(self._require_time, partial(self.stages.add, WAIT))
 
     def _require_time(self) -> None:
@@ -325,15 +338,15 @@ class Call:
 class Latching:
     """Decides which topics are latched: their last message holds until the next, however old.
 
-    Durability alone does not: PX4 publishes telemetry of 100 Hz as transient local, and `/rosout`
-    is transient local everywhere. A topic is latched where it is transient local, no log, and has a
-    message every 5 s or less often over its recording (see `is_rare`); so are the topics of static
-    transforms, which some writers record without QoS. The configuration overrides this by topic.
+    Durability is not enough: PX4 publishes telemetry of 100 Hz as transient local, and `/rosout` is
+    always transient local. A topic is latched if it is transient local, no log, and rare in its
+    recording (see `Pace.is_rare`). Topics of static transforms are latched even if their writers
+    record no QoS. The configuration overrides this by topic.
 
     Attributes:
-        static_topics: those of static transforms.
+        static_topics: the topics of static transforms.
         include: names or globs of topics that are latched whatever their publishers offer.
-        exclude: names or globs of topics that are not; it wins.
+        exclude: names or globs of topics that are not latched; stronger than `include`.
     """
 
     static_topics: tuple[str, ...] = ()
@@ -342,13 +355,13 @@ class Latching:
 
     def may_hold(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether some message of a topic may be latched."""
-        return self._whatever_pace(snapshot, topic) is not False
+        return self._without_pace(snapshot, topic) is not False
 
     def holds(self, snapshot: Snapshot, stored: StoredMessage) -> bool:
         """Whether a message is latched, by the pace of its topic in its own recording."""
-        settled = self._whatever_pace(snapshot, stored.topic)
-        if settled is not None:
-            return settled
+        decided = self._without_pace(snapshot, stored.topic)
+        if decided is not None:
+            return decided
         if is_carried(stored.bag.file):
             origin = origin_of(stored.record.channel)
             return origin is None or not origin.often
@@ -357,19 +370,19 @@ class Latching:
     def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether a topic is latched, by its pace in the newest recording that holds it.
 
-        Carried messages count as a recording only where there is no other.
+        Carried messages count as a recording only if there is no other.
         """
-        settled = self._whatever_pace(snapshot, topic)
-        if settled is not None:
-            return settled
+        decided = self._without_pace(snapshot, topic)
+        if decided is not None:
+            return decided
         last = {path: last for path, (_, last) in snapshot.timeline.recordings(topic).items()}
         newest = max(
             last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
         )
         return newest is not None and snapshot.timeline.pace(topic, newest).is_rare
 
-    def _whatever_pace(self, snapshot: Snapshot, topic: str) -> bool | None:
-        """Returns whether a topic is latched; None where that depends on its pace."""
+    def _without_pace(self, snapshot: Snapshot, topic: str) -> bool | None:
+        """Returns whether a topic is latched; None if that depends on its pace."""
         if any(match_topics((topic,), glob) for glob in self.exclude):
             return False
         if topic in self.static_topics or any(
@@ -380,18 +393,18 @@ class Latching:
 
 
 NoteKey: TypeAlias = "tuple[Reason, str, Ns, Ns]"
-"""The kind of a note, the file that it is on, and the log times between which it is."""
+"""Kind, file, since and until of a note."""
 
 
 class Note(NamedTuple):
-    """What is wrong with one file (or topic, or recording); all of a kind make one sentence.
+    """What is wrong with one file, topic or recording. Notes of one kind make one sentence.
 
     Attributes:
         kind: the sentence.
-        file: its name as replies have it.
-        detail: what is special about this one; may be empty.
-        since: no part of it is before this log time.
-        until: none is after this one.
+        file: the name of the file, topic or recording in replies.
+        detail: what is special about it; may be empty.
+        since: first log time that it concerns.
+        until: last log time that it concerns (inclusive).
     """
 
     kind: Reason
@@ -405,10 +418,9 @@ class Notes:
     """Collects notes, each once.
 
     Attributes:
-        complete: False once something that bears on the answer could not be read.
-        added: how many notes on files were added, again or not, and how many messages were left
-            out that cannot be decoded. What was computed while it stays the same was read whole;
-            `keys` would not show that a file failed twice.
+        complete: False once something could not be read that the answer needs.
+        added: how many times a file could not be read, or a message not be decoded. If a
+            computation leaves it the same, all of its data was read, and it may be remembered.
     """
 
     def __init__(self) -> None:
@@ -419,7 +431,7 @@ class Notes:
         self._remarks: dict[str, tuple[str, ...]] = {}
 
     def add(self, *notes: str | Note) -> None:
-        """Adds sentences, or notes that share one with others of their kind."""
+        """Adds sentences, and notes that become one sentence for each kind."""
         for note in notes:
             if isinstance(note, str):
                 self._sentences.setdefault(note)
@@ -434,9 +446,9 @@ class Notes:
 
     @contextmanager
     def isolated(self) -> Iterator[None]:
-        """Within the block, `complete` is about the block alone.
+        """Has `complete` tell within the block only about the block.
 
-        So a result that was computed from readable bags is stored, whatever failed before.
+        So a result is remembered if all of its own bags could be read, whatever failed before.
         """
         before, self.complete = self.complete, True
         try:
@@ -445,27 +457,27 @@ class Notes:
             self.complete = self.complete and before
 
     def sentences(self) -> tuple[str, ...]:
-        """Returns the sentences for the reply: those that files share, then the others as added.
+        """Returns the sentences for the reply: one for each kind of note, then all others.
 
-        Which file is read first, and for what, depends on which bags are stored, and the reply must
-        not: so the shared ones are sorted.
+        The first are sorted. In which order files are read depends on the store, and a reply must
+        not.
         """
         by_kind: dict[Reason, dict[str, str]] = {}
         for note in _farthest(self._notes.values()):
-            # A sentence on the bag's summary may report the same already.
+            # Another sentence may have reported it already, from the summary of the bag.
             if note.detail not in self._remarks.get(note.file, ()):
                 by_kind.setdefault(note.kind, {})[note.file] = note.detail
         shared = sorted(kind.sentence(files) for kind, files in by_kind.items())
         return (*shared, *self._sentences)
 
     def add_remarks(self, bags: Iterable[BagFile]) -> None:
-        """Records that sentences already have what the summaries of these bags remark."""
+        """Records that sentences have reported the remarks of these bags' summaries."""
         self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
 
     def notes_cover_remarks(self, bag: BagFile) -> bool:
-        """Returns whether the notes on a bag have all remarks of its summary.
+        """Returns whether the notes on a bag report all remarks of its summary.
 
-        False where a sentence has them (`add_remarks`): then such notes are left out.
+        False if a sentence reported them (`add_remarks`): it replaces the notes.
         """
         name = short_name(bag.path)
         if name in self._remarks:
@@ -475,16 +487,15 @@ class Notes:
         return details.issuperset(bag.summary.remarks)
 
     def keys(self) -> frozenset[NoteKey]:
-        """Returns which notes there are, for `retract_outside`."""
+        """Returns the keys of all notes, for `retract_outside`."""
         return frozenset(self._notes)
 
     def retract_outside(
         self, *windows: TimeWindow, keep: Collection[NoteKey] = frozenset()
     ) -> None:
-        """Removes the notes on what lies outside of all windows, except those to `keep`.
+        """Removes the notes that concern none of the windows, except the notes to `keep`.
 
-        For a question about these alone: what is read besides depends on what is stored, and the
-        reply must not.
+        What else was read depends on the store, and a reply must not.
         """
         self._notes = {
             key: note
@@ -494,11 +505,11 @@ class Notes:
 
 
 def _farthest(notes: Iterable[Note]) -> Iterable[Note]:
-    """Returns, of the notes of each kind on each file, the one that reaches farthest."""
-    in_order = sorted(notes, key=attrgetter("until", "since"))
-    return {(note.kind, note.file): note for note in in_order}.values()
+    """Returns one note for each kind and file: the one that reaches farthest."""
+    ascending = sorted(notes, key=attrgetter("until", "since"))
+    return {(note.kind, note.file): note for note in ascending}.values()
 
 
 def short_name(path: Path) -> str:
-    """Returns a bag's name for a reply: recording and file, never a path of this machine."""
+    """Returns the name of a bag in replies: recording and file, never a path of this machine."""
     return f"{path.parent.name}/{path.name}"

@@ -2,20 +2,19 @@
 
 The first few of each kind are named, and the others counted:
 
-- files that were not read at all: damaged, or of a kind that is not read here. Such a file has no
-  readable times, so it counts where its recording and its own date place it (see
-  `index.snapshot`): an old one that nobody removes is not part of every answer for ever.
-  Where the answer is that there is nothing, it counts unless it is known to lie elsewhere.
-- splits that the metadata.yaml of a recording lists and that are missing, for searches and answers
-  that there is nothing.
-- the file that is still being written, from the end of the split before it on, or, where what is
-  on disk of it answers, from the end of that on;
-- bags that a crash left open, up to the last time that their files were written to;
-- closed bags of which parts could not be read, or that contradict themselves;
-- gaps, and times before the memory begins, of which retention deleted what was recorded;
+- files that were not read at all: damaged, or of a kind that is not read here. The times of such a
+  file are estimated by its recording and its mtime (see `index.snapshot`), so that an old one is
+  not noted in every answer for ever. If the answer is that there is nothing, it counts unless it
+  certainly lies elsewhere;
+- missing splits that a metadata.yaml lists, for searches and answers that there is nothing;
+- the file that is being written, from its last readable message on, or from the end of the split
+  before it;
+- bags that a crash left open, up to their mtime;
+- closed bags that could not be read whole, or that contradict themselves;
+- gaps, and times before the memory begins, in which retention deleted what was recorded;
 - messages that the recorder found to be missing (`bag_dir.state_files`);
-- stretches that `recording.exclude_when` excluded;
-- bags that a wrong clock dated, except where the answer is that there is nothing.
+- intervals that `recording.exclude_when` excluded;
+- bags that a wrong clock dated, unless the answer is that there is nothing.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from ros2_memory.core.bag_summary import (
     READ_WITHOUT_INDEXES,
 )
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
-from ros2_memory.core.spans import Spans, overlaps_any, united, without
+from ros2_memory.core.spans import Spans, enclosing, overlaps_any, united, without
 from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -69,9 +68,9 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 _RESTART_NS: Final = 10 * NS_PER_S
-"""What an interruption costs may begin so much earlier, and end so much later."""
+"""Messages may be lost this long before an interruption, and this long after it."""
 _EDGE_NS: Final = 20 * NS_PER_S
-"""So much of a window may lie before or after the memory without a note on what was recorded."""
+"""A window may begin this long before the memory, or end this long after it, without a note."""
 
 
 def note_unread(
@@ -85,45 +84,52 @@ def note_unread(
 ) -> None:
     """Adds notes on data of a window that could not be read.
 
-    With `nothing` the answer is that there is nothing. Then, and after a `search`, splits that are
-    listed and missing count too. `of` says which window it is, for sentences without a time.
-    Without `gaps` none is on times in which nothing was recorded: what is returned shows them.
+    Args:
+        view: of the call.
+        window: of log time.
+        nothing: whether the answer is that there is nothing.
+        search: whether the answer is the result of a search.
+        of: names the window in sentences without a time.
+        gaps: whether there are notes on gaps; if not, the answer itself shows them.
     """
     if window.empty:
         return
-    absent = _absent(view) if nothing or search else ()
+    must_be_complete = nothing or search
+    notes, bag_dir = view.notes, view.bag_dir
+    absent = _absent_files(view) if must_be_complete else ()
     odd = [
         bag
         for bag in view.timeline.faulty(window)
-        # There is no note about bags that a crash left open.
-        if bag.state is BagState.INCOMPLETE or not view.notes.notes_cover_remarks(bag)
+        # No other note says that a crash left a bag open.
+        if bag.state is BagState.INCOMPLETE or not notes.notes_cover_remarks(bag)
     ]
-    view.notes.add(*describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ())
-    if nothing or search:
-        view.notes.add(*describe_thinned(view.snapshot, window))
-    bag_dir = view.bag_dir
+    if gaps:
+        notes.add(*describe_gaps(view, window, explained=window.start <= MIN_NS))
+    if must_be_complete:
+        notes.add(*describe_thinned(view.snapshot, window))
     if os.path.lexists(bag_dir / OWN_FOLDER):
-        view.notes.add(
-            *describe_deleted(view, window),
+        notes.add(
+            *_describe_deleted(view, window),
             *(f"{of}{sentence}" for sentence in describe_lost(bag_dir, window)),
             *(f"{of}{sentence}" for sentence in describe_cut(bag_dir, window)),
             *describe_excluded(bag_dir, window),
         )
-    if (nothing or search) and _are_losses_hidden(bag_dir):
-        view.notes.add_lack(f"{OWN_FOLDER} cannot be read: what was lost or deleted is not known")
-    view.notes.add(*unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd))
-    # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
+    if must_be_complete and _are_losses_hidden(bag_dir):
+        notes.add_lack(f"{OWN_FOLDER} cannot be read: what was lost or deleted is not known")
+    notes.add(*unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd))
+    # With more kinds of remarks, the sentences do not have every remark.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
-        view.notes.add_remarks(odd)
+        notes.add_remarks(odd)
 
 
 def _are_losses_hidden(bag_dir: Path) -> bool:
+    """Whether the folder that records losses exists and cannot be read."""
     own = bag_dir / OWN_FOLDER
     return os.path.lexists(own) and not os.access(own, os.X_OK)
 
 
 def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on days of a window of which only some messages stayed, if there are."""
+    """Yields a sentence if a window has days of which only some messages stayed."""
     days = [bag for bag in snapshot.timeline.thinned if bag.reaches_into(window)]
     if days and overlaps_any(snapshot.timeline.thinned_times, window.start, window.stop - 1):
         span = f"{unix_text(days[0].start)} to {unix_text(max(bag.end for bag in days))}"
@@ -135,7 +141,7 @@ def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
 
 _LOST: Final = (
     ("lost before {they} recorded", ("counter", "rosbag2")),
-    # A publisher that skipped one leaves the same mark as a loss.
+    # A publisher that skips a message looks the same as a loss.
     ("missing by the cadence of header stamps (never published, or lost)", ("stamps",)),
 )
 _CUT: Final = (
@@ -145,31 +151,31 @@ _CUT: Final = (
 
 
 def describe_cut(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence for each reason for which messages of a window were cut out of bags."""
-    return _counted_losses(read_losses(bag_dir, window.start, window.stop), _CUT)
+    """Yields a sentence for each reason why messages of a window were cut out of bags."""
+    return _count_losses(read_losses(bag_dir, window.start, window.stop), _CUT)
 
 
-def _counted_losses(
+def _count_losses(
     losses: Iterable[Loss], kinds: Iterable[tuple[str, Collection[str]]]
 ) -> Iterator[str]:
-    """Yields how many messages of which topics some kinds of losses have."""
-    for what, by in kinds:
+    """Yields a sentence for each kind of loss: how many messages of which topics."""
+    for what, causes in kinds:
         topics = Counter[str]()
         for loss in losses:
-            if loss.by in by:
+            if loss.by in causes:
                 topics[loss.topic] += loss.lost
         if topics:
-            most = sorted(topics.items(), key=lambda item: (-item[1], item[0]))
-            named = listed([f"{topic} ({count})" for topic, count in most])
+            most_first = sorted(topics.items(), key=lambda item: (-item[1], item[0]))
+            named = listed([f"{topic} ({count})" for topic, count in most_first])
             lost = topics.total()
             they = "it was" if lost == 1 else "they were"
             yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
 
 
 def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence for each way in which messages of a window are known to be missing."""
+    """Yields a sentence for each way in which messages of a window were lost."""
     losses = read_losses(bag_dir, window.start, window.stop)
-    yield from _counted_losses(losses, _LOST)
+    yield from _count_losses(losses, _LOST)
     refused = defaultdict[str, Spans](list)
     for loss in losses:
         if loss.by == "refused":
@@ -184,64 +190,66 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
 
 
 def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterator[str]:
-    """Yields a sentence for each reason for which nothing was recorded in a part of a window.
+    """Yields a sentence for each cause of gaps in a window, and one on gaps without a known cause.
 
-    What was deleted or excluded was recorded; what files have that cannot be read may have been.
-    And one where recording ended unexpectedly after the newest data, which no gap shows yet.
-    Without a reason where none is known, unless only gaps that are `explained` are asked for.
+    The latter is left out if only `explained` gaps are wanted. Times that were deleted or excluded
+    are no gaps: they were recorded. An interruption after the newest data has a sentence, too.
     """
-    bag_dir, snapshot, touched = view.bag_dir, view.snapshot, view.gaps(window)
+    bag_dir, snapshot, gaps = view.bag_dir, view.snapshot, view.gaps(window)
     interruptions = [
         loss for loss in read_losses(bag_dir, MIN_NS, MAX_NS) if loss.by in INTERRUPTIONS
     ]
     yield from _describe_open_end(view, window, interruptions)
-    if not touched:
+    if not gaps or (explained and not interruptions):
         return
-    if explained and not interruptions:
-        return
-    texts = defaultdict[tuple[str, str], list[str]](list)
     gone = united([*deleted_spans(bag_dir), *excluded_spans(bag_dir)])
-    absent = _absent(view)
-    for part in chain.from_iterable(_unrecorded(snapshot, gap, gone) for gap in touched):
-        inside = TimeWindow(part[0] + 1, part[1])
-        may_hold = bool(lost_in(snapshot, inside, nothing=True, absent=absent))
-        may_come = being_written(snapshot, inside)
-        for by, start, end in _by_cause(part, interruptions, 0 if may_hold else _RESTART_NS):
-            if (start, end) != part and not by and end - start <= snapshot.shortest_gap:
+    absent = _absent_files(view)
+    texts = defaultdict[tuple[str, str], list[str]](list)
+    for part in chain.from_iterable(_unrecorded_parts(snapshot, gap, gone) for gap in gaps):
+        first, last = part
+        inside = TimeWindow(first + 1, last)
+        is_unread = bool(lost_in(snapshot, inside, nothing=True, absent=absent))
+        is_unexplained_noted = not explained and not being_written(snapshot, inside)
+        margin = 0 if is_unread else _RESTART_NS
+        for cause, start, end in _split_by_cause(part, interruptions, margin):
+            is_remainder = not cause and (start, end) != part
+            if is_remainder and end - start <= snapshot.shortest_gap:
                 continue
-            if window.overlaps(start, end) and (by or not (explained or may_come)):
-                what = "could be read" if may_hold and not by else "was recorded"
-                texts[by, what].append(_span_text(start, end))
-    for (by, what), spans in texts.items():
+            if window.overlaps(start, end) and (cause or is_unexplained_noted):
+                what = "could be read" if is_unread and not cause else "was recorded"
+                texts[cause, what].append(_span_text(start, end))
+    for (cause, what), spans in texts.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
-        because = f", because {INTERRUPTIONS[by]}" if by else ""
+        because = f", because {INTERRUPTIONS[cause]}" if cause else ""
         yield f"nothing {what} from {named}{because}"
 
 
-def _by_cause(
-    part: Span, interruptions: Sequence[Loss], around: Ns
+def _split_by_cause(
+    gap: Span, interruptions: Sequence[Loss], margin: Ns
 ) -> Iterator[tuple[str, Ns, Ns]]:
-    """Yields the interruptions in a part of a gap, and what is left of it, with "" for the cause.
+    """Yields the parts of a gap: cause, start and end. The cause is "" if it is not known.
 
-    One of it reaches up to `around` farther: what had not reached the disk before it was lost as
-    well, and the next start takes time.
+    An interruption explains `margin` more on both sides: messages that had not reached the disk
+    were lost as well, and a restart takes time.
     """
-    left = [part]
+    first, last = gap
+    unexplained = [gap]
     for loss in interruptions:
-        if not (loss.start < part[1] and part[0] < loss.stop):
-            continue
-        rest = without(left, [(loss.start - around, loss.stop + around)])
-        yield from ((loss.by, start, end) for start, end in without(left, rest))
-        left = rest
-    yield from (("", start, end) for start, end in left)
+        if loss.start < last and first < loss.stop:
+            rest = without(unexplained, [(loss.start - margin, loss.stop + margin)])
+            for start, end in without(unexplained, rest):
+                yield loss.by, start, end
+            unexplained = rest
+    for start, end in unexplained:
+        yield "", start, end
 
 
 def _describe_open_end(
     view: View, window: TimeWindow, interruptions: Sequence[Loss]
 ) -> Iterator[str]:
-    """Yields why messages may be missing after the newest data, if it is known.
+    """Yields a sentence if interruptions explain why messages are missing after the newest data.
 
-    Not in a simulation, whose data is dated by another clock.
+    Not with `data.now=latest`: another clock dates the data of a simulation.
     """
     latest = view.snapshot.latest
     if latest is None or view.limits.now == "latest" or window.stop <= latest:
@@ -259,20 +267,17 @@ def _span_text(start: Ns, end: Ns) -> str:
     return f"{unix_text(start)} to {unix_text(end)} ({seconds(end - start)})"
 
 
-def _unrecorded(snapshot: Snapshot, gap: Span, gone: Sequence[Span]) -> Sequence[Span]:
-    """Returns the parts of a gap in which nothing was recorded that was deleted since."""
+def _unrecorded_parts(snapshot: Snapshot, gap: Span, gone: Sequence[Span]) -> Sequence[Span]:
+    """Returns the parts of a gap outside the times of which messages are gone."""
     parts = without([gap], gone)
     if parts == [gap]:
         return parts
-    # Before the first message that was deleted, and after the last, is as little as between others.
+    # Up to the first deleted message, and from the last on, a short pause is as usual as elsewhere.
     return [(start, end) for start, end in parts if end - start > snapshot.shortest_gap]
 
 
 def deleted_between(view: View, window: TimeWindow) -> Spans:
-    """Returns the spans in a window, or around its ends, that retention deleted since.
-
-    Those in gaps, and those before the memory begins unless the window is open there (`MIN_NS`).
-    """
+    """Returns the spans that overlap a window and were deleted as a whole; see `deleted_by_gap`."""
     first, last = window.asked()
     return [
         (start, stop)
@@ -283,9 +288,9 @@ def deleted_between(view: View, window: TimeWindow) -> Spans:
 
 
 def deleted_by_gap(view: View, window: TimeWindow) -> Iterator[tuple[Ns, Spans]]:
-    """Yields the end of each gap that a window overlaps and retention deleted some of, with that.
+    """Yields for each gap in a window its end, and the spans in it that were recorded and deleted.
 
-    First that of the time before the memory, unless the window is open there (`MIN_NS`).
+    The time before the memory comes first, as a gap, unless the window is open there (`MIN_NS`).
     """
     snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
     if not gone:
@@ -293,28 +298,25 @@ def deleted_by_gap(view: View, window: TimeWindow) -> Iterator[tuple[Ns, Spans]]
     gaps: list[tuple[Ns, Spans]] = []
     if window.start > MIN_NS and (earliest := snapshot.earliest) is not None:
         gaps.append((earliest, [(start, min(stop, earliest)) for start, stop in gone]))
-    gaps += (
-        (gap[1], without([gap], _unrecorded(snapshot, gap, gone)))
-        for gap in snapshot.gaps
-        if window.overlaps(*gap)
-    )
+    for gap in snapshot.gaps:
+        first, last = gap
+        if window.overlaps(first, last):
+            gaps.append((last, without([gap], _unrecorded_parts(snapshot, gap, gone))))
     for end, parts in gaps:
         deleted = [(start, stop) for start, stop in parts if stop - start > snapshot.shortest_gap]
         if deleted:
             yield end, deleted
 
 
-def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on what was deleted whole of a window, if some was, and around that."""
+def _describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
     if spans := [_span_text(*span) for span in deleted_between(view, window)]:
         yield f"recorded, and deleted since: {listed(spans[-MAX_NAMED:], len(spans))}"
 
 
 def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
-    """Returns when messages of a topic were deleted, and others of their bags were not.
+    """Returns the spans of a window in which messages of a topic were cut out of their bags.
 
-    By request, or by `retention.topics`. Those intervals (log time, half-open) that overlap the
-    window, in order, joined where they overlap.
+    They are half-open (log time) and united. Messages are cut by request, or by `retention.topics`.
     """
     losses = read_losses(bag_dir, window.start, window.stop)
     gone = (loss for loss in losses if loss.topic == topic and loss.by in {"forgotten", "expired"})
@@ -322,17 +324,17 @@ def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
 
 
 def excluded_spans(bag_dir: Path, window: TimeWindow | None = None) -> Spans:
-    """Returns the intervals (log time, half-open) that overlap a window and were excluded."""
+    """Returns the intervals (log time, half-open) that were excluded and overlap a window."""
     start, stop = (MIN_NS, MAX_NS) if window is None else (window.start, window.stop)
     excluded = excluded_between(bag_dir, start, stop)
     return united(stretch.span for stretch in excluded)
 
 
 def unexcluded(view: View, gaps: Iterable[Span]) -> Iterator[Span]:
-    """Yields the gaps of the recording without what was excluded."""
+    """Yields the parts of gaps that were not excluded."""
     excluded = excluded_spans(view.bag_dir)
     for gap in gaps:
-        yield from _unrecorded(view.snapshot, gap, excluded)
+        yield from _unrecorded_parts(view.snapshot, gap, excluded)
 
 
 def was_removed(view: View, window: TimeWindow) -> bool:
@@ -342,7 +344,7 @@ def was_removed(view: View, window: TimeWindow) -> bool:
 
 
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on the intervals of a window that were excluded."""
+    """Yields a sentence if intervals of a window were excluded."""
     if spans := excluded_spans(bag_dir, window):
         named = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in spans[-MAX_NAMED:]]
         yield (
@@ -369,12 +371,12 @@ def note_edges(view: View, window: TimeWindow) -> None:
 
 
 def _ends_after(window: TimeWindow, latest: Ns) -> bool:
-    """Whether a window was asked to end after the newest data, whose time replies round up."""
+    """Whether a window ends after the newest data. Replies round times up to a microsecond."""
     return window.asked()[1] >= latest + NS_PER_US
 
 
 def seconds(duration: Ns) -> str:
-    """Returns a duration for a sentence: three digits, and to the second or better up to a week."""
+    """Returns a duration for a sentence: with three digits, or in days if longer than a week."""
     length = unix_from_ns(duration)
     if duration > LONGEST_OFF_NS:
         return f"{length / 86_400:.0f} days"
@@ -387,38 +389,43 @@ def unix_text(at: Ns) -> str:
 
 
 def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:
-    """Returns why a search of topics in a window was not complete; empty where it was.
+    """Returns why a search of topics in a window was not complete; empty if it was.
 
-    It was where all that closed files hold of the window was read, and nothing of the topics was
-    deleted out of bags, nor by retention between two bags. A file that is being written
-    does not count: or else no search of a robot that records would be complete.
+    It was complete if all closed files could be read, and nothing in the window was deleted,
+    excluded or cut out. A file that is being written does not count: else no search of a robot that
+    records would be complete.
     """
-    is_complete = view.notes.complete and all(map(is_whole, view.timeline.faulty(window)))
-    if is_complete and not (
-        _are_losses_hidden(view.bag_dir)
-        or lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-        or excluded_between(view.bag_dir, window.start, window.stop)
+    is_incomplete = (
+        not view.notes.complete
+        or not all(map(is_whole, view.timeline.faulty(window)))
+        or _are_losses_hidden(view.bag_dir)
+        or lost_in(view.snapshot, window, nothing=True, absent=_absent_files(view))
+        or was_removed(view, window)
         or any(cut_spans(view.bag_dir, topic, window) for topic in topics)
-        or deleted_between(view, window)
         or any(describe_thinned(view.snapshot, window))
-    ):
+    )
+    if not is_incomplete:
         return ()
     note_unread(view, window, nothing=True)
     return view.notes.sentences()
 
 
-def _absent(view: View) -> Sequence[SetAside]:
+def _absent_files(view: View) -> Sequence[SetAside]:
     return absent_files(view.memory.absent_splits(view.snapshot))
 
 
 def is_whole(bag: BagFile) -> bool:
-    """Whether all messages of an odd bag could be read."""
-    return bag.state is not BagState.INCOMPLETE and all(
-        not note.endswith(MESSAGES_MISSING)
-        if note.startswith(DOUBTS)
-        else note.endswith(READ_WITHOUT_INDEXES) or note == LOG_CLOCK_NOTE
-        for note in bag.summary.notes
-    )
+    """Whether all messages of a bag with notes could be read."""
+    if bag.state is BagState.INCOMPLETE:
+        return False
+    for note in bag.summary.notes:
+        if note.startswith(DOUBTS):
+            is_harmless = not note.endswith(MESSAGES_MISSING)
+        else:
+            is_harmless = note.endswith(READ_WITHOUT_INDEXES) or note == LOG_CLOCK_NOTE
+        if not is_harmless:
+            return False
+    return True
 
 
 def unread_spans(
@@ -429,9 +436,14 @@ def unread_spans(
     absent: Sequence[SetAside],
     odd: Sequence[BagFile],
 ) -> Iterator[str]:
-    """Yields the sentences for a window; none where all of it was read.
+    """Yields sentences on the files that were not read in a window, or not as a whole.
 
-    `odd` are the bags to name of those that are not whole.
+    Args:
+        snapshot: of the bags.
+        window: of log time.
+        nothing: whether the answer is that there is nothing.
+        absent: missing files.
+        odd: bags that are not whole and have to be named.
     """
     if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
         names = [
@@ -458,9 +470,9 @@ def lost_in(
     nothing: bool = False,
     absent: Sequence[SetAside] = (),
 ) -> list[SetAside]:
-    """Returns the files, `absent` ones included, that probably hold some of a window.
+    """Returns the unread files, and `absent` ones, that probably have messages in a window.
 
-    None of them was read at all. With `nothing`, those that may hold some.
+    With `nothing`, files that possibly have some.
     """
     spans = snapshot.unread_bounds if nothing else snapshot.unread_spans
     if absent:
@@ -475,18 +487,19 @@ def lost_in(
 def being_written(
     snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False
 ) -> list[SetAside]:
-    """Returns the files still being written that probably hold some of a window.
+    """Returns the files still being written that probably have messages in a window.
 
-    With `nothing`, those that may hold some.
+    With `nothing`, files that possibly have some.
     """
     spans = snapshot.unread_bounds if nothing else snapshot.unread_spans
     return [aside for aside in snapshot.active if _touches(spans[aside], window, unknown=True)]
 
 
 def _touches(span: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> bool:
+    """Whether a span overlaps a window; `unknown` if the span is not known."""
     if span is None:
         return unknown
-    # Without what the bounds were widened by: a window up to a split's end does not touch the next.
+    # Without the slack of the window: a window up to a split's end does not touch the next split.
     stop = max(window.stop - AT_OR_BEFORE_SLACK_NS, window.start + 1)
     return span.start < stop - 1 and window.start + START_SLACK_NS < span.stop
 
@@ -513,13 +526,16 @@ def _nothing_after(active: Sequence[SetAside], latest: Ns) -> str:
 
 
 def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
-    """Yields one sentence for each remark that bags share, for the remarks of the newest bags."""
+    """Yields a sentence for each remark, with the bags that share it.
+
+    At most `most` remarks are shown, those of the newest bags.
+    """
     names: dict[str, list[str]] = {}
     for bag, remark in reversed(bags):
         names.setdefault(shortened(remark), []).append(short_name(bag.path))
     shown = [*names.items()][:most]
-    for remark, [name, *others] in reversed(shown):
-        subject = f"{len(others) + 1} bags ({listed([name, *others])})" if others else name
+    for remark, files in reversed(shown):
+        subject = f"{len(files)} bags ({listed(files)})" if len(files) > 1 else files[0]
         yield f"{subject}: {remark}"
     more = len(bags) - sum(len(files) for _, files in shown)
     if more:
@@ -527,7 +543,7 @@ def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
 
 
 def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
-    """Yields the sentences on bags that are not whole or contradict themselves."""
+    """Yields sentences on bags that are not whole, or that contradict themselves."""
     remarked = [(bag, "; ".join(bag.summary.remarks)) for bag in bags]
     left_open = [(bag, remark) for bag, remark in remarked if bag.state is BagState.INCOMPLETE]
     if left_open:
@@ -553,10 +569,10 @@ def describe_misdated(faults: Sequence[ClockFault]) -> str:
 
 
 def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | None:
-    """Returns the gap that all of a window lies in: when recording ended, and when it went on.
+    """Returns the gap that a window lies in: when recording ended, and when it went on.
 
-    Before the memory it has no begin, after it no end: None. Returns None alone where something of
-    the window was recorded, also by a bag that a wrong clock dated. An open end of the window is
+    The former is None before the memory, the latter after it. Without a gap, which is if something
+    of the window was recorded, even by a misdated bag, returns None. An open end of the window is
     `MIN_NS` or `MAX_NS`.
     """
     snapshot = view.snapshot
@@ -578,12 +594,11 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
 
 
 def note_unrecorded(view: View, asked: TimeWindow) -> None:
-    """Adds a note on how much of a window was not recorded, if some was not.
+    """Adds a note on how much of a window was recorded, if there are gaps in it.
 
-    It ends now at the latest, unless it begins later; or where the memory does if its end is open
-    (`MAX_NS`).
-
-    None where only pauses are missing that are no gap, and as little before and after the memory.
+    So there is one if the window reaches more than `_EDGE_NS` beyond the memory. Time after now
+    does not count, unless the whole window is later. With an open end (`MAX_NS`), nor does time
+    after the memory.
     """
     earliest, latest, memory = view.snapshot.earliest, view.snapshot.latest, view.memory
     if earliest is None or latest is None:
@@ -593,33 +608,33 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     until = latest if asked.stop >= MAX_NS else memory.now(memory.clock.now(), latest)
     if start < until:
         end = min(end, until)
-    until_end = TimeWindow(start, end)
-    outside = (min(end, earliest) - start, end - max(start, latest))
-    gaps = [last - first for first, last in recording_gaps(view, until_end)]
-    length, missing = end - start, sum(max(span_ns, 0) for span_ns in (*outside, *gaps))
+    counted_window = TimeWindow(start, end)
+    before, after = max(min(end, earliest) - start, 0), max(end - max(start, latest), 0)
+    gaps = [last - first for first, last in recording_gaps(view, counted_window)]
     when = f"between {unix_text(start)} and {unix_text(end)}"
-    deleted = was_removed(view, until_end)
+    deleted = was_removed(view, counted_window)
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(when, deleted=deleted))
-    elif gaps or max(outside) > _EDGE_NS:
+    elif gaps or max(before, after) > _EDGE_NS:
+        length = end - start
+        recorded = max(length - before - after - sum(gaps), 0)
         digits = 0 if length >= 100 * NS_PER_S else 1
-        recorded_s, of_s = (
-            f"{unix_from_ns(lasted):.{digits}f}" for lasted in (max(length - missing, 0), length)
-        )
+        recorded_s = f"{unix_from_ns(recorded):.{digits}f}"
+        of_s = f"{unix_from_ns(length):.{digits}f}"
         what = "here are only" if deleted else "recorded only"
         if recorded_s != of_s:
             view.notes.add(f"{what} {recorded_s} of {of_s} s {when}")
 
 
 def why_nothing(when: str, *, deleted: bool) -> str:
-    """Returns that a time has no messages: none were recorded, or they were deleted since."""
+    """Returns a sentence on a time without messages: not recorded, or deleted since."""
     return f"what was recorded {when} was deleted" if deleted else f"nothing was recorded {when}"
 
 
 def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> Span | None:
-    """Returns the first and the last moment of what the memory has that a window can show.
+    """Returns the first and the last log time of the memory; None without bags.
 
-    Without bags that a wrong clock dated, unless the window has nothing else. None without a bag.
+    Misdated bags count only if the window has no other: then their recordings alone do.
     """
     if snapshot.earliest is None or snapshot.latest is None:
         return None
@@ -627,18 +642,17 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> Span | None:
     if window.overlaps(*reach):
         return reach
     misdated = [fault.bag for fault in snapshot.misdated]
-    shown = {bag.recording for bag in misdated if bag.reaches_into(window)}
-    if not shown:
+    recordings = {bag.recording for bag in misdated if bag.reaches_into(window)}
+    if not recordings:
         return reach
-    # Of whole recordings: where their bags end says nothing.
-    faulty = [bag for bag in misdated if bag.recording in shown]
-    return min(bag.start for bag in faulty), max(bag.end for bag in faulty)
+    # The reach is that of whole recordings: it must not depend on where splits end.
+    return enclosing((bag.start, bag.end) for bag in misdated if bag.recording in recordings)
 
 
 def shown_span(snapshot: Snapshot, window: TimeWindow) -> Span:
-    """Returns from when to when (inclusive) the memory can show a window, by `recorded_reach`.
+    """Returns the first and last moment of a window that the memory can show; see `recorded_reach`.
 
-    It ends before it begins where the memory shows nothing of it.
+    The last is before the first if the memory can show nothing of the window.
     """
     start, end = window.asked()
     first, last = recorded_reach(snapshot, window) or (start, end)
@@ -646,16 +660,13 @@ def shown_span(snapshot: Snapshot, window: TimeWindow) -> Span:
 
 
 def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
-    """Returns the part of a window that the memory can show, by `recorded_reach`."""
+    """Returns the part of a window that the memory can show; see `recorded_reach`."""
     first, last = recorded_reach(snapshot, window) or (window.start, window.stop - 1)
     return window.intersect(TimeWindow(first, last + 1))
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Span]:
-    """Yields where nothing was recorded, by `View.gaps`; of a window, the parts in it.
-
-    A part that only the tolerance of its bounds reaches is left out.
-    """
+    """Yields the gaps (in a window, cut at its bounds); see `View.gaps`."""
     asked = window or TimeWindow.everything()
     for start, end in view.gaps(asked):
         yield max(start, asked.start), min(end, asked.stop)
@@ -664,21 +675,27 @@ def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Spa
 def unknown_times(
     view: View, window: TimeWindow, known: Spans, what: str, *, mixed: Spans
 ) -> Spans:
-    """Returns the recorded times of a window in which something is not known, in order.
+    """Returns the recorded times of a window at which something is not known, in order.
 
-    `known` are the times in which it is: between these, and at the ends of recordings, up to
-    `SILENCE_NS` may pass. It is not at any of the `mixed` times, of which there are two accounts.
-    A note says if `what` is not known at any time.
+    Args:
+        view: of the call.
+        window: of log time.
+        known: when it is known. It stays known for up to `SILENCE_NS` between these times, and at
+            the ends of recordings.
+        what: names it, in a note if it is not known at any time of the window.
+        mixed: when two robots say different things: then it is not known.
     """
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (0, 0)
     around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
     gaps = united(recording_gaps(view))
-    left = without([around], united([*known, *mixed, *gaps]))
-    long = [(begin, stop) for begin, stop in left if stop - begin > SILENCE_NS]
-    uncut = united([*long, *without(mixed, gaps)])
-    cut = [(max(begin, start, first), min(stop, end, last)) for begin, stop in uncut]
-    unknown = [(begin, stop) for begin, stop in cut if begin < stop]
+    between = without([around], united([*known, *mixed, *gaps]))
+    long = [(begin, stop) for begin, stop in between if stop - begin > SILENCE_NS]
+    unknown: Spans = []
+    for begin, stop in united([*long, *without(mixed, gaps)]):
+        inside = max(begin, start, first), min(stop, end, last)
+        if inside[0] < inside[1]:
+            unknown.append(inside)
     if unknown and not any(begin <= end and start <= stop for begin, stop in known):
         view.notes.add(f"{what} is not known at any time of the window")
     return unknown

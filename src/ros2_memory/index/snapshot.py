@@ -1,18 +1,17 @@
 """The bag directory as it is known at one moment.
 
-A file that cannot be read shows nothing of its times; the files around it do:
+A file that cannot be read does not show its times, but the files around it do:
 
     not before   the end of the split before it in its recording, else the time in the name of a
                  recording of this program
     not after    the start of the split after it, else the last time that the file was written to
 
-Between two splits nothing more is known. Where only one side is known, the file is taken to hold a
-day at most: so an old file that nobody removes, or one that was copied here later, does not affect
-answers about other days. Where neither side is known, or the file's own date cannot be true, its
-time is unknown.
+If only one side is known, the file is taken to hold a day at most. So an old file that nobody
+removes, or one that was copied here later, does not affect answers about other days. If neither
+side is known, or if the file's own date cannot be true, its time is unknown.
 
-That a file holds a day at most is an estimate, good enough for a note beside an answer. Where the
-answer is that there is nothing, the file counts wherever it can contain a message.
+A day at most is an estimate, good enough for a note beside an answer. If the answer is that there
+is nothing, the file counts wherever it may contain a message.
 """
 
 from __future__ import annotations
@@ -60,6 +59,7 @@ if TYPE_CHECKING:
 
 
 _MAX_PLACED: Final = 500
+"""Of more files that do not answer, only the last ones are placed in time."""
 
 
 @dataclass(frozen=True)
@@ -68,18 +68,18 @@ class Snapshot:
 
     Attributes:
         timeline: the bags that answer queries, in time order, and what they hold.
-        active: files that are still being written, or held back, with the reason, by path; those
-            that answer as far as they are complete are among `bags` too.
-        damaged: files and directories that cannot be read at all, likewise.
-        unread: files of a kind that another adapter reads, and symbolic links, likewise.
-        empty: closed bags without a message, by path.
-        silent_topics: topics that some bag declares and none has a message of.
+        active: files that are being written or held back, sorted by path. If the complete part of
+            one answers, it is among `bags` too.
+        damaged: files and directories that cannot be read at all, sorted by path.
+        unread: files of a kind that another adapter reads, and symbolic links, sorted by path.
+        empty: closed bags without a message, sorted.
+        silent_topics: topics that some bag declares and no bag has a message of.
         scanned_at: when the directory was scanned.
         problem: why the bag directory itself could not be read.
         metadata_folders: folders with a metadata.yaml.
-        copies: bags that are byte for byte the same as others in their folder, which answer.
-        older: up to which log time (inclusive) there are older bags, which are not in it: those of
-            a lake are shown some days at a time. None where all are.
+        copies: bags that are left out as copies of others in their folder.
+        older: the last log time of older bags that are left out: a lake is shown some days at a
+            time. None if no bags are.
     """
 
     timeline: Timeline = field(default_factory=Timeline, repr=False, compare=False)
@@ -96,21 +96,21 @@ class Snapshot:
 
     @property
     def bags(self) -> Sequence[BagFile]:
-        """What answers queries: bags that are closed, or left open by a crash, and not empty.
+        """The bags that answer queries, sorted by (start, end, path).
 
-        In the order (start, end, path). The bag of carried latched messages is not among them, but
-        is found wherever a topic is asked for.
+        They are closed, or left open by a crash, and have messages. The bag of carried latched
+        messages is not among them, but is found wherever a topic is asked for.
         """
         return self.timeline.recorded
 
     @property
     def earliest(self) -> Ns | None:
-        """Log time of the first message in any correctly dated bag; None without one."""
+        """Log time of the first message in a correctly dated bag; None without bags."""
         return self._dating_by_times.earliest
 
     @property
     def latest(self) -> Ns | None:
-        """Log time of the last message (inclusive) in such a bag; None without one."""
+        """Log time of the last message (inclusive) in a correctly dated bag; None without bags."""
         return self._dating_by_times.latest
 
     @cached_property
@@ -132,17 +132,19 @@ class Snapshot:
 
     @cached_property
     def _dated_segments(self) -> Sequence[Segment]:
-        """The bags that a correct clock dated, without that of carried messages, in order."""
+        """The correctly dated bags, without the bag of carried messages, in order."""
         return dated_segments(self.timeline, self.dating.faults)
 
     @property
     def whole_segments(self) -> Iterator[Segment]:
-        """The bags that a correct clock dated, and that have every message that was recorded."""
-        return filter(None, (segment.unthinned for segment in self._dated_segments))
+        """The correctly dated bags that have every message that was recorded."""
+        for segment in self._dated_segments:
+            if segment.unthinned is not None:
+                yield segment.unthinned
 
     @cached_property
     def _periods(self) -> dict[str, Ns]:
-        """The usual period of each topic; not of logs, whose lines come when something happens."""
+        """The usual period of each topic that has one; logs have none."""
         by_topic: dict[str, list[Pacing]] = {}
         for segment in self.whole_segments:
             for topic, pacing in segment.pacings.items():
@@ -170,7 +172,7 @@ class Snapshot:
         return tuple(silences(self._periods, self._runs, together, self.gaps))
 
     def prolonged(self, silence: Silence) -> Silence:
-        """Returns a silence that deleted bags showed, as it went on in later ones."""
+        """Returns a silence that began in deleted bags, prolonged by what later bags show."""
         if not silence.goes_on:
             return silence
         return prolonged_silence(
@@ -179,7 +181,7 @@ class Snapshot:
 
     @cached_property
     def _robot_on(self) -> Sequence[Span]:
-        """When the robot was on, by all topics that have a usual rate."""
+        """When the robot was on, by all topics with a usual rate."""
         return robot_on_times([self._runs[topic] for topic in self._periods])
 
     def shortest_silence(self, topic: str) -> Ns:
@@ -187,15 +189,16 @@ class Snapshot:
         return shortest_silence(self._periods.get(topic, 0))
 
     def longest_silence(self, topic: str) -> Ns:
-        """Returns for how long others were recorded, at most, between two messages of a topic."""
-        pauses = () if self.timeline.is_log(topic) else pairwise(self._runs.get(topic, ()))
-        return max(
-            (stop - start - length_in(self.gaps, start, stop) for (_, start), (stop, _) in pauses),
-            default=0,
-        )
+        """Returns the longest time (ns) without a message of a topic, gaps not counted."""
+        if self.timeline.is_log(topic):
+            return 0
+        longest = 0
+        for (_, end), (start, _) in pairwise(self._runs.get(topic, ())):
+            longest = max(longest, start - end - length_in(self.gaps, end, start))
+        return longest
 
     def totals(self, topic: str) -> list[TopicTotals]:
-        """Returns what correctly dated bags hold of a topic, in parts."""
+        """Returns the totals of a topic in correctly dated bags, for each segment and type."""
         return [
             totals
             for segment in self._dated_segments
@@ -204,12 +207,15 @@ class Snapshot:
 
     @cached_property
     def newest_stretch(self) -> Ns | None:
-        """First log time after the newest gap of more than `LONGEST_OFF_NS`; None without a bag."""
+        """The first log time after the newest gap of more than `LONGEST_OFF_NS`.
+
+        None without bags.
+        """
         begin = reach = None
         for segment in self._dated_segments:
-            bags, (first, *_) = segment.bags, segment.first
-            spans = [(first, segment.latest)]
-            if segment.latest - first > LONGEST_OFF_NS:
+            bags, start, end = segment.bags, segment.bags[0].start, segment.latest
+            spans = [(start, end)]
+            if end - start > LONGEST_OFF_NS:
                 spans = [*zip(bags.starts.tolist(), bags.ends.tolist(), strict=True)]
             for start, end in spans:
                 if reach is None or start - reach > LONGEST_OFF_NS:
@@ -221,27 +227,27 @@ class Snapshot:
     def gaps(self) -> Sequence[Span]:
         """Where nothing was recorded: from the last message before to the first after, in order.
 
-        Between bags or within one; see `index.holes`. Carried messages and bags that a wrong clock
-        dated do not count. A step forward of the clock looks alike: see `View.gaps`.
+        A gap lies between bags or within one; see `index.holes`. Carried messages and bags that a
+        wrong clock dated do not count. A step forward of the clock looks like a gap: see
+        `View.gaps`.
         """
-        # Each bag of several that hold the same has it.
+        # Several bags of one time each show the same gap.
         return sorted({pause.span for pause in self._rhythm.gaps(self.pauses)})
 
     @cached_property
     def breaks(self) -> Sequence[Span]:
-        """Those gaps after which another run of a recorder began."""
-        pauses = [*self._rhythm.gaps(self.pauses)]
-        within_runs = {pause.span for pause in pauses if pause.ran_on}
+        """The gaps after which another run of a recorder began."""
+        within_runs = {pause.span for pause in self._rhythm.gaps(self.pauses) if pause.ran_on}
         return [gap for gap in self.gaps if gap not in within_runs]
 
-    @cached_property
+    @property
     def shortest_gap(self) -> Ns:
-        """How long a pause between two recordings may be without being one of `gaps`."""
+        """The length (ns) that a pause between two recordings must exceed to be one of `gaps`."""
         return self._rhythm.shortest_gap
 
     @cached_property
     def suspects(self) -> Sequence[Pause]:
-        """Where the clock may have been set forward, as a recorder ran on, in order of time."""
+        """Pauses of running recorders in which the clock may have been set forward, in order."""
         return self._rhythm.suspects(self.pauses)
 
     @cached_property
@@ -250,12 +256,14 @@ class Snapshot:
 
     @cached_property
     def pauses(self) -> Sequence[Pause]:
-        """Where no dated bag has a message for a while, in order of time."""
+        """Where no correctly dated bag has a message for a while, in order of time."""
         pauses: list[Pause] = []
         newest: BagFile | None = None
         for segment in self._dated_segments:
-            if newest is not None:
-                # Bags of other parts may last into this one.
+            if newest is None:
+                pauses += segment.pauses
+            else:
+                # A bag of an earlier segment may last into this one.
                 reach = newest.end
                 if segment.bags[0].start - reach > SHORTEST_PAUSE_NS:
                     pauses.append(pause_between(newest, segment.bags[0]))
@@ -264,45 +272,42 @@ class Snapshot:
                     for pause in segment.pauses
                     if pause.end - reach > SHORTEST_PAUSE_NS
                 )
-            else:
-                pauses += segment.pauses
             for pause in segment.pauses_within:
-                pauses += self._shared_parts(pause)
+                pauses += self._parts_shared_by_all(pause)
             if newest is None or segment.latest > newest.end:
                 newest = segment.newest
         return sorted(pauses, key=lambda pause: pause.span)
 
-    def _shared_parts(self, pause: Pause) -> Iterator[Pause]:
+    def _parts_shared_by_all(self, pause: Pause) -> Iterator[Pause]:
         """Yields the parts of a bag's pause in which no other bag has a message either."""
-        inside = TimeWindow(pause.start + 1, pause.end)
-        others = united(
-            span
-            for bag in self.timeline.overlapping(inside)
-            if bag not in pause.bags and not is_carried(bag.file)
-            if bag.file not in self.dating.misdated
-            for span in without([(bag.start, bag.end)], bag.summary.schema.pauses)
-        )
+        others: list[Span] = []
+        for bag in self.timeline.overlapping(TimeWindow(pause.start + 1, pause.end)):
+            is_counted = not is_carried(bag.file) and bag.file not in self.dating.misdated
+            if is_counted and bag not in pause.bags:
+                others += without([(bag.start, bag.end)], bag.summary.schema.pauses)
         parts = [
             (start, end)
-            for start, end in without([pause.span], others)
+            for start, end in without([pause.span], united(others))
             if end - start > SHORTEST_PAUSE_NS
         ]
         for start, end in parts:
-            # With another recording in the middle of it, the clock was set more likely than not.
+            # Another recording in the middle of the pause makes a step of the clock likely.
             yield pause._replace(start=start, end=end, ran_on=pause.ran_on and len(parts) == 1)
 
     @cached_property
     def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:
-        """When messages of the files that do not answer may have been recorded; None: unknown.
+        """When files that do not answer were probably recorded; None if unknown.
 
-        Of very many files that cannot be read only the last ones are looked at.
+        An estimate: see `unreadable_span`.
         """
-        closed = (*self.damaged, *self.unread)
-        return {
-            **{aside: self._unread_span(aside, growing=True) for aside in self.active},
-            **dict.fromkeys(closed),
-            **{aside: self._unread_span(aside, growing=False) for aside in closed[-_MAX_PLACED:]},
+        spans: dict[SetAside, TimeWindow | None] = {
+            aside: self._unread_span(aside, growing=True) for aside in self.active
         }
+        closed = (*self.damaged, *self.unread)
+        spans.update(dict.fromkeys(closed))
+        for aside in closed[-_MAX_PLACED:]:
+            spans[aside] = self._unread_span(aside, growing=False)
+        return spans
 
     def _unread_span(self, aside: SetAside, *, growing: bool) -> TimeWindow | None:
         if aside.until is not None:
@@ -313,18 +318,18 @@ class Snapshot:
 
     @cached_property
     def unread_bounds(self) -> Mapping[SetAside, TimeWindow | None]:
-        """Bounds outside of which the files that do not answer contain no message.
+        """By file that does not answer, bounds outside of which it has no message; None: anywhere.
 
-        Wider than `unread_spans`, which estimate how much a file holds. None: anywhere.
+        Wider than `unread_spans`: nothing is estimated.
         """
         return self.bounds_of((*self.damaged, *self.unread, *self.active))
 
     def bounds_of(self, files: Sequence[SetAside]) -> Mapping[SetAside, TimeWindow | None]:
-        """Returns `unread_bounds` of any files, even if they do not exist any more."""
-        return {
-            **dict.fromkeys(files),
-            **{file: self._bounds(file) for file in files[-_MAX_PLACED:]},
-        }
+        """Returns `unread_bounds` of any files, even of files that do not exist any more."""
+        bounds: dict[SetAside, TimeWindow | None] = dict.fromkeys(files)
+        for file in files[-_MAX_PLACED:]:
+            bounds[file] = self._bounds(file)
+        return bounds
 
     def _bounds(self, aside: SetAside) -> TimeWindow | None:
         if aside.until is not None:
@@ -342,19 +347,19 @@ class Snapshot:
 
 
 def _after(until: Ns) -> TimeWindow:
-    """Returns the times behind what was read of a file that goes on."""
+    """Returns the times after the last message that was read of a growing file."""
     return TimeWindow(min(until + 1, MAX_NS), MAX_NS)
 
 
 def unreadable_span(
     recording: str, near: Neighbours, written: Ns | None, now: Ns, *, growing: bool = False
 ) -> TimeWindow | None:
-    """Returns the log times between which all messages of a file lie; None where unknown.
+    """Returns the log times between which a file's messages probably lie; None if unknown.
 
     Args:
         recording: the name of the file's folder.
         near: the splits around it.
-        written: the file's mtime; None where unknown.
+        written: the file's mtime; None if unknown.
         now: the present.
         growing: whether the file is still being written.
     """
@@ -370,8 +375,9 @@ def unreadable_span(
     if start is None:
         return None if end is None else TimeWindow(end - MAX_FILE_NS, end)
     longest = min(start + MAX_FILE_NS, MAX_NS)
-    # A file last written before its start was recorded by another clock than its file system's.
-    return TimeWindow(start, longest if end is None or end <= start else min(end, longest))
+    # If the file was last written before its start, its file system has another clock.
+    is_plausible = end is not None and end > start
+    return TimeWindow(start, min(end, longest) if end is not None and is_plausible else longest)
 
 
 def unreadable_bounds(
@@ -379,7 +385,7 @@ def unreadable_bounds(
 ) -> TimeWindow | None:
     """Returns the log times outside of which a closed file has no message; None: anywhere.
 
-    As `unreadable_span`, without the estimate of how much a file holds. Splits between which the
+    Does not estimate how much a file holds, as `unreadable_span` does. Splits between which the
     clock was set back bound nothing.
     """
     start = named_start(recording) if near.before is None else near.before
@@ -392,7 +398,7 @@ def unreadable_bounds(
 
 
 def _last_written(written: Ns | None, now: Ns) -> Ns | None:
-    """Returns the latest log time that a file can have, by its mtime; None where that cannot be."""
+    """Returns the latest log time in a file by its mtime; None if the mtime is not plausible."""
     if written is None or not FIRST_BAGS_NS <= written <= max_plausible(now):
         return None
     return min(written + FUTURE_NS, MAX_NS)

@@ -1,8 +1,8 @@
 """The splits of a recording in the order in which they were written, whatever their times are.
 
-`ros2 bag record` names its files after the folder and numbers them (`rec_3.mcap`). Those numbers
-are the only order that a clock cannot spoil: they show where the clock was set back, and which
-splits lie on both sides of one that cannot be read.
+`ros2 bag record` names its files after the folder and numbers them (`rec_3.mcap`). The numbers are
+the only order that a clock cannot spoil: they show where the clock was set back, and which splits
+lie around an unreadable one.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from ros2_memory.index.timeline import Timeline
 
 Series: TypeAlias = str
-"""The path of a bag file without its number: what the files of one recording share."""
+"""The path of a bag file without its number and suffixes: all splits of a recording share it."""
 
 
 class Neighbours(NamedTuple):
-    """The end of the split before and the start of the one after (inclusive); None without one."""
+    """The splits around a file: the last log time before it and the first after it, if known."""
 
     before: Ns | None = None
     after: Ns | None = None
 
 
 class StepBack(NamedTuple):
-    """A clock that was set back while a recording ran: `after` begins `by` before `before` ends.
+    """A clock that was set back during a recording: `after` begins `by` before `before` ends.
 
-    Both are one bag where that happened while it was being written.
+    If the clock was set back within a bag, both are that bag.
     """
 
     before: BagFile
@@ -50,14 +50,14 @@ class StepBack(NamedTuple):
 
 
 class SplitName(NamedTuple):
-    """What the name of a bag file says: its series, and its number there."""
+    """The series of a bag file, and its number in the series."""
 
     series: Series
     number: int
 
 
 class Stem(NamedTuple):
-    """What the paths of bags share: their series, zeros before the number, and the suffixes."""
+    """What the paths of splits share: the series, zeros before the number, and the suffixes."""
 
     series: Series
     zeros: str
@@ -65,12 +65,12 @@ class Stem(NamedTuple):
 
 
 class SplitNames(NamedTuple):
-    """The paths of some bags.
+    """The paths of many bags, in little memory.
 
     Attributes:
-        stems: the different ones, in order of the bags.
-        positions: for each bag, where its stem is among these.
-        numbers: of the bags in their series; -1 where the name has none.
+        stems: the different stems.
+        positions: for each bag, the index of its stem.
+        numbers: for each bag, its number in the series; -1 if its name has none.
     """
 
     stems: Sequence[Stem]
@@ -86,19 +86,19 @@ def stem_of(file: str) -> str:
 
 
 def split_of(file: str) -> SplitName | None:
-    """Returns the series of a bag file and its number there; None where its name has no number."""
+    """Returns the series of a bag file and its number; None if its name has no number."""
     stem = stem_of(file)
     series = stem.rstrip("0123456789")
     return None if series == stem else SplitName(series, int(stem[len(series) :]))
 
 
 def split_names_of(files: Iterable[str]) -> SplitNames:
-    """Returns what the names of bags say, which are paths."""
+    """Returns the paths of bags split into stems and numbers."""
     position_of: dict[Stem, int] = {}
     positions, numbers = list[int](), list[int]()
     following, position, number, stem = "", 0, 0, Stem("", "", "")
     for file in files:
-        # Mostly the bag after one is the next split.
+        # Mostly the next bag is the next split: then there is nothing to parse.
         if file == following:
             number += 1
         else:
@@ -110,34 +110,34 @@ def split_names_of(files: Iterable[str]) -> SplitNames:
         positions.append(position)
         numbers.append(number)
         following = f"{stem.series}{stem.zeros}{number + 1}{stem.suffix}"
-    # A date with microseconds has 20 digits.
+    # A date with microseconds is a number of 20 digits: too many for 64 bits.
     dtype = np.int64 if max(numbers, default=0) <= MAX_NS else object
     return SplitNames([*position_of], np.array(positions, np.uint16), np.array(numbers, dtype))
 
 
 def is_recording(series: Series) -> bool:
-    """Returns whether files are named as `ros2 bag record` names the splits of a recording."""
+    """Returns whether a series is named as `ros2 bag record` names splits: after its folder."""
     folder, _, prefix = series.rpartition("/")
     return prefix == f"{folder.rpartition('/')[2]}_"
 
 
 def steps_of(timeline: Timeline) -> list[StepBack]:
-    """Returns where the clock was set back between two splits of a recording that follow.
+    """Returns where the clock was set back between two consecutive splits of a recording.
 
-    Those that are damaged are passed over: their times may be, too.
+    Damaged bags are passed over: their times may be wrong.
     """
-    position_of: dict[Series, int] = {}
-    all_series, all_numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    code_of: dict[Series, int] = {}
+    all_codes, all_numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for rows in (segment.bags for segment in timeline.segments):
         stems, positions, numbers = rows.names
-        of_stems = [
-            position_of.setdefault(series, len(position_of)) if is_recording(series) else -1
-            for series, *_ in stems
+        codes_of_stems = [
+            code_of.setdefault(stem.series, len(code_of)) if is_recording(stem.series) else -1
+            for stem in stems
         ]
         is_damaged = rows.with_schema(attrgetter("is_damaged"))
-        all_series.append(np.where(is_damaged, -1, np.array(of_stems)[positions]))
+        all_codes.append(np.where(is_damaged, -1, np.array(codes_of_stems)[positions]))
         all_numbers.append(numbers)
-    series, numbers = np.concatenate(all_series), np.concatenate(all_numbers)
+    series, numbers = np.concatenate(all_codes), np.concatenate(all_numbers)
     bags, starts, ends = timeline.bags, timeline.starts, timeline.ends
     order = np.lexsort((numbers, series))
     before, after = order[:-1], order[1:]
@@ -156,15 +156,18 @@ def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
     name = split_of(file)
     if name is None:
         return Neighbours()
-    lower: list[tuple[int, Ns]] = []
-    higher: list[tuple[int, Ns]] = []
+    before: list[tuple[int, Ns]] = []  # number and end of the nearest split of each segment
+    after: list[tuple[int, Ns]] = []  # number and start
     for bags in (segment.bags for segment in segments):
         stems, positions, numbers = bags.names
         is_of_series = np.array([stem.series == name.series for stem in stems])[positions]
         rows = np.flatnonzero(is_of_series & (numbers >= 0))
         rows = rows[np.argsort(numbers[rows], kind="stable")]
-        before = rows[numbers[rows] < name.number][-1:]
-        after = rows[numbers[rows] > name.number][:1]
-        lower += zip(numbers[before].tolist(), bags.ends[before].tolist(), strict=True)
-        higher += zip(numbers[after].tolist(), bags.starts[after].tolist(), strict=True)
-    return Neighbours(max(lower)[1] if lower else None, min(higher)[1] if higher else None)
+        lower, higher = rows[numbers[rows] < name.number], rows[numbers[rows] > name.number]
+        if lower.size:
+            before.append((int(numbers[lower[-1]]), int(bags.ends[lower[-1]])))
+        if higher.size:
+            after.append((int(numbers[higher[0]]), int(bags.starts[higher[0]])))
+    _, end = max(before, default=(0, None))
+    _, start = min(after, default=(0, None))
+    return Neighbours(end, start)
