@@ -34,7 +34,7 @@ from ros2_memory.history.coverage import note_edges, note_unread, seconds, shown
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.scan import blocks, in_time, scan
+from ros2_memory.history.scan import blocks, read_until_late, scan
 from ros2_memory.results import Bins
 
 if TYPE_CHECKING:
@@ -239,7 +239,7 @@ def read_labels(
     """
     least_score = condition.least_score if condition.min_score > 0 else -math.inf
     detection_filter = _DetectionFilter(is_wanted, scope, least_score)
-    seen_blocks, since = in_time(view, _seen_blocks(view, topics, detection_filter), READING_S)
+    seen_blocks, since = read_until_late(view, _seen_blocks(view, topics, detection_filter), READING_S)
     parts: defaultdict[str, list[IntervalPart]] = defaultdict(list)
     most_at_once = Counter[str]()
     for block in seen_blocks:

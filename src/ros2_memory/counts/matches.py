@@ -60,7 +60,7 @@ from ros2_memory.history.held_values import (
 from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
-from ros2_memory.history.scan import in_time
+from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back, flags_before
@@ -262,7 +262,7 @@ def _events_in_order(
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    parts, since = in_time(view, events_back(view, topic, window), READING_S)
+    parts, since = read_until_late(view, events_back(view, topic, window), READING_S)
     return parts[::-1], since
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from operator import itemgetter
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -33,17 +33,18 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray, Mask
 
 _LONGEST_LATENCY_NS: Final = 10 * NS_PER_S
-"""So long a large model may look at an image before it says what is in it."""
+"""A large model may look at an image for this long before it says what is in it."""
 
 
 class Detected(NamedTuple):
     """Messages of one topic in order of log time, and the detections in them.
 
     Attributes:
-        log_times: of the messages (ns).
-        stamps: of their headers (ns); the log times where they have none.
-        found: by the place of their message; places are rounded to 0.1 mm, as the store has them.
-        frames: of the messages, empty where their headers name none.
+        log_times: log time of each message (ns).
+        stamps: header stamp of each message (ns), or its log time if it has no stamp.
+        found: the detections; `rows` says which message each is from. Places are rounded to 0.1 mm,
+            as in the store.
+        frames: frame of each message's header; empty if it names none.
     """
 
     log_times: IntArray
@@ -53,43 +54,42 @@ class Detected(NamedTuple):
 
     @property
     def times(self) -> IntArray:
-        """In the clock of the transforms (ns), as far as is known.
+        """When the detections were seen (ns): the stamps if they agree with the log times.
 
-        Those of their stamps where these agree with the log times, else those.
+        Else the log times: a stamp of another clock cannot be compared with those of transforms.
         """
         latency = self.log_times - self.stamps
-        # A stamp of another clock cannot be compared with those of transforms.
         agrees = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
         return np.where(agrees, self.stamps, self.log_times)
 
     def new_since(self, time: Ns) -> Detected:
-        """Returns the messages from a log time (ns) on that do not repeat the one before.
+        """Returns the messages from a log time (ns) on, without repeated ones.
 
-        A detector that hangs may publish one message again and again: with the stamp, the frame and
-        the detections of the one before it is no new look. A stamp of 0 is none.
+        A detector that hangs publishes its last message again and again: with equal stamp, frame
+        and detections. A stamp of 0 counts as none.
         """
         rows, labels, scores, places, frames = self.found
         columns = np.column_stack((labels.codes, frames.codes, scores, places))
         begins = begins_of(rows, len(self.log_times)).tolist()
-        said: dict[tuple[Ns, int], bytes] = {}
+        last_content: dict[tuple[Ns, int], bytes] = {}
         is_new = self.log_times >= time
         headers = zip(self.stamps.tolist(), self.frames.codes.tolist(), strict=True)
-        for nth, (stamp, frame) in enumerate(headers):
-            found = columns[begins[nth] : begins[nth + 1]].tobytes()
-            if stamp and said.get((stamp, frame)) == found:
-                is_new[nth] = False
-            said[stamp, frame] = found
-        which = np.flatnonzero(is_new)
+        for message, (stamp, frame) in enumerate(headers):
+            content = columns[begins[message] : begins[message + 1]].tobytes()
+            if stamp and last_content.get((stamp, frame)) == content:
+                is_new[message] = False
+            last_content[stamp, frame] = content
+        new = np.flatnonzero(is_new)
         return Detected(
-            self.log_times[which],
-            self.stamps[which],
-            self.found.at(which),
-            self.frames.rows(which),
+            self.log_times[new],
+            self.stamps[new],
+            self.found.at(new),
+            self.frames.rows(new),
         )
 
 
 def joined_detected(parts: Sequence[Detected]) -> Detected:
-    """Returns messages of tables of one topic together; `parts` is not empty."""
+    """Returns the messages of several tables of one topic, in order; `parts` is not empty."""
     if len(parts) == 1:
         return parts[0]
     log_times, order, places = merged_times([part.log_times for part in parts])
@@ -102,8 +102,17 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
     return Detected(log_times, stamps, joined_detections(detections), frames)
 
 
+class _Message(NamedTuple):
+    """The detections of one decoded message; see `Detected`."""
+
+    log_time: Ns
+    stamp: Ns
+    detections: list[Detection]
+    frame: str
+
+
 class DetectionRows:
-    """Reads the detections of rows by their columns, else by their messages.
+    """Reads the detections of rows from their columns, else from their messages.
 
     Args:
         view: has the bags.
@@ -114,11 +123,11 @@ class DetectionRows:
         self._columns = DetectionColumns(view.extractor)
 
     def may_match(self, parts: PartZones) -> bool | Mask:
-        """Returns in which parts some message may hold a detection, by their zones."""
+        """Returns which parts may have a detection, by their zones."""
         return self._columns.may_match(parts)
 
     def may_have_any(self, rows: Rows) -> bool:
-        """Returns whether a message in the table of some rows may hold a detection."""
+        """Returns whether the table of some rows may have a detection."""
         return self._columns.may_have_any(rows.table)
 
     def have_labels(self, rows: Rows) -> bool:
@@ -126,12 +135,12 @@ class DetectionRows:
         return self._columns.has_labels(rows.table)
 
     def of(self, rows: Rows) -> Detected:
-        """Returns the detections of some rows; messages that cannot be decoded are left out."""
-        detected = of_columns(self._view, rows, self._by_columns)
-        return self._by_messages(rows) if detected is None else joined_detected(detected)
+        """Returns the detections of rows, without messages that cannot be decoded."""
+        detected = of_columns(self._view, rows, self._read_columns)
+        return self._read_messages(rows) if detected is None else joined_detected(detected)
 
-    def _by_columns(self, rows: Rows) -> Detected | None:
-        """Returns the detections of some rows; None where their columns leave something open."""
+    def _read_columns(self, rows: Rows) -> Detected | None:
+        """Returns the detections of rows; None if the columns do not have all of them."""
         columns = self._columns.of(rows.table)
         if columns is None:
             return None
@@ -142,53 +151,55 @@ class DetectionRows:
         stamps = rows.times if stamps is None else stamps
         return _rounded(Detected(rows.times, stamps, detections, frames))
 
-    def _by_messages(self, rows: Rows) -> Detected:
+    def _read_messages(self, rows: Rows) -> Detected:
         extractor = self._view.extractor
-        messages: list[tuple[Ns, Ns, list[Detection], str]] = []
+        messages: list[_Message] = []
         for stored in messages_of(self._view, rows):
             message = self._view.bags.decode(stored)
-            if message is not None:
-                frame, stamp = extractor.frame(message), _stamp_of(message)
-                detections = [
-                    detection if detection.frame_id else detection._replace(frame_id=frame)
-                    for detection in detections_of(extractor.exact(message, stored.type))
-                ]
-                stamp = stored.time if stamp is None else stamp
-                messages.append((stored.time, stamp, detections, frame))
-        # Those of a part come bag after bag, in the order in which bags were stored.
-        messages.sort(key=itemgetter(0))
+            if message is None:
+                continue
+            frame, stamp = extractor.frame(message), _stamp_of(message)
+            detections = [
+                detection if detection.frame_id else detection._replace(frame_id=frame)
+                for detection in detections_of(extractor.exact(message, stored.type))
+            ]
+            stamp = stored.time if stamp is None else stamp
+            messages.append(_Message(stored.time, stamp, detections, frame))
+        # A part has bag after bag, in the order in which they were stored.
+        messages.sort(key=attrgetter("log_time"))
         return _rounded(
             Detected(
-                np.array([log_time for log_time, *_ in messages], np.int64),
-                np.array([stamp for _, stamp, *_ in messages], np.int64),
-                detections_by([detections for *_, detections, _ in messages]),
-                Texts.of([frame for *_, frame in messages]),
+                np.array([message.log_time for message in messages], np.int64),
+                np.array([message.stamp for message in messages], np.int64),
+                detections_by([message.detections for message in messages]),
+                Texts.of([message.frame for message in messages]),
             )
         )
 
 
 def seen_at(view: View, stored: StoredMessage) -> Ns:
-    """Returns when what a message detects was seen: as `Detected.times` has it.
+    """Returns when the detections of a message were seen (ns), as `Detected.times` does.
 
-    Where it repeats the stamp of the message before, as that of a detector that hangs, by that
-    stamp if the first one that had it agrees with its log time.
+    If it repeats the stamp of the message before it, as a detector that hangs does, the stamp
+    counts if it agrees with the log time of the first message that has it.
     """
-    topic, stamp = stored.topic, _stamp(view, stored)
+    topic, stamp = stored.topic, _stamp_or_log_time(view, stored)
     if -AGREEMENT_NS <= stored.time - stamp <= _LONGEST_LATENCY_NS:
         return stamp
     before = view.stream.last(topic, stored.time)
-    if before is not None and _stamp(view, before) == stamp:
-        soon = TimeWindow(stamp - AGREEMENT_NS, stamp + _LONGEST_LATENCY_NS + 1)
-        if any(_stamp(view, each) == stamp for each in view.stream.messages([topic], soon)):
-            return stamp
+    if before is not None and _stamp_or_log_time(view, before) == stamp:
+        agreeing = TimeWindow(stamp - AGREEMENT_NS, stamp + _LONGEST_LATENCY_NS + 1)
+        for message in view.stream.messages([topic], agreeing):
+            if _stamp_or_log_time(view, message) == stamp:
+                return stamp
     return stored.time
 
 
 def hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
-    """Returns the stamp (ns) of an old message that a topic's newest ones in a window repeat.
+    """Returns the stamp (ns) of an old message that the newest messages of a window repeat.
 
-    None where the newest one is not the one before again, is no older than an image that is still
-    looked at, or has no stamp.
+    None if the newest message differs from the one before, has no stamp, or is so young that its
+    image may have been looked at until then.
     """
     newest = view.stream.newest(topic, window)
     stamp = None if newest is None else _stamp_of(view.bags.decode(newest))
@@ -199,8 +210,7 @@ def hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
     return stamp if repeats else None
 
 
-def _stamp(view: View, stored: StoredMessage) -> Ns:
-    """Returns the stamp of a message, or its log time where it has none."""
+def _stamp_or_log_time(view: View, stored: StoredMessage) -> Ns:
     stamp = _stamp_of(view.bags.decode(stored))
     return stored.time if stamp is None else stamp
 

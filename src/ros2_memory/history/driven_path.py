@@ -1,4 +1,4 @@
-"""The driven path in a window, by the poses of a topic, or by transforms."""
+"""The driven path in a window, by the poses of a topic or by transforms."""
 
 from __future__ import annotations
 
@@ -45,7 +45,14 @@ from ros2_memory.history.no_data import (
 )
 from ros2_memory.history.poses import PoseReader, PoseRows
 from ros2_memory.history.robots import parallel_or_twice
-from ros2_memory.history.scan import blocks, in_time, joined_back, open_scan, remembered, scan
+from ros2_memory.history.scan import (
+    blocks,
+    joined_back,
+    open_scan,
+    read_until_late,
+    remembered,
+    scan,
+)
 from ros2_memory.history.sessions import Session, decoded_transforms
 from ros2_memory.history.transforms import (
     edges_of_rows,
@@ -67,18 +74,19 @@ T = TypeVar("T", bound="Sized")
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _BODIES: Final = ("base_footprint", "base_link")
-_READ_NS: Final = 3600 * NS_PER_S
-"""Transforms are read an hour (log time) at once."""
+"""Names of the frame of the robot's body, the likelier first."""
+_HOUR_NS: Final = 3600 * NS_PER_S
+"""Transforms are read by the hour."""
 _LONGEST_H: Final = 64
-"""Where a bag spans more hours a clock was set in it: decades may lie between two messages."""
+"""In a bag that spans more hours a clock was set: decades may lie between two messages."""
 _STEP_NS: Final = NS_PER_S // 20
-"""Poses by transforms are no closer than this."""
+"""The least time between two poses by transforms."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
-"""Of a call: the frames of topics of poses."""
+"""Of a call: by topic of poses, the frame of its newest pose."""
 
 
 def driven_path(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
-    """Does as `path_by_poses`; a note says how far back the path is known if not all was read."""
+    """Returns `path_by_poses`; a note says how far back the path is known if time ran out."""
     path, since = path_by_poses(view, topic, window)
     if since is not None:
         view.notes.add_lack(
@@ -88,10 +96,10 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice |
 
 
 def path_by_poses(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
-    """Returns the path in a window by the poses of one topic; None where there is no message.
+    """Returns the path in a window by the poses of a topic, and since when it is known.
 
-    And from which log time (ns) on it is known, where older bags were not read. Messages that
-    cannot be decoded are left out, with a note.
+    The path is None without a message. The log time (ns) is None if all bags were read in time.
+    Messages that cannot be decoded are left out, with a note.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
@@ -99,16 +107,16 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice
         QueryTimeoutError: the call's time runs out before any result.
     """
     failures: list[UndecodableError] = []
-    timed = slices_of_path(view, topic, window, failures)
-    drawn = ((at, part) for at, part in timed if part.poses or part.invalid)
-    slices, since = in_time(view, drawn, READING_S)
-    if failures and not slices:
+    slices = slices_of_path(view, topic, window, failures)
+    driven = ((at, part) for at, part in slices if part.poses or part.invalid)
+    newest_first, since = read_until_late(view, driven, READING_S)
+    if failures and not newest_first:
         raise with_notes(view, window, undecodable(failures[0])) from failures[0]
     if failures:
         why = f"{len(failures)} ({failures[0].reason})"
         view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
     fastest = view.limits.max_plausible_speed_mps
-    return joined_slices(slices[::-1], fastest) if slices else None, since
+    return joined_slices(newest_first[::-1], fastest) if newest_first else None, since
 
 
 def slices_of_path(
@@ -124,7 +132,7 @@ def slices_of_path(
         topic,
         window,
         PATHS,
-        lambda piece: path_slice(piece.poses, fastest),
+        lambda pose_slice: path_slice(pose_slice.poses, fastest),
         failures=failures,
         settings=str(fastest),
     )
@@ -141,21 +149,21 @@ def slices_by_poses(
     beside: Ns = 0,
     settings: str = "",
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what `make` returns of the robot's poses, slice by slice of the clock, newest first.
+    """Makes something of each slice of the robot's poses, and yields it, the newest slice first.
 
-    Each with a time (log time, ns) that no pose of it is earlier than. Of a topic of transforms
-    they are the poses of the robot's body. Where two recordings have poses of their own, or one has
-    a time twice, they are those that come first.
+    With each comes the log time (ns) at which its slice begins, or its stretch, if what was made of
+    a whole stretch is stored. If two recordings have different poses for one time, or one recording
+    has the time twice, the poses of the first count.
 
     Args:
         view: of the call.
-        topic: of the poses.
+        topic: of the poses; a topic of transforms stands for the poses of the robot's body.
         window: of log time.
-        kind: what is made; it is stored, and joined by stretches of the clock.
+        kind: the kind of what is made, for the store.
         make: makes it.
         failures: as for `pose_rows`.
-        beside: poses so far before and after a slice (ns) are with it, too.
-        settings: what it depends on besides the poses.
+        beside: how far before and after a slice (ns) `make` sees poses, too.
+        settings: what the result depends on besides the poses.
 
     Raises:
         InvalidArgumentsError: while it is iterated, messages carry no position.
@@ -165,53 +173,51 @@ def slices_by_poses(
         for pose_slice in pose_slices(rows_of_body(view, window), beside):
             yield pose_slice.start, make(pose_slice)
         return
-    twice = () if view.call.stored else parallel_or_twice(view, topic, window)
-    # What is stored follows from whole parts: also from those that the window cuts.
+    parallel = () if view.call.stored else parallel_or_twice(view, topic, window)
+    # Stored results are of whole parts, including the parts that the window cuts.
     reach = window.widened(2 * PART_NS) if view.call.stored else window
     opened = open_scan(view, topic, reach, stored=view.call.stored)
-    reader = PoseReader(view, failures, twice)
+    reader = PoseReader(view, failures, parallel)
 
-    def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
-        around = stretch.window.widened(beside)
-        rows = opened.rows(newest_first=True, among=around)
+    def make_slices(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
+        rows = opened.rows(newest_first=True, among=stretch.window.widened(beside))
         read = map(reader.block, blocks(rows, newest_first=True))
         wanted = stretch.window if stretch.parts else stretch.window.intersect(window)
         needs_all = stretch.parts is not None or not view.call.stored
         for pose_slice in pose_slices(read, beside):
             inside = TimeWindow(pose_slice.start, pose_slice.stop)
+            if wanted.intersect(inside).empty:
+                continue
             key = pose_slice.key(settings)
-            may_be_made = needs_all or (key and opened.is_stored(inside.widened(beside)))
-            if may_be_made and not wanted.intersect(inside).empty:
-                # Those before it in the stretch are wanted next.
+            if needs_all or (key and opened.is_stored(inside.widened(beside))):
+                # Earlier slices of the stretch are wanted next.
                 before = min(max(pose_slice.start - stretch.window.start, 0), STRETCH_NS)
-                yield (
-                    pose_slice.start,
-                    remembered(view, kind, key, partial(make, pose_slice), also_before=before),
-                )
+                made = remembered(view, kind, key, partial(make, pose_slice), also_before=before)
+                yield pose_slice.start, made
 
     def key_of(stretch: Stretch) -> FragmentKey | None:
         around = stretch.window.widened(beside)
-        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
+        # The span is cut: it grows with each bag, and poses outside change nothing here.
         near = [
             (str(pair.other), pair.span.intersect(around), sorted(pair.bags))
-            for pair in twice
+            for pair in parallel
             if around.overlaps(pair.span.start, pair.span.stop - 1)
         ]
         left_out = sha256(repr(near).encode()).hexdigest()
         return stretch.key(f"{settings} {left_out}" if near else settings)
 
-    yield from joined_back(view, opened, kind, made_in, key_of, beside=beside)
+    yield from joined_back(view, opened, kind, make_slices, key_of, beside=beside)
 
 
 @dataclass(frozen=True, slots=True)
 class PoseSlice:
-    """The poses in a slice of the clock, and those beside it.
+    """The poses in a slice of the clock, and some poses beside it.
 
     Attributes:
-        start: log time (ns) where it begins.
-        stop: where it ends.
-        beside: how far before and after it (ns) poses are with it.
-        blocks: of the poses.
+        start: log time (ns) at which the slice begins.
+        stop: log time at which it ends.
+        beside: how far (ns) before and after it poses are included.
+        blocks: the blocks that may have these poses, in order.
     """
 
     start: Ns
@@ -221,12 +227,12 @@ class PoseSlice:
 
     @property
     def poses(self) -> Poses:
-        """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
+        """The poses in the slice and beside it, in order; raises as `PoseRows.poses`."""
         start, stop = self.start - self.beside, self.stop + self.beside
         return joined_poses([block.poses.between(start, stop) for block in self.blocks])
 
     def key(self, settings: str) -> FragmentKey | None:
-        """Returns the key of the poses in memory; None where not all of these parts are here."""
+        """Returns the key of what is made of the poses; None if they are not of whole parts."""
         span = self.start - self.beside, self.stop + self.beside
         parts: list[int] = []
         for block in self.blocks:
@@ -238,39 +244,40 @@ class PoseSlice:
 
 
 def pose_slices(newest_first: Iterable[PoseRows], beside: Ns) -> Iterator[PoseSlice]:
-    """Yields the slices of the clock in which there may be poses, the newest first.
+    """Yields the slices of the clock that may have poses, the newest first.
 
     Args:
-        newest_first: the poses.
-        beside: poses so far before and after a slice (ns) are with it, too.
+        newest_first: blocks of poses.
+        beside: how far (ns) before and after a slice poses are included.
     """
-    held: list[PoseRows] = []
-    waiting: set[int] = set()
+    recent: list[PoseRows] = []  # blocks that a waiting slice may need, the newest first
+    waiting: set[int] = set()  # numbers of slices whose older poses have not been seen yet
     for block in chain(newest_first, [None]):
         if block is not None:
             newest = max(waiting, default=block.last // SLICE_NS)
-            held = [older for older in held if older.first < (newest + 1) * SLICE_NS + beside]
-            held.append(block)
+            needed_until = (newest + 1) * SLICE_NS + beside
+            recent = [newer for newer in recent if newer.first < needed_until]
+            recent.append(block)
             waiting.update(block.slices(SLICE_NS))
-        oldest = MIN_NS if block is None else block.first
+        seen_back_to = MIN_NS if block is None else block.first
         for number in sorted(waiting, reverse=True):
             start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
             first, last = start - beside, stop + beside
-            if first < oldest:
+            if first < seen_back_to:
                 break
             waiting.discard(number)
-            near = [rows for rows in reversed(held) if rows.last >= first and rows.first < last]
+            near = [rows for rows in reversed(recent) if rows.last >= first and rows.first < last]
             yield PoseSlice(start, stop, beside, near)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:
-    """Yields what is left out of the length of a path, and why it is not the sum of all steps."""
+    """Yields sentences on what the length of a path leaves out, and on what makes it uncertain."""
     totals = path.totals
     if path.invalid:
         poses = counted(path.invalid, "pose")
         yield f"{poses} left out: their coordinates are not valid (NaN or out of range)"
     if path.is_noisy:
-        # Without the number, which the reply has, the note of several windows is one.
+        # Without numbers, so that several windows share one note; the reply has them.
         yield (
             "the positions are noisy: distance_m leaves out what noise adds to the sum of all steps"
         )
@@ -301,7 +308,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
 
 
 def note_left_out(view: View, error: UndecodableError) -> None:
-    """Notes that there are poses which cannot be decoded, and why."""
+    """Notes that poses cannot be decoded, and why."""
     view.notes.add_lack(
         f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}"
     )
@@ -310,17 +317,23 @@ def note_left_out(view: View, error: UndecodableError) -> None:
 def frame_of_newest_pose(view: View, topic: str) -> str:
     """Returns the frame of the newest pose that can be decoded; empty without a pose.
 
+    A topic of transforms has the frame of odometry. Remembers the frame for the call.
+
     Raises:
         InvalidArgumentsError: the topic's messages carry no position.
-        UndecodableError: none of the newest ones can be decoded.
+        UndecodableError: no message among the newest can be decoded.
     """
     frames = view.memo.of(_POSE_FRAMES, dict)
-    if topic in frames:
-        return frames[topic]
-    body, failures = body_of(view, topic), list[UndecodableError]()
-    frame = "" if body is None else body.odometry
+    if topic not in frames:
+        body = body_of(view, topic)
+        frames[topic] = _frame_of_newest(view, topic) if body is None else body.odometry
+    return frames[topic]
+
+
+def _frame_of_newest(view: View, topic: str) -> str:
+    failures: list[UndecodableError] = []
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
-    for stored in islice(newest, _MOST_TRIED if body is None else 0):
+    for stored in islice(newest, _MOST_TRIED):
         message = view.bags.decode(stored, failures)
         if message is None:
             continue
@@ -329,21 +342,23 @@ def frame_of_newest_pose(view: View, topic: str) -> str:
             raise InvalidArgumentsError(describe_lack(view, "position", stored))
         if failures:
             note_left_out(view, failures[0])
-        frame = pose.frame_id.lstrip("/")
-        break
-    else:
-        if failures:
-            raise failures[0]
-    frames[topic] = frame
-    return frame
+        return pose.frame_id.lstrip("/")
+    if failures:
+        raise failures[0]
+    return ""
 
 
 class Body(NamedTuple):
-    """The robot's body among the frames that move: `child` in `parent`, and the other frames.
+    """The robot's body among the frames that move.
 
-    `above`: the frames above it, the nearest first. `odometry`: in which its path is measured, as
-    no correction of the map is driven: that of odometry, else `parent`. `beside`: the bodies of
-    other robots, by their names.
+    Attributes:
+        parent: the map, or the root of its frames.
+        child: the frame of the body.
+        others: the other frames that move.
+        above: the frames above it, the nearest first.
+        odometry: the frame in which its path is measured: a correction of the map is not driven.
+            `parent` if there is none of odometry.
+        beside: frames that are the bodies of other robots, by their names.
     """
 
     parent: str
@@ -355,14 +370,14 @@ class Body(NamedTuple):
 
 
 def robot_body(view: View) -> Body | None:
-    """Returns the robot's body by its transforms; None where none of them moves.
+    """Returns the robot's body by its transforms; None if none of them moves.
 
-    By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
-    in the root of its frames.
+    It is found by its name (`base_footprint`, `base_link`), else it is the moving frame that is
+    nearest to the root.
     """
-    known_edges = view.sessions.edges
-    parents = {edge.child: edge.parent for edge in known_edges}
-    moving = [edge.child for edge in known_edges if not edge.static]
+    edges = view.sessions.edges
+    parents = {edge.child: edge.parent for edge in edges}
+    moving = [edge.child for edge in edges if not edge.static]
     if not moving:
         return None
     above = {child: _ancestors(child, parents) for child in moving}
@@ -371,13 +386,18 @@ def robot_body(view: View) -> Body | None:
     root = map_frame if map_frame in above[body] else above[body][-1]
     odometry = next(filter(_is_odometry, above[body]), root)
     others = sorted({child for child in moving if child != body})
-    named = (child for child in others if _body_rank(child, map_frame) < len(_BODIES))
-    beside = (child for child in named if child not in above[body] and body not in above[child])
-    return Body(root, body, tuple(others), tuple(above[body]), odometry, tuple(beside))
+    beside = tuple(
+        child
+        for child in others
+        if _body_rank(child, map_frame) < len(_BODIES)
+        and child not in above[body]
+        and body not in above[child]
+    )
+    return Body(root, body, tuple(others), tuple(above[body]), odometry, beside)
 
 
 def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
-    """Returns the frames above a frame, the nearest first; a loop ends it."""
+    """Returns the frames above a frame, the nearest first; stops at a loop."""
     frames: list[str] = []
     while frame in parents and parents[frame] not in frames:
         frame = parents[frame]
@@ -393,27 +413,30 @@ def _body_rank(frame: str, map_frame: str | None) -> int:
     """Returns how unlikely a frame is the body: named bodies first, frames of the world last."""
     name = frame.rpartition("/")[2]
     if name == map_frame or _is_odometry(frame):
-        return len(_BODIES) + 1  # of the world: it moves as the map is corrected
+        return len(_BODIES) + 1  # it moves only as the map is corrected
     return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 
 
 def body_of(view: View, topic: str) -> Body | None:
-    """Returns the robot's body where a topic is of transforms."""
+    """Returns the robot's body if the topic is one of transforms, else None."""
     return robot_body(view) if topic in view.limits.tf_topics else None
 
 
 def body_by_transforms(view: View) -> Body | None:
-    """Returns the robot's body where transforms place it; None where a topic of poses does.
+    """Returns the robot's body if transforms place it; None if a topic of poses does.
 
-    They do where no topic has its poses, or where `data.pose_topic` is one of transforms.
+    Transforms place it if no topic has its poses, or if `data.pose_topic` is one of transforms.
     """
-    return body_of(view, view.pose_topic) or (None if view.has_poses else robot_body(view))
+    body = body_of(view, view.pose_topic)
+    if body is None and not view.has_poses:
+        return robot_body(view)
+    return body
 
 
 def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = False) -> str:
-    """Returns the topic of the robot's places: that of its poses, else with a note of transforms.
+    """Returns the topic that places the robot: a topic of poses, or, with a note, of transforms.
 
-    With `degrees` that of a satellite receiver, where there is nothing else.
+    With `degrees`, the topic of a satellite receiver if there is nothing else.
 
     Raises:
         NoDataError: as for `resolve_pose_topic`.
@@ -441,10 +464,10 @@ def newest_of_body(
     frame_id: str | None = None,
     recording: Path | None = None,
 ) -> tuple[StoredMessage, Pose] | None:
-    """Returns the newest transform in a window that places the robot's body, with its pose.
+    """Returns the newest transform in a window that places the robot's body, and its pose.
 
-    In the map or the root of its frames, or in `frame_id`. Where the session of a `recording` has
-    transforms, it is one of these.
+    The pose is in `frame_id`, by default in `body.parent`. Only transforms of the session of a
+    `recording` count, if it has any.
     """
     parent, topics, sessions = frame_id or body.parent, view.moving_topics, view.sessions
     own_session = None if recording is None else sessions.of(recording)
@@ -459,50 +482,63 @@ def newest_of_body(
                 continue
             clock = frames_of(view, (), [transform], parent).clock
             moment = transform.stamp if clock == "stamp" else transform.log_time
-            with suppress(NoDataError):  # no other transforms lead there: an older one may
-                there = transform_at(
+            # If no transforms lead to the parent now, they may have at an older moment.
+            with suppress(NoDataError):
+                placed = transform_at(
                     view, parent, body.child, moment, recorded_in, explains=False
                 ).transform
-                return stored, Pose(there.translation, there.rotation, parent)
+                return stored, Pose(placed.translation, placed.rotation, parent)
     return None
 
 
 def rows_of_body(view: View, window: TimeWindow) -> Iterator[PoseRows]:
     """Yields the poses of the robot's body by transforms, the newest first; none without a body.
 
-    In the frame of its odometry, at most twenty a second. They are read as they are asked for, an
-    hour at a time, and each may then raise QueryTimeoutError, as may the first step.
+    They are in the frame of its odometry, at most twenty a second. Each block is an hour, and is
+    read when its poses are asked for.
+
+    Raises:
+        QueryTimeoutError: while it is iterated or a block is read, the call's time is over.
     """
     body = robot_body(view)
-    hours: set[int] = set()
-    for topic in () if body is None else view.moving_topics:
-        firsts, lasts = (times // _READ_NS for times in view.bounds(topic, window))
-        is_short = lasts - firsts <= _LONGEST_H
-        for first, last in zip(firsts[is_short].tolist(), lasts[is_short].tolist(), strict=True):
-            hours.update(range(first, last + 1))
-        for bag, start, end in () if is_short.all() else view.timeline.extents(topic, window):
-            if end // _READ_NS - start // _READ_NS > _LONGEST_H:
-                for table in view.bags.tables(bag, topic, window, columns=False):
-                    hours.update(np.unique(table.log_times // _READ_NS).tolist())
+    if body is None:
+        return
+    hours = set(chain.from_iterable(_hours_of(view, topic, window) for topic in view.moving_topics))
     for hour in sorted(hours, reverse=True):
-        piece = TimeWindow(hour * _READ_NS, (hour + 1) * _READ_NS).intersect(window)
-        if body is not None and not piece.empty:
+        piece = TimeWindow(hour * _HOUR_NS, (hour + 1) * _HOUR_NS).intersect(window)
+        if not piece.empty:
             read = partial(_poses_of_body, view, piece, body)
             yield PoseRows(piece.start, piece.stop - 1, read)
+
+
+def _hours_of(view: View, topic: str, window: TimeWindow) -> set[int]:
+    """Returns the hours of a window, counted from the epoch, that may have messages of a topic."""
+    hours: set[int] = set()
+    firsts, lasts = (times // _HOUR_NS for times in view.bounds(topic, window))
+    is_short = lasts - firsts <= _LONGEST_H
+    for first, last in zip(firsts[is_short].tolist(), lasts[is_short].tolist(), strict=True):
+        hours.update(range(first, last + 1))
+    if is_short.all():
+        return hours
+    for extent in view.timeline.extents(topic, window):
+        if extent.last // _HOUR_NS - extent.first // _HOUR_NS > _LONGEST_H:
+            for table in view.bags.tables(extent.bag, topic, window, columns=False):
+                hours.update(np.unique(table.log_times // _HOUR_NS).tolist())
+    return hours
 
 
 def _poses_of_body(view: View, window: TimeWindow, body: Body) -> Poses:
     """Returns the poses of the body in a window, by the transforms of all sessions."""
     bags = view.stream.overlapping_bags(view.moving_topics, window)
     sessions = dict.fromkeys(view.sessions.of(span.bag.recording) for span in bags)
-    poses = joined_poses([poses_by_session(view, window, each, body) for each in sessions])
-    return poses.rows(_apart(poses.times))
+    poses = joined_poses([poses_by_session(view, window, session, body) for session in sessions])
+    return poses.rows(_positions_apart(poses.times))
 
 
 def poses_by_session(view: View, window: TimeWindow, session: Session, body: Body) -> Poses:
-    """Returns the poses of the body in a window, by the transforms of a session, in order of time.
+    """Returns the poses of the body in a window by the transforms of a session, in order of time.
 
-    In the frame of its odometry; none where no transforms lead there.
+    They are in the frame of its odometry; none if no transforms lead there.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -516,10 +552,9 @@ def poses_by_session(view: View, window: TimeWindow, session: Session, body: Bod
 
 
 def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow) -> Poses:
-    """Returns where a body was in the target of frames whenever its transform was received.
+    """Returns the pose of a body in the target of `frames` at each of its transforms in a window.
 
-    Where no transform leads to the target there is none, as before the first one of the map, or in
-    a gap of these.
+    Left out are moments at which no transforms lead to the target.
     """
     of_body = [edge for (_, name), edge in edges.items() if name == child]
     if not of_body:
@@ -542,8 +577,8 @@ def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow)
     return poses.rows(np.flatnonzero(placed.valid))
 
 
-def _apart(times: IntArray) -> IntArray:
-    """Returns the positions of ascending times (ns), each `_STEP_NS` or more after the last."""
+def _positions_apart(times: IntArray) -> IntArray:
+    """Returns the positions of ascending times (ns) that are at least `_STEP_NS` apart."""
     last, positions = MIN_NS, list[int]()
     for position, time in enumerate(times.tolist()):
         if time - last >= _STEP_NS:

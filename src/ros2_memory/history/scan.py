@@ -187,28 +187,31 @@ def remembered(
     return fragment
 
 
-def in_time(
-    view: View, timed: Iterable[tuple[Ns, V]], budget_s: float
+def read_until_late(
+    view: View, newest_first: Iterable[tuple[Ns, V]], budget_s: float
 ) -> tuple[list[V], Ns | None]:
-    """Returns what is yielded, the newest first, while there is time; and since when that is all.
+    """Returns values, the newest first, until time runs out; and since when they are complete.
 
-    None where it is. `timed`: each with a log time that nothing of it is earlier than.
+    The latter is None if there was time for all. With each value comes the log time that nothing of
+    it is earlier than.
 
     Raises:
-        QueryTimeoutError: the call's time is over before the first.
+        QueryTimeoutError: the call's time is over before the first value.
     """
-    reading, found, since = view.call.partial_after(budget_s), list[V](), MAX_NS
+    reading = view.call.partial_after(budget_s)
+    values: list[V] = []
+    since = MAX_NS
     try:
-        for at, one in timed:
-            if found and reading.expired():
-                return found, since
-            found.append(one)
+        for at, value in newest_first:
+            if values and reading.expired():
+                return values, since
+            values.append(value)
             since = at
     except QueryTimeoutError:
-        if not found:
+        if not values:
             raise
-        return found, since
-    return found, None
+        return values, since
+    return values, None
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:

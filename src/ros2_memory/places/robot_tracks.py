@@ -54,10 +54,10 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.scan import (
-    in_time,
     joined_back,
     open_scan,
     positions_in,
+    read_until_late,
     remembered,
     scan,
 )
@@ -122,7 +122,7 @@ class TrackReader:
         # Whole slices are read, so that no vertex depends on the window.
         around = window.widened(SILENCE_NS).aligned(TRACK_SLICE_NS)
         try:
-            tracks, since = in_time(view, self._tracks_back(around), _READING_S)
+            tracks, since = read_until_late(view, self._tracks_back(around), _READING_S)
         except QueryTimeoutError as error:
             raise QueryTimeoutError(
                 f"the question needs more time; {view.bags.filling_progress()}"
