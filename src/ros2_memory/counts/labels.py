@@ -239,7 +239,9 @@ def read_labels(
     """
     least_score = condition.least_score if condition.min_score > 0 else -math.inf
     detection_filter = _DetectionFilter(is_wanted, scope, least_score)
-    seen_blocks, since = read_until_late(view, _seen_blocks(view, topics, detection_filter), READING_S)
+    seen_blocks, since = read_until_late(
+        view, _seen_blocks(view, topics, detection_filter), READING_S
+    )
     parts: defaultdict[str, list[IntervalPart]] = defaultdict(list)
     most_at_once = Counter[str]()
     for block in seen_blocks:

@@ -50,7 +50,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.held_values import (
-    Held,
+    HeldValue,
     HeldValues,
     held_at,
     held_until,
@@ -520,13 +520,13 @@ def count_values(
 
 
 def _value_rows(
-    held_values: Sequence[Held], elapsed: Elapsed, outside: Spans, condition: Condition | None
+    held_values: Sequence[HeldValue], elapsed: Elapsed, outside: Spans, condition: Condition | None
 ) -> list[tuple[str, _ValueRow]]:
     """Returns each value that counts with its row, the one that held longest first.
 
     Time that lies in the spans `outside` adds nothing to a length.
     """
-    by_word: defaultdict[str, list[Held]] = defaultdict(list)
+    by_word: defaultdict[str, list[HeldValue]] = defaultdict(list)
     for held in held_values:
         by_word[held.word].append(held)
     rows = []

@@ -110,7 +110,9 @@ class JoinedIndex:
         bags = _bags_not_in_lake(shipped, own, until)
         if own.thinned:
             bags = _without_shipped_days(bags, shipped.timeline, deleted_spans(self.bag_dir))
-        same_path = {bag.file: bag for bag in shipped.timeline.bags_named({bag.file for bag in bags})}
+        same_path = {
+            bag.file: bag for bag in shipped.timeline.bags_named({bag.file for bag in bags})
+        }
         named: list[BagFile] = []
         set_aside: list[SetAside] = []
         for bag in bags:

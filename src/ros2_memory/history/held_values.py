@@ -1,10 +1,12 @@
-"""What a topic said, and until when: a value holds until a message says another one.
+"""The values that a topic held, and until when: a value holds until a message says another one.
 
-So do the texts that say what a robot does (`std_msgs/msg/String`): nothing of them is known to have
-ended only because a topic is silent, or because nothing was recorded for a while. Where another run
-of the recorder begins, only what a latched topic said is known to hold on; of a topic that is
-usually heard often, no value where it falls silent for `SILENCE_NS`. No value is known to hold
-where messages of the topic were deleted.
+A value of a rare topic, or a text that says what a robot does (`std_msgs/msg/String`), does not end
+because the topic is silent, or because nothing was recorded for a while. A value ends, as far as is
+known:
+
+- where another run of the recorder begins, unless the topic is latched;
+- after its last message, if the topic is usually frequent and falls silent for `SILENCE_NS`;
+- where messages of the topic were deleted.
 """
 
 from __future__ import annotations
@@ -40,20 +42,19 @@ if TYPE_CHECKING:
 
 TEXT: Final = "std_msgs/msg/String"
 _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
-"""Of a view: the `deletions` of topics."""
+"""Of a view: by topic, its `deletions`."""
 _MOST_CHARS: Final = 16 << 20
-"""How much of values a call may hold, as JSON text."""
+"""The most characters of values (as JSON text) that a call may hold in memory."""
 
 
-class Held(NamedTuple):
+class HeldValue(NamedTuple):
     """A value, and when it held.
 
     Attributes:
         word: the value as JSON text.
-        start: log time of the first message that says so.
-        stop: of the next one that says otherwise; where none is known to do so, until when it is
-            known to hold.
-        ended: whether a message says otherwise then.
+        start: log time of the first message that says it.
+        stop: log time until which it is known to hold.
+        ended: whether a message says another value at `stop`.
     """
 
     word: str
@@ -69,16 +70,16 @@ class Held(NamedTuple):
 
     @property
     def value(self) -> JsonValue:
-        """The same as replies round it: NaN and infinity are None."""
+        """The value, rounded for replies: NaN and infinity are None."""
         exact = self.exact
         if isinstance(exact, float):
             return round_real(exact)
-        # In the word a whole float has all its digits.
+        # A whole float is an integer in the word, with all its digits.
         return round_integer(exact) if isinstance(exact, int) else exact
 
     @property
     def is_blank(self) -> bool:
-        """Whether it is a text that says nothing: it only ends the one before."""
+        """Whether it is a text without words: it only ends the value before."""
         value = self.value
         return isinstance(value, str) and not value.strip()
 
@@ -97,16 +98,16 @@ class HeldValues:
     Args:
         view: the call's.
         topic: its name.
-        field: dot-path of the value in the messages; None for all that they have.
-        asked: the argument that asks for it, as errors name it.
-        until: the moment before which it is asked for; a topic may have had other types then.
+        field: dot-path of the value in the messages; None for whole messages.
+        asked: the argument that asks for it, for errors.
+        until: the end of the time that is asked about: later messages may have another type.
 
     Attributes:
-        reached: what began from then on was yielded by `back`.
-        known: what `during` found, newest first, also where time was over.
+        reached: `back` has yielded all values that began at this log time or later.
+        known: the values that `during` has found, newest first, also if time was over.
 
     Raises:
-        InvalidArgumentsError: what the newest message before then has there is no single value.
+        InvalidArgumentsError: the newest message before `until` has no single value there.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class HeldValues:
         self._breaks = breaks_of(view, topic)
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
-        self.known: list[Held] = []
+        self.known: list[HeldValue] = []
         self._require_single_value(asked, until)
 
     def _require_single_value(self, asked: str, until: Ns) -> None:
@@ -133,7 +134,7 @@ class HeldValues:
         message = None if newest is None else self._view.bags.decode(newest)
         if newest is None or message is None:
             return
-        if isinstance(self._said(message, newest.type), list | dict | None):
+        if isinstance(self._value_of(message, newest.type), list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
             raise InvalidArgumentsError(
                 f"{asked}: {of_field}{self._topic} ({newest.type}) is no text, number or "
@@ -141,30 +142,30 @@ class HeldValues:
                 "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
             )
 
-    def back(self, until: Ns) -> Iterator[Held]:
-        """Yields the values that were said before a moment, newest first.
+    def back(self, until: Ns) -> Iterator[HeldValue]:
+        """Yields the values that began before a moment, newest first.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the time for reading is over.
         """
         self.reached = until
         later = self._runs(TimeWindow(until, MAX_NS), newest_first=False)
-        after = next(later, None)
-        for before in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
-            run = before
-            if after is not None and self._goes_on(before, after):
-                # It goes on after `until`.
-                run, after = before._replace(last=after.last), next(later, None)
-            stop, ended = self._end_of(run, after)
+        following = next(later, None)
+        for earlier in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
+            run = earlier
+            if following is not None and self._goes_on(run, following):
+                # Only the newest run can go on after `until`.
+                run, following = run._replace(last=following.last), next(later, None)
+            stop, ended = self._end_of(run, following)
             self.reached = run.first
-            yield Held(run.word, run.first, stop, ended)
-            after = run
+            yield HeldValue(run.word, run.first, stop, ended)
+            following = run
 
-    def during(self, start: Ns, stop: Ns) -> list[Held]:
-        """Returns the values that held at some time from `start` on and before `stop`, in order.
+    def during(self, start: Ns, stop: Ns) -> list[HeldValue]:
+        """Returns the values that held at some time in `[start, stop)`, in order.
 
         Raises:
-            QueryTimeoutError: the time for reading is over, or the values are too long to be held.
+            QueryTimeoutError: the time for reading is over, or the values take too much memory.
         """
         self.known = []
         chars = 0
@@ -179,48 +180,56 @@ class HeldValues:
                 break
         return self.known[::-1]
 
-    def named_after(self, moment: Ns) -> Held | None:
-        """Returns the first value said from a moment on that is no blank text; its end is not read.
+    def named_after(self, moment: Ns) -> HeldValue | None:
+        """Returns the first value from a moment on that is no blank text. Its end is not read.
 
         Raises:
             QueryTimeoutError: the time for reading is over.
         """
         for run in self._runs(TimeWindow(moment, MAX_NS), newest_first=False):
-            held = Held(run.word, run.first, run.last, ended=False)
+            held = HeldValue(run.word, run.first, run.last, ended=False)
             if not held.is_blank:
                 return held
         return None
 
     def _runs(self, window: TimeWindow, *, newest_first: bool) -> Iterator[_Run]:
-        """Yields runs in order, or the newest first; those that go on in the next rows joined."""
+        """Yields the runs of messages with one value, in order or the newest first."""
         waiting: _Run | None = None
-        scanned = scan(
-            self._view, self._topic, window, newest_first=newest_first, reached=self._check
-        )
-        for together in blocks(scanned, newest_first=newest_first):
-            parts = [of_columns(self._view, rows, self._texts_of) for rows in together]
-            if any(part is None for part in parts):
-                runs = self._runs_of_messages(together, window, newest_first=newest_first)
-            else:
-                joined = self._runs_of_columns([column for part in parts for column in part or ()])
-                runs = reversed(joined) if newest_first else iter(joined)
-            for run in runs:
-                older, newer = (run, waiting) if newest_first else (waiting, run)
-                if older is not None and newer is not None and self._goes_on(older, newer):
-                    waiting = _Run(run.word, older.first, newer.last)
-                    continue
-                if waiting is not None:
-                    yield waiting
-                waiting = run
+        for run in self._runs_of_blocks(window, newest_first=newest_first):
+            older, newer = (run, waiting) if newest_first else (waiting, run)
+            if older is not None and newer is not None and self._goes_on(older, newer):
+                waiting = _Run(run.word, older.first, newer.last)
+                continue
+            if waiting is not None:
+                yield waiting
+            waiting = run
         if waiting is not None:
             yield waiting
 
+    def _runs_of_blocks(self, window: TimeWindow, *, newest_first: bool) -> Iterator[_Run]:
+        """Yields the runs of each block of rows: a run may go on in the next block."""
+        scanned = scan(
+            self._view, self._topic, window, newest_first=newest_first, reached=self._check
+        )
+        for block in blocks(scanned, newest_first=newest_first):
+            columns: list[tuple[IntArray, Texts]] = []
+            for rows in block:
+                of_rows = of_columns(self._view, rows, self._words_of)
+                if of_rows is None:
+                    yield from self._runs_of_messages(block, window, newest_first=newest_first)
+                    break
+                columns += of_rows
+            else:
+                runs = self._runs_of_columns(columns)
+                yield from reversed(runs) if newest_first else runs
+
     def _check(self, _: Ns) -> None:
+        """Checks that there is time left for reading."""
         if self._reading.expired():
             raise QueryTimeoutError("out of time; ask about a shorter window")
 
     def _runs_of_columns(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
-        """Returns the runs of rows that overlap in time, in order."""
+        """Returns the runs, in order, of the log times and words of rows that overlap in time."""
         times = np.concatenate([part_times for part_times, _ in parts])
         if not times.size:
             return []
@@ -240,104 +249,115 @@ class HeldValues:
             )
         ]
 
-    def _texts_of(self, rows: Rows) -> tuple[IntArray, Texts] | None:
-        """Returns the log times of some rows, and what each says; None where columns lack it."""
-        texts = words_of(rows.table, self._field, self._view.extractor)
-        if texts is None:
+    def _words_of(self, rows: Rows) -> tuple[IntArray, Texts] | None:
+        """Returns the log time and the value, as JSON text, of each row.
+
+        None if the columns do not have the values.
+        """
+        words = words_of(rows.table, self._field, self._view.extractor)
+        if words is None:
             return None
-        return rows.times, texts if rows.index is None else texts.rows(rows.index)
+        return rows.times, words if rows.index is None else words.rows(rows.index)
 
     def _runs_of_messages(
-        self, together: Sequence[Rows], window: TimeWindow, *, newest_first: bool
+        self, block: Sequence[Rows], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[_Run]:
-        """Yields a run for each message of the times of some rows, one of which may be large."""
-        first, last = min(rows.first for rows in together), max(rows.last for rows in together)
+        """Yields a run for each message in the time of some rows."""
+        first, last = min(rows.first for rows in block), max(rows.last for rows in block)
         part = window.intersect(TimeWindow(first, last + 1))
         for stored in self._view.stream.messages([self._topic], part, newest_first=newest_first):
             self._check(stored.time)
             message = self._view.bags.decode(stored)
             if message is not None:
-                word = json.dumps(self._said(message, stored.type))
+                word = json.dumps(self._value_of(message, stored.type))
                 yield _Run(word, stored.time, stored.time)
 
-    def _said(self, message: object, type_name: str) -> JsonValue:
-        """Returns the value of a message, of an object with one key that; but no array's size."""
+    def _value_of(self, message: object, type_name: str) -> JsonValue:
+        """Returns the value in a message; an object with one key stands for its value."""
         extractor, field = self._view.extractor, self._field
         value = (
             extractor.exact(message, type_name)
             if field is None
             else extractor.exact_at(message, type_name, field)
         )
+        # A summary stands for an array that is too long to be shown.
         if isinstance(value, dict) and len(value) == 1 and not isinstance(value, Summary):
             [value] = value.values()
-        return _as_said(value)
+        return _canonical(value)
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
+        """Whether a run goes on in the next one, with nothing in between that ends it."""
         return older.word == newer.word and self._end_of(older, newer) == (newer.first, True)
 
-    def _end_of(self, run: _Run, after: _Run | None) -> tuple[Ns, bool]:
-        """Returns until when a run is known to hold, and whether the next run ends it then."""
-        following = MAX_NS if after is None else after.first
-        if not self._holds_on and following - run.last > SILENCE_NS:
+    def _end_of(self, run: _Run, following: _Run | None) -> tuple[Ns, bool]:
+        """Returns until when a run is known to hold, and whether the following run ends it."""
+        next_first = MAX_NS if following is None else following.first
+        if not self._holds_on and next_first - run.last > SILENCE_NS:
             return run.last, False
         nth = bisect_left(self._breaks, run.last)
-        if nth < len(self._breaks) and self._breaks[nth] < following:
+        if nth < len(self._breaks) and self._breaks[nth] < next_first:
             return self._breaks[nth], False
-        if after is None:
+        if following is None:
             return max(run.last, self._view.snapshot.latest or run.last), False
-        return following, True
+        return next_first, True
 
 
 def breaks_of(view: View, topic: str) -> list[Ns]:
-    """Returns the moments from which on what a topic said before is not known to hold, in order.
+    """Returns the moments, in order, after which an earlier value is not known to hold.
 
-    Also where bags of a wrong clock end before the others, and where these end before more.
+    Messages were deleted then, another run of the recorder began, or the clock was wrong: misdated
+    bags before the memory end, or those after it begin.
     """
-    snapshot, breaks = view.snapshot, list[Ns]()
-    breaks += deletions(view, topic)
+    snapshot = view.snapshot
+    breaks = {*deletions(view, topic)}
     if not is_latched(view, topic):
-        breaks += [start for start, _ in snapshot.breaks]
-    if snapshot.earliest is not None and snapshot.latest is not None:
+        breaks.update(start for start, _ in snapshot.breaks)
+    earliest, latest = snapshot.earliest, snapshot.latest
+    if earliest is not None and latest is not None:
         bags = [fault.bag for fault in snapshot.misdated]
-        breaks += sorted(bag.end for bag in bags if bag.end < snapshot.earliest)[-1:]
-        breaks += [snapshot.latest] if any(bag.start > snapshot.latest for bag in bags) else []
-    return sorted(set(breaks))
+        ends_before = [bag.end for bag in bags if bag.end < earliest]
+        if ends_before:
+            breaks.add(max(ends_before))
+        if any(bag.start > latest for bag in bags):
+            breaks.add(latest)
+    return sorted(breaks)
 
 
 def deletions(view: View, topic: str) -> Sequence[Ns]:
-    """Returns the moments from which on messages of a topic may have been deleted, up to its next.
+    """Returns the moments after which messages of a topic may have been deleted, up to its next.
 
-    Of bags that go as a whole, retention carries on what a latched topic said newest, and what held
-    while something was recorded that stays. So after its last message in a time that was deleted,
-    no more was; nor where it has none there.
+    When retention deletes bags as a whole, it carries on the newest value of a latched topic, and
+    the values that held while something was recorded that stays. So after the last carried message
+    of a deleted time nothing is missing, and if the topic has none there, nothing was deleted.
     """
     known = view.memo.of(_DELETIONS, dict)
     if topic not in known:
         cut = cut_spans(view.bag_dir, topic, TimeWindow.everything())
-        known[topic] = [start for start, _ in cut]
+        moments = [start for start, _ in cut]
         statics = view.limits.latching.static_topics
         is_carried_on = view.timeline.is_transient_state(topic) or topic in statics
-        for end, deleted in deleted_by_gap(view, TimeWindow(0, MAX_NS)):
-            window = TimeWindow(deleted[0][0], end + 1)
+        for gap_end, deleted in deleted_by_gap(view, TimeWindow(0, MAX_NS)):
+            begin, _ = deleted[0]
             if not is_carried_on:
-                known[topic].append(window.start)
+                moments.append(begin)
                 continue
-            scanned = scan(view, topic, window, columns=False)
+            scanned = scan(view, topic, TimeWindow(begin, gap_end + 1), columns=False)
             times = [*chain.from_iterable(rows.times.tolist() for rows in scanned)]
             newest = max(times, default=MIN_NS)
-            known[topic] += [at for at in (window.start, *times) if at < newest]
+            moments += [at for at in (begin, *times) if at < newest]
+        known[topic] = moments
     return known[topic]
 
 
-def _as_said(value: JsonValue) -> JsonValue:
-    """Returns a value in the form that all equal ones have: 2 for 2.0, and 0 for -0.0."""
+def _canonical(value: JsonValue) -> JsonValue:
+    """Returns a value in the one form of all equal values: 2 for 2.0, and 0 for -0.0."""
     if isinstance(value, dict):
-        return {name: _as_said(part) for name, part in value.items()}
+        return {name: _canonical(part) for name, part in value.items()}
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def is_latched(view: View, topic: str) -> bool:
-    """Returns whether a topic is latched: what it said last holds."""
+    """Returns whether a topic is latched: its last message holds."""
     return view.limits.latching.is_latched(view.snapshot, topic)
 
 
@@ -347,23 +367,25 @@ def is_text(view: View, topic: str) -> bool:
 
 
 def held_until(view: View, topic: str, last: Ns, end: Ns) -> Ns:
-    """Returns until when what a message at `last` stated held, at most until `end`.
+    """Returns until when the message of a topic at `last` held (log time, ns), at most `end`.
 
-    On a latched topic to its next message, or as far as something is recorded. On another one to
-    its next message, too, and not at all after `last` where that comes later than `SILENCE_NS`.
+    On a latched topic it holds until the next message, or as far as something is recorded. On
+    another topic it holds until the next message if that comes within `SILENCE_NS`, else it does
+    not hold after `last`.
     """
-    lasting = is_latched(view, topic)
-    stop = end if lasting else last + SILENCE_NS
-    following = view.stream.first([topic], TimeWindow(last + 1, stop + 1))
-    if lasting:
-        ends = [moment for moment in breaks_of(view, topic) if moment >= last]
-        ends += [end, view.snapshot.latest or end]
-        return max(last, min([*ends, *([] if following is None else [following.time])]))
+    if is_latched(view, topic):
+        ends = [end, view.snapshot.latest or end]
+        ends += [moment for moment in breaks_of(view, topic) if moment >= last]
+        following = view.stream.first([topic], TimeWindow(last + 1, end + 1))
+        if following is not None:
+            ends.append(following.time)
+        return max(last, min(ends))
+    following = view.stream.first([topic], TimeWindow(last + 1, last + SILENCE_NS + 1))
     return last if following is None else max(last, min(following.time, end))
 
 
 def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
-    """Returns the message before a moment that still held then, on a latched topic."""
+    """Returns the message of a latched topic that held at a moment; None on other topics."""
     if not is_latched(view, topic):
         return None
     before = view.stream.last(topic, moment)
@@ -373,9 +395,9 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
 
 
 def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
-    """Returns whether the newest message of its topic before a moment is latched and holds then.
+    """Returns whether the newest message before a moment is latched and holds then.
 
-    Nothing is known to hold in a time that was excluded.
+    In a time that was excluded, nothing is known to hold.
     """
     return (
         view.limits.latching.holds(view.snapshot, stored)
@@ -385,7 +407,7 @@ def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
 
 
 def holds_on(view: View, topics: Iterable[str]) -> bool:
-    """Returns whether the newest messages of topics hold on: they are latched, or seldom."""
+    """Returns whether messages of topics hold through silence: the topics are latched or rare."""
     timeline = view.timeline
     return all(
         is_latched(view, topic)

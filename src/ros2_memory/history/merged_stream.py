@@ -1,7 +1,7 @@
 """Many bags as one stream: in log-time order, each message once.
 
-Messages of one log time are in the order of their recordings' names, then of their bags. Which
-ones count where recordings overlap, `columns.units` says.
+Messages with one log time are sorted by the names of their recordings, then by their bags. Where
+recordings overlap, `columns.units` decides which copies count.
 
 A new recording receives latched messages again: with a new log time and the original publish time.
 Such a message counts once too, at its earliest log time, however long ago that is.
@@ -12,7 +12,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter, deque
 from functools import partial
-from itertools import chain, pairwise
+from itertools import chain, compress, pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.bag_access import BagAccess
     from ros2_memory.history.stored_message import StoredMessage
 
-_Row: TypeAlias = tuple[str, Ns, Ns, int]
-"""Of a message of a topic: its file, log time, publish time, and the hash of its payload."""
+_MessageKey: TypeAlias = tuple[str, Ns, Ns, int]
+"""What tells messages of a topic apart: file, log time, publish time, and hash of the payload."""
 
 
 class MergedStream:
@@ -52,16 +52,18 @@ class MergedStream:
         self._searched: dict[str, Spans] = {}
 
     def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[TopicExtent]:
-        """Returns the bags that hold messages of these topics in the window, in order.
+        """Returns the bags that may hold messages of these topics in the window, in order.
 
-        Each with the times of its first and last message of those that reach into the window.
+        With the first and last log time of these topics in each bag; of topics that do not reach
+        into the window, none.
         """
-        spans: dict[str, TopicExtent] = {}
+        extents: dict[str, TopicExtent] = {}
         for topic in topics:
-            for bag, first, last in self._timeline.extents(topic, window):
-                known = spans.get(bag.file, TopicExtent(bag, first, last))
-                spans[bag.file] = TopicExtent(bag, min(first, known.first), max(last, known.last))
-        return sorted(spans.values(), key=_span_order)
+            for extent in self._timeline.extents(topic, window):
+                bag, first, last = extent
+                known = extents.get(bag.file, extent)
+                extents[bag.file] = TopicExtent(bag, min(first, known.first), max(last, known.last))
+        return sorted(extents.values(), key=_in_time)
 
     def messages(
         self,
@@ -70,7 +72,7 @@ class MergedStream:
         *,
         newest_first: bool = False,
     ) -> Iterator[StoredMessage]:
-        """Returns the messages of the topics in the window in log-time order, each one once.
+        """Returns the messages of the topics in the window in log-time order, each once.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -100,10 +102,10 @@ class MergedStream:
         return self.newest(topic, TimeWindow(MIN_NS, before))
 
     def _segment_windows(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
-        """Returns the window cut where segments begin, to hold few bags at a time.
+        """Returns the window cut where segments begin, so that few bags are open at a time.
 
         It is also cut after the first and before the last message of each segment: many callers
-        read no other.
+        read only these.
         """
         edges = {window.start, window.stop}
         for segment in self._timeline.segments_in(window):
@@ -118,19 +120,19 @@ class MergedStream:
         self, topics: Sequence[str], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[StoredMessage]:
         near = self.overlapping_bags(topics, window.widened(COPY_HORIZON_NS))
-        bags = [span for span in near if window.overlaps(span.first, span.last)]
-        messages = self.merged(bags, topics, window, newest_first=newest_first)
-        shared = overlap_spans((span.first, span.last, span.bag.recording) for span in near)
+        inside = [extent for extent in near if window.overlaps(extent.first, extent.last)]
+        messages = self.merged(inside, topics, window, newest_first=newest_first)
+        shared = overlap_spans((extent.first, extent.last, extent.bag.recording) for extent in near)
         if shared:
             messages = self._without_copies(messages, window, shared)
         if self.may_be_repeated(topics):
             messages = (message for message in messages if not self._is_repeated(message))
-        if all(span.bag.state is BagState.CLOSED for span in bags):
+        if all(extent.bag.state is BagState.CLOSED for extent in inside):
             return messages
         return self.bags.track_sources(messages)
 
     def may_be_repeated(self, topics: Iterable[str]) -> bool:
-        """Whether two recordings may have received one latched message of these topics."""
+        """Whether two recordings may have received the same latched message of a topic."""
         return any(
             topic in self._timeline.transient_local and len(self._timeline.recordings(topic)) > 1
             for topic in topics
@@ -139,47 +141,52 @@ class MergedStream:
     def _without_copies(
         self, messages: Iterable[StoredMessage], window: TimeWindow, shared: Spans
     ) -> Iterator[StoredMessage]:
-        """Yields messages of a window, in any order of time, without the copies among them.
+        """Yields messages of a window, in either order of time, without copies.
 
-        It is looked at some seconds of a topic at once, where recordings share them.
+        `shared` are the spans in which recordings may hold copies. Copies are looked up for one
+        topic and some seconds at once.
         """
-        asked: dict[str, tuple[Ns, Counter[_Row]]] = {}
+        looked_up: dict[str, tuple[Ns, Counter[_MessageKey]]] = {}
         for stored in messages:
-            if lies_inside(shared, stored.time):
-                topic, begin = stored.topic, stored.time - stored.time % COPY_HORIZON_NS
-                if topic not in asked or asked[topic][0] != begin:
-                    part = TimeWindow(begin, begin + COPY_HORIZON_NS).intersect(window)
-                    asked[topic] = begin, self._copies(topic, part)
-                _, copies = asked[topic]
-                row = stored.bag.file, stored.time, *stored.identity
-                if copies[row]:
-                    copies[row] -= 1
-                    continue
-            yield stored
+            if not lies_inside(shared, stored.time):
+                yield stored
+                continue
+            topic, begin = stored.topic, stored.time - stored.time % COPY_HORIZON_NS
+            known_begin, copies = looked_up.get(topic, (None, Counter[_MessageKey]()))
+            if known_begin != begin:
+                part = TimeWindow(begin, begin + COPY_HORIZON_NS).intersect(window)
+                copies = self._count_copies(topic, part)
+                looked_up[topic] = begin, copies
+            key = stored.bag.file, stored.time, *stored.identity
+            if copies[key]:
+                copies[key] -= 1
+            else:
+                yield stored
 
-    def _copies(self, topic: str, part: TimeWindow) -> Counter[_Row]:
-        """Returns how many messages of a part of a topic are copies, by what tells them apart."""
+    def _count_copies(self, topic: str, part: TimeWindow) -> Counter[_MessageKey]:
+        """Returns how many messages with each key are copies, in a part of a topic."""
         around = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
-        bags = self.overlapping_bags([topic], around)
-        recordings = sorted({str(span.bag.recording) for span in bags})
+        extents = self.overlapping_bags([topic], around)
+        recordings = sorted({str(extent.bag.recording) for extent in extents})
         number_of = {recording: number for number, recording in enumerate(recordings)}
-        merged = self.merged(bags, [topic], around, since=part.start)
-        rows = [
-            (number_of[str(stored.bag.recording)], (stored.bag.file, stored.time, *stored.identity))
-            for stored in merged
-        ]
-        columns = np.array([(*row[1:], number) for number, row in rows], np.int64).reshape(-1, 4)
-        are_copies = copies_among(Identities(*columns.T))
-        return Counter(row for (_, row), is_copy in zip(rows, are_copies, strict=True) if is_copy)
+        keys: list[_MessageKey] = []
+        rows: list[tuple[Ns, Ns, int, int]] = []
+        for stored in self.merged(extents, [topic], around, since=part.start):
+            keys.append((stored.bag.file, stored.time, *stored.identity))
+            rows.append((stored.time, *stored.identity, number_of[str(stored.bag.recording)]))
+        columns = np.array(rows, np.int64).reshape(-1, 4).T
+        return Counter(compress(keys, copies_among(Identities(*columns))))
 
     def find_first_copy(self, stored: StoredMessage) -> None:
-        """Notes what cannot be read where a message may have been received before."""
+        """Reads where a message may have been received before, for the notes on what is damaged."""
         topic, window = stored.topic, _since_published(stored)
         if stored.record.may_be_repeated and self.may_be_repeated([topic]):
-            copies = self.merged(self.overlapping_bags([topic], window), [topic], window)
-            next((copy for copy in copies if copy.identity == stored.identity), None)
+            for copy in self.merged(self.overlapping_bags([topic], window), [topic], window):
+                if copy.identity == stored.identity:
+                    break
 
     def _is_repeated(self, stored: StoredMessage) -> bool:
+        """Whether another recording received the same latched message earlier."""
         if not stored.record.may_be_repeated:
             return False
         self._find_first_copies(stored)
@@ -187,24 +194,24 @@ class MergedStream:
         first_time, first_recording = self._first_copies.get((stored.topic, *stored.identity), own)
         return stored.time > first_time and stored.bag.recording != first_recording
 
-    def _find_first_copies(self, late: StoredMessage) -> None:
-        """Records the first reception of every message that a late one may repeat.
+    def _find_first_copies(self, repeated: StoredMessage) -> None:
+        """Finds the first reception of each message in the time since one was published.
 
-        Late messages come many at once. So the search covers the rest of the late one's bag, and as
-        much again before its window: a few searches serve them all.
+        Many messages are repeated at once. So the search also covers the rest of the bag, and as
+        much time again before: a few searches serve them all.
         """
-        topic, window = late.topic, _since_published(late)
+        topic, window = repeated.topic, _since_published(repeated)
         searched = self._searched.setdefault(topic, [])
         if not without([(window.start, window.stop)], searched):
             return
-        back = max(window.start - (window.stop - window.start), MIN_NS)
-        missing = without([(back, max(window.stop, late.bag.end + 1))], searched)
+        begin = max(window.start - (window.stop - window.start), MIN_NS)
+        missing = without([(begin, max(window.stop, repeated.bag.end + 1))], searched)
         for start, stop in missing:
             part = TimeWindow(start, stop)
             bags = self.overlapping_bags([topic], part)
             for message in self.merged(bags, [topic], part, since=window.start):
-                key, first = (topic, *message.identity), (message.time, message.bag.recording)
-                self._first_copies[key] = min(first, self._first_copies.get(key, first))
+                key, reception = (topic, *message.identity), (message.time, message.bag.recording)
+                self._first_copies[key] = min(reception, self._first_copies.get(key, reception))
         self._searched[topic] = united([*searched, *missing])
 
     def merged(
@@ -216,9 +223,9 @@ class MergedStream:
         newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """Yields all messages in order, copies too; opens a bag when the stream reaches it.
+        """Yields all messages in order, including copies. Opens a bag when the stream reaches it.
 
-        What cannot be read is noted, unless all of it lies before `since`.
+        A note reports what cannot be read, unless all of it lies before `since`.
         """
         read = partial(
             self.bags.read, topics=topics, window=window, newest_first=newest_first, since=since
@@ -227,11 +234,11 @@ class MergedStream:
             yield from read(bags[0].bag)
             return
         sign = -1 if newest_first else 1
-        # Each with the earliest sort key that one of its messages can have in the heap.
+        # With the least sort key of each bag's messages: its first message, or its last one.
         waiting = deque(
             sorted(
-                (-span.last if newest_first else span.first, sign * rank, span.bag)
-                for rank, span in enumerate(sorted(bags, key=_recording_order))
+                (-extent.last if newest_first else extent.first, sign * rank, extent.bag)
+                for rank, extent in enumerate(sorted(bags, key=_by_recording))
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
@@ -248,14 +255,14 @@ class MergedStream:
 
 
 def _since_published(stored: StoredMessage) -> TimeWindow:
-    """Returns the window in which a late message may have been received before."""
+    """Returns the window in which another recording may have received a message."""
     since = max(stored.record.publish_time - COPY_HORIZON_NS, MIN_NS)
     return TimeWindow(since, stored.time + 1)
 
 
-def _span_order(span: TopicExtent) -> tuple[Ns, Ns, str]:
-    return span.first, span.last, span.bag.file
+def _in_time(extent: TopicExtent) -> tuple[Ns, Ns, str]:
+    return extent.first, extent.last, extent.bag.file
 
 
-def _recording_order(span: TopicExtent) -> tuple[str, Ns, Ns, str]:
-    return str(span.bag.recording), *_span_order(span)
+def _by_recording(extent: TopicExtent) -> tuple[str, Ns, Ns, str]:
+    return str(extent.bag.recording), *_in_time(extent)

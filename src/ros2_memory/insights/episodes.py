@@ -17,7 +17,7 @@ from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, unix_text
-from ros2_memory.history.held_values import Held, HeldValues, is_text
+from ros2_memory.history.held_values import HeldValue, HeldValues, is_text
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import note_robots
@@ -122,7 +122,7 @@ def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -
     """
     start, _ = scope.window.asked()
     waiting: Episode | None = None
-    newer: Held | None = None
+    newer: HeldValue | None = None
     texts = (held for held in values.back(scope.window.stop) if not held.is_blank)
     while True:
         try:
@@ -143,7 +143,7 @@ def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -
         newer = held
 
 
-def spell_of(held: Held) -> Spell:
+def spell_of(held: HeldValue) -> Spell:
     """Returns a value that held, as replies show it."""
     value = held.value
     shown = shortened(value, _LONGEST_TEXT) if isinstance(value, str) else value
