@@ -6,7 +6,7 @@ import math
 import re
 from contextlib import suppress
 from itertools import chain
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.layout import is_derived, is_thinned
@@ -45,21 +45,21 @@ if TYPE_CHECKING:
 
 GIVE_TOPIC: Final = "give topic where the tool takes it"
 _DEFAULT_POSES: Final = "/odom"
-"""`data.pose_topic` where nobody chose another."""
+"""The default of `data.pose_topic`."""
 _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|plan|marker")
-"""Names of topics whose poses are not those of the robot."""
+"""Matches names of topics whose poses are not the robot's."""
 MOST_TRIED: Final = 20
-"""Topics of unknown content that are looked into for poses."""
+"""At most this many topics of unmapped types are looked into for poses."""
 _NEAR_NS: Final = 60 * NS_PER_S
-"""An older message may stand in for a missing one; farther back it says nothing about the time."""
+"""A message that is older by no more may stand in for a missing one."""
 _CLOCKS_DIFFER_NS: Final = 60 * NS_PER_S
-"""A time that is later than now by no more may be now by the clock of who asks."""
+"""A time that is later than now by no more may be now by the clock of the client."""
 ON_DISK_S: Final = 3
-"""A message that the recorder received longer ago is on disk, as small as its chunks are."""
+"""A received message is on disk after this time: the recorder's chunks are small."""
 
 
 def resolve_topic(view: View, name: str) -> str:
-    """Returns the recorded topic of a name; a missing or extra leading slash is accepted.
+    """Returns the recorded topic with a name, with or without its leading slash.
 
     Raises:
         NoDataError: `topic_not_recorded` with the nearest names, or `empty_memory`.
@@ -72,11 +72,10 @@ def resolve_topic(view: View, name: str) -> str:
 
 
 def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False) -> str | None:
-    """Returns the only topic with the robot's poses where `data.pose_topic` is not recorded.
+    """Returns the only topic with the robot's poses, if `data.pose_topic` is not recorded.
 
-    With `degrees` that of the only satellite receiver, if there is none with poses. None where
-    there is more than one, or somebody chose `data.pose_topic`; goals and clicked points do not
-    count.
+    With `degrees`, the only topic of a satellite receiver if no topic has poses. None if there is
+    more than one topic, or if somebody set `data.pose_topic`.
     """
     configured = view.limits.pose_topic
     if configured != _DEFAULT_POSES or configured in view.timeline.topics():
@@ -88,19 +87,21 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
 
 
 def topics_of_robot(view: View, what: str) -> list[str]:
-    """Returns the names of `topics_with`, without goals and points that somebody clicked."""
-    names = dict.fromkeys(named.partition(" ")[0] for named in topics_with(view, what))
-    return [topic for topic in names if not _OF_OTHERS.search(topic)]
+    """Returns the topics that carry `what` of the robot, without goals and clicked points.
+
+    `what` is as in `topics_with`.
+    """
+    return [topic for topic in _types_with(view, what) if not _OF_OTHERS.search(topic)]
 
 
 def has_poses(view: View) -> bool:
-    """Whether a topic has the robot's poses; `View.has_poses` remembers it."""
+    """Whether a topic has the robot's poses. `View.has_poses` remembers it."""
     extractor = view.extractor
-    # Asked first, and cheap: of other topics it takes longer to know.
+    # The configured topic first: it is cheap to know, and mostly enough.
     for type_name in view.timeline.types_of(view.limits.pose_topic):
         if not extractor.is_mapped(type_name) or "position" in extractor.kinds_of(type_name):
             return True
-    return bool(topics_of_robot(view, "position") or topics_that_show(view))
+    return bool(topics_of_robot(view, "position") or unmapped_topics_with(view))
 
 
 def resolve_pose_topic(
@@ -114,14 +115,14 @@ def resolve_pose_topic(
 
     Args:
         view: what is recorded.
-        name: the topic that was asked for; None for `data.pose_topic`, or with a note for the only
-            other one that there is.
+        name: the topic that was asked for; None for `data.pose_topic`, or, with a note, for
+            `only_pose_topic`.
         what: "position" or "velocity".
         degrees: whether the latitude and longitude of a satellite receiver answer too.
 
     Raises:
-        NoDataError: as for `resolve_topic`; where the configured topic is not recorded the sentence
-            names those that carry poses, or else what the bags have in their place.
+        NoDataError: as for `resolve_topic`. If the configured topic is not recorded, the sentence
+            names topics with poses, or what the bags have instead.
     """
     if name is not None:
         return resolve_topic(view, name)
@@ -136,37 +137,37 @@ def resolve_pose_topic(
     try:
         return resolve_topic(view, configured)
     except NoDataError as error:
-        where = _where_it_is(view, what, degrees=degrees)
-        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED or where is None:
+        alternative = _describe_alternative(view, what, degrees=degrees)
+        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED or alternative is None:
             raise
-        detail = f"data.pose_topic is {configured}, which these bags do not have{where}"
+        detail = f"data.pose_topic is {configured}, which these bags do not have{alternative}"
         raise NoDataError(error.reason, detail, error.notes) from error
 
 
-def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
-    """Returns where positions or velocities are in bags without `data.pose_topic`, and the setting.
+def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None:
+    """Returns a clause on other topics with positions or velocities, or on what is like them.
 
-    Else what the bags have in their place; None where they have nothing like it.
+    None if the bags have nothing like them.
     """
     those = {"position": "poses", "velocity": "velocities"}[what]
     topics = topics_with(view, what)
     if not topics and what == "position":
-        topics = topics_that_show(view)
+        topics = unmapped_topics_with(view)
     if topics:
-        which = topics[0].partition(" ")[0] if len(topics) == 1 else "to one of them"
-        return (
-            f"; {those} are on {listed(topics)}: set data.pose_topic"
-            f"{'=' if len(topics) == 1 else ' '}{which}, or {GIVE_TOPIC}"
-        )
+        name, _, _ = topics[0].partition(" ")
+        value = f"={name}" if len(topics) == 1 else " to one of them"
+        return f"; {those} are on {listed(topics)}: set data.pose_topic{value}, or {GIVE_TOPIC}"
     if what == "position" and (
-        fixes := topics_with(view, "geodetic") or topics_that_show(view, "geodetic")
+        fixes := topics_with(view, "geodetic") or unmapped_topics_with(view, "geodetic")
     ):
         advice = "give topic" if degrees else "get_position_at answers them by topic"
         return (
             ", nor another with poses in metres; latitude and longitude are on "
             f"{listed(fixes)}: {advice}"
         )
-    if what == "velocity" and (posed := topics_with(view, "position") or topics_that_show(view)):
+    if what == "velocity" and (
+        posed := topics_with(view, "position") or unmapped_topics_with(view)
+    ):
         return (
             f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
             "returns speeds from them, by topic"
@@ -182,11 +183,11 @@ def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
     return None
 
 
-def topics_that_show(view: View, what: str = "position") -> list[str]:
+def unmapped_topics_with(view: View, what: str = "position") -> list[str]:
     """Returns topics of types outside the schema map whose newest message has a pose.
 
-    Or latitude and longitude, if `what` is "geodetic". Each with its type behind it, of at most
-    `MOST_TRIED` topics: for an error alone.
+    Or, if `what` is "geodetic", latitude and longitude. Each is followed by its type. At most
+    `MOST_TRIED` topics are read.
     """
     extractor, timeline = view.extractor, view.timeline
     unmapped = [
@@ -194,38 +195,48 @@ def topics_that_show(view: View, what: str = "position") -> list[str]:
         for topic in timeline.topics()
         if not any(extractor.is_mapped(type_name) for type_name in timeline.types_of(topic))
     ]
-    shown = []
+    topics = []
     for topic in unmapped[:MOST_TRIED]:
-        # What a lake does not hold, as images, shows nothing.
+        # A message cannot be decoded, or a lake does not hold it, as an image.
         with suppress(NoDataError, NotInLakeError):
-            newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
+            newest = view.stream.last(topic)
             if newest is None:
                 continue
             message, type_name = decode(view, newest), newest.type
             if what == "geodetic":
-                is_shown = extractor.geodetic(message, type_name) is not None
+                has_it = extractor.geodetic(message, type_name) is not None
             else:
                 pose = extractor.pose(message, type_name)
-                is_shown = pose is not None and pose.orientation is not None
-            if is_shown:
-                shown.append(f"{topic} ({newest.type})")
-    return shown
+                has_it = pose is not None and pose.orientation is not None
+            if has_it:
+                topics.append(f"{topic} ({type_name})")
+    return topics
 
 
 def topics_with(view: View, what: str) -> list[str]:
-    """Returns the recorded topics of types that carry `position`, `velocity` or `geodetic`.
+    """Returns the recorded topics that carry `position`, `velocity` or `geodetic`.
 
-    Each with its type behind it. What types that are not in the schema map carry is not known.
+    Each is followed by its type. Types outside the schema map are not looked into.
     """
-    kinds_of, types = view.extractor.kinds_of, view.timeline.types
-    all_types = set(chain(*types.values()))
-    carriers = {type_name for type_name in all_types if what in kinds_of(type_name)}
     return [
         f"{topic} ({type_name})"
-        for topic, names in types.items()
-        for type_name in names
-        if type_name in carriers
+        for topic, type_names in _types_with(view, what).items()
+        for type_name in type_names
     ]
+
+
+def _types_with(view: View, what: str) -> dict[str, list[str]]:
+    """Returns by topic its types that carry `what`."""
+    kinds_of, types = view.extractor.kinds_of, view.timeline.types
+    # Each type is looked up once: thousands of topics may share it.
+    all_types = set(chain.from_iterable(types.values()))
+    carriers = {type_name for type_name in all_types if what in kinds_of(type_name)}
+    carried: dict[str, list[str]] = {}
+    for topic, names in types.items():
+        for name in names:
+            if name in carriers:
+                carried.setdefault(topic, []).append(name)
+    return carried
 
 
 def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
@@ -243,7 +254,7 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
 
 
 def nothing_here(snapshot: Snapshot) -> str:
-    """Returns the sentence on a bag directory in which no bag answers."""
+    """Returns the sentence on a bag directory without a bag that answers."""
     held_splits = [split for split in snapshot.active if split.reason == HELD_BACK]
     if held_splits:
         splits = counted(len(held_splits), "split")
@@ -262,7 +273,7 @@ def require_bags(view: View) -> None:
     """Checks that the memory holds something.
 
     Raises:
-        NoDataError: `empty_memory`, or `not_closed_yet` where splits are there that do not answer.
+        NoDataError: `empty_memory`, or `not_closed_yet` if there are only splits being written.
     """
     snapshot = view.snapshot
     if snapshot.bags:
@@ -283,7 +294,7 @@ def require_bags(view: View) -> None:
 
 
 def not_recorded(view: View, name: str) -> NoDataError:
-    """Returns the error for a topic of which no closed bag holds a message.
+    """Returns the error for a topic without a message in any bag.
 
     Raises:
         NoDataError: nothing is recorded at all.
@@ -313,40 +324,51 @@ def no_data_at(
     *,
     deleted: bool = False,
 ) -> NoDataError:
-    """Returns the error for no message of these topics at a moment or within a tolerance before.
+    """Returns the error for no message of these topics near a moment.
 
-    With `around`, neither so long after it. `deleted`: one may have been deleted. The sentence
-    names the nearest older and newer message with their distances, and what to do.
+    The sentence names the nearest messages, and what to do.
+
+    Args:
+        view: of the call.
+        topics: of which there is no message.
+        at: the moment.
+        tolerance: how far before it a message would have counted (ns); None for any time before.
+        around: how far before and after it a message would have counted; instead of `tolerance`.
+        deleted: whether a message that would have counted may have been deleted.
     """
-    older, newer, elsewhere, is_between = _nearest(
-        view, topics, TimeWindow(at, at + 1), (at, at + 1)
-    )
-    when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
+    this_moment = TimeWindow(at, at + 1)
+    nearest = _nearest(view, topics, this_moment, (at, at + 1))
+    older, newer = nearest.older, nearest.newer
     if around is not None:
-        when = f"within {seconds(around)} of"
-    before = tolerance if around is None else around
-    start = MIN_NS if before is None else max(at - before, MIN_NS)
-    window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
-    reason, why = between(view, window) if is_between else beyond(view, at), list[str]()
-    if older and newer and around is None and reason is NoDataReason.GAP:
-        reason, why = _within_recording(view, older, newer)
-    excluded = excluded_between(view.bag_dir, at, at + 1)
+        when, start, stop = f"within {seconds(around)} of", at - around, at + around + 1
+    elif tolerance is not None:
+        when, start, stop = f"within {seconds(tolerance)} before", at - tolerance, at + 1
+    else:
+        when, start, stop = "at or before", MIN_NS, at + 1
+    window = TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
+    why: list[str] = []
+    if not nearest.on_both_sides:
+        reason = reason_beyond(view, at)
+    else:
+        reason = reason_between(view, window)
+        if older and newer and around is None and reason is NoDataReason.GAP:
+            reason, why = _reason_within_recording(view, older, newer)
     if (
         deleted
-        or excluded
+        or excluded_between(view.bag_dir, at, at + 1)
         or _cut_topics(view, window).issuperset(topics)
-        or _is_thinned(view, TimeWindow(at, at + 1))
+        or _is_thinned(view, this_moment)
     ):
         reason = NoDataReason.DELETED
     detail = [
         f"no message of {' or '.join(topics)} {when} {unix_text(at)}",
-        *elsewhere,
+        *nearest.only_elsewhere,
         *_distances(at, older, newer, tolerance),
         *why,
         *_advice(view, reason, at),
     ]
     is_near = older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance)
-    if older and is_near and not _to_come(view, at):
+    if older and is_near and not _describe_future(view, at):
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
@@ -359,7 +381,7 @@ def _distances(
     if older:
         ago = seconds(at - older.time)
         if tolerance is not None and ago == seconds(tolerance):
-            # Rounded it would read as near enough.
+            # Rounded, it would read as if it were near enough.
             ago = f"{unix_from_ns(at - older.time):.6f} s"
         yield f"the nearest older one is {ago} before it, at {unix_text(older.time)}"
     if newer:
@@ -368,24 +390,21 @@ def _distances(
 
 
 def _cut_topics(view: View, window: TimeWindow) -> set[str]:
-    """Returns the topics of which messages of a window were cut out of bags.
-
-    By `retention.topics`, or by request.
-    """
+    """Returns the topics whose messages in a window were cut out by request or retention."""
     losses = read_losses(view.bag_dir, window.start, window.stop)
     return {loss.topic for loss in losses if loss.by in {"expired", "forgotten"}}
 
 
 def _is_thinned(view: View, window: TimeWindow) -> bool:
-    """Whether of some time of a window only some messages stayed, and something was recorded."""
+    """Whether a window lies partly in a thinned day, and not in a gap."""
     times = view.snapshot.timeline.thinned_times
     return overlaps_any(times, window.start, window.stop - 1) and not view.gaps(window)
 
 
-def _within_recording(
+def _reason_within_recording(
     view: View, older: StoredMessage, newer: StoredMessage
 ) -> tuple[NoDataReason, list[str]]:
-    """Returns why there is no message between two that follow each other, and a sentence on it."""
+    """Returns why there is no message between two consecutive ones, and sentences on that."""
     if is_thinned(older.bag.file) and not view.gaps(TimeWindow(older.time + 1, newer.time)):
         why = "of that time only some messages stayed: retention deleted the others"
         return NoDataReason.DELETED, [why]
@@ -399,18 +418,20 @@ def _within_recording(
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
     """Returns the error for no message of these topics in a window."""
-    older, newer, elsewhere, is_between = _nearest(
-        view, topics, window, (window.start - 1, window.stop)
-    )
+    nearest = _nearest(view, topics, window, (window.start - 1, window.stop))
     start, end = window.asked()
-    names = " or ".join(topics)
-    detail = [f"no message of {names} between {unix_text(start)} and {unix_text(end)}", *elsewhere]
-    if older:
-        detail.append(f"the last one before is at {unix_text(older.time)}")
-    if newer:
-        detail.append(f"the first one after is at {unix_text(newer.time)}")
-    newest = min(end, max(start, view.memory.clock.now()))
-    reason = between(view, window) if is_between else beyond(view, newest)
+    detail = [
+        f"no message of {' or '.join(topics)} between {unix_text(start)} and {unix_text(end)}",
+        *nearest.only_elsewhere,
+    ]
+    if nearest.older:
+        detail.append(f"the last one before is at {unix_text(nearest.older.time)}")
+    if nearest.newer:
+        detail.append(f"the first one after is at {unix_text(nearest.newer.time)}")
+    if nearest.on_both_sides:
+        reason = reason_between(view, window)
+    else:
+        reason = reason_beyond(view, min(end, max(start, view.memory.clock.now())))
     if _cut_topics(view, window).issuperset(topics) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
     detail += _advice(view, reason, start)
@@ -420,19 +441,19 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
 def require_recorded(view: View, asked: TimeWindow) -> None:
     """Checks that some of a window was recorded: else "never" and "none" would be false.
 
-    An end that is open is `MIN_NS` or `MAX_NS`. Where the start is not, a note says how much of the
-    window was not recorded.
+    An open end of the window is `MIN_NS` or `MAX_NS`. Unless its start is open, a note says how
+    much of it was recorded.
 
     Raises:
-        NoDataError: nothing of it was.
+        NoDataError: nothing was recorded in it.
     """
-    lies_in = gap_around(view, asked)
-    if lies_in is None:
+    gap = gap_around(view, asked)
+    if gap is None:
         if asked.start > MIN_NS:
             note_unrecorded(view, asked)
         return
     start, end = asked.asked()
-    first, last = lies_in
+    first, last = gap
     if asked.start <= MIN_NS:
         when = f"up to {unix_text(end)}"
     elif asked.stop >= MAX_NS:
@@ -442,106 +463,123 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
     detail = [why_nothing(when, deleted=was_removed(view, asked))]
     if first is not None and last is not None:
         detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
-        reason = between(view, asked)
+        reason = reason_between(view, asked)
     else:
-        reason = beyond(view, start)
+        reason = reason_beyond(view, start)
     detail += _advice(view, reason, start)
     raise with_notes(view, asked, NoDataError(reason, "; ".join(detail)))
 
 
 def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataError:
-    """Returns the error with all notes, also on what of a window without an answer was not read."""
+    """Returns the error with all notes, including those on what was not read of the window."""
     note_unread(view, window, nothing=True)
     return NoDataError(error.reason, error.detail, view.notes.sentences())
 
 
+class _Nearest(NamedTuple):
+    """The messages around a window without a message.
+
+    Attributes:
+        older: the last message before it, unless it is too old to say anything.
+        newer: the first message after it.
+        only_elsewhere: a sentence if the recordings of the window have none of the topics.
+        on_both_sides: whether there are messages before and after it, of whatever time.
+    """
+
+    older: StoredMessage | None
+    newer: StoredMessage | None
+    only_elsewhere: list[str]
+    on_both_sides: bool
+
+
 def _nearest(
     view: View, topics: tuple[str, ...], window: TimeWindow, ends: tuple[Ns, Ns]
-) -> tuple[StoredMessage | None, StoredMessage | None, list[str], bool]:
-    """Returns the last message up to one of the ends (log time), and the first from the other on.
+) -> _Nearest:
+    """Returns the last message up to the first end (log time), and the first from the second on.
 
-    Where the recordings of the window have none of the topics, without messages of another time
-    altogether, as of another robot's bag, and with a sentence on it. At last whether there are
-    messages on both sides, of whatever time.
+    If the recordings of the window have none of the topics, messages of another time are left out:
+    they may be of another robot.
     """
     until, since = ends
-    nearest = (
-        view.stream.first(topics, TimeWindow.until(until), newest_first=True),
-        view.stream.first(topics, TimeWindow(since, MAX_NS)),
-    )
-    elsewhere = _only_elsewhere(view, topics, window)
-    older, newer = (
-        stored
-        if not elsewhere or (stored is not None and abs(stored.time - at) <= LONGEST_OFF_NS)
-        else None
-        for stored, at in zip(nearest, (window.start, window.stop), strict=True)
-    )
-    return older, newer, elsewhere, all(nearest)
+    older = view.stream.first(topics, TimeWindow.until(until), newest_first=True)
+    newer = view.stream.first(topics, TimeWindow(since, MAX_NS))
+    on_both_sides = older is not None and newer is not None
+    only_elsewhere = _only_elsewhere(view, topics, window)
+    if only_elsewhere:
+        if older is not None and window.start - older.time > LONGEST_OFF_NS:
+            older = None
+        if newer is not None and newer.time - window.stop > LONGEST_OFF_NS:
+            newer = None
+    return _Nearest(older, newer, only_elsewhere, on_both_sides)
 
 
 def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> list[str]:
-    """Returns a sentence where the recordings of a window have none of these topics at all.
+    """Returns a sentence if the recordings of a window have none of these topics at all.
 
-    It names topics there that carry what these do (poses, velocities). In a folder with the bags of
+    It names topics there that carry the same (poses, velocities). Where a folder has bags of
     several robots, the nearest message of a topic may be another robot's.
     """
     if _cut_topics(view, window).issuperset(topics):
         return []
     timeline, whole = view.timeline, view.snapshot.metadata_folders
     names: dict[str, None] = {}
-    held: set[str] = set()
+    recorded: set[str] = set()
     for bag in timeline.overlapping(window):
         if is_derived(bag.file):
             continue
-        held.update(bag.summary.schema.positions)
+        recorded.update(bag.summary.schema.positions)
         if is_named_after_folder(bag.file) or str(bag.recording) in whole:
             if any(bag.recording in timeline.recordings(topic) for topic in topics):
                 return []
             names[bag.recording.name] = None
         else:
             names[short_name(bag.path)] = None
-    if not names or not held.isdisjoint(topics):
+    if not names or not recorded.isdisjoint(topics):
         return []
-    alike = _alike(view, topics, held)
-    verb = "has" if len(names) == 1 else "have"
-    recordings = counted(len(names), "recording").removeprefix("1 ")
+    recordings, verb = "recording", "has"
+    if len(names) > 1:
+        recordings, verb = counted(len(names), "recording"), "have"
     sentence = f"the {recordings} of that time, {listed(sorted(names))}, {verb} no such topic"
-    return [sentence + (f"; similar there: {listed(alike)}; give topic" if alike else "")]
+    alike = _topics_alike(view, topics, recorded)
+    if alike:
+        sentence += f"; similar there: {listed(alike)}; give topic"
+    return [sentence]
 
 
-def _alike(view: View, topics: tuple[str, ...], held: set[str]) -> list[str]:
-    """Returns which of the `held` topics carry all that some topics do, or else some of it."""
+def _topics_alike(view: View, topics: tuple[str, ...], recorded: set[str]) -> list[str]:
+    """Returns recorded topics that carry all that `topics` carry, or else some of it."""
 
-    def carried(*topics: str) -> set[str]:
+    def kinds_of(*topics: str) -> set[str]:
         types = chain.from_iterable(map(view.timeline.types_of, topics))
         return set(chain.from_iterable(map(view.extractor.kinds_of, types)))
 
-    wanted = carried(*topics)
-    similar = [topic for topic in sorted(held) if carried(topic) & wanted]
-    return [topic for topic in similar if carried(topic) >= wanted] or similar
+    wanted = kinds_of(*topics)
+    with_some = [topic for topic in sorted(recorded) if kinds_of(topic) & wanted]
+    return [topic for topic in with_some if kinds_of(topic) >= wanted] or with_some
 
 
-def between(view: View, window: TimeWindow) -> NoDataReason:
+def reason_between(view: View, window: TimeWindow) -> NoDataReason:
     """Returns why a window with messages on both sides has none.
 
-    While one recording takes over from another, the older one may not be on disk as far as the
-    newer one begins: what lies between is no gap.
+    It is no gap while one recording takes over from another: the older one may not be on disk up to
+    where the newer one begins.
     """
     if being_written(view.snapshot, window):
         return NoDataReason.NOT_CLOSED_YET
     return NoDataReason.DELETED if was_removed(view, window) else NoDataReason.GAP
 
 
-def beyond(view: View, at: Ns) -> NoDataReason:
-    """Returns why a moment with no message on one of its sides has no answer."""
+def reason_beyond(view: View, at: Ns) -> NoDataReason:
+    """Returns why a moment without a message before it, or after it, has no answer."""
     latest = view.snapshot.latest
-    if latest is not None and at > latest and view.snapshot.active and not _to_come(view, at):
+    is_recent = latest is not None and at > latest and not _describe_future(view, at)
+    if is_recent and view.snapshot.active:
         return NoDataReason.NOT_CLOSED_YET
     return NoDataReason.OUTSIDE_RANGE
 
 
-def _to_come(view: View, at: Ns) -> list[str]:
-    """Returns a sentence for a moment that is later than now by more than two clocks differ."""
+def _describe_future(view: View, at: Ns) -> list[str]:
+    """Returns a sentence if a moment is later than now by more than clocks may differ."""
     now = view.memory.clock.now()
     if at <= now + _CLOCKS_DIFFER_NS:
         return []
@@ -549,7 +587,7 @@ def _to_come(view: View, at: Ns) -> list[str]:
 
 
 def undecodable(error: UndecodableError) -> NoDataError:
-    """Returns the error for messages that are there, and that cannot be decoded."""
+    """Returns the error for recorded messages that cannot be decoded."""
     return NoDataError(
         NoDataReason.UNDECODABLE,
         f"messages of {error.topic} ({error.type_name}) are recorded but cannot be decoded: "
@@ -570,7 +608,7 @@ def decode(view: View, stored: StoredMessage) -> object:
 
 
 def describe_lack(view: View, what: str, stored: StoredMessage) -> str:
-    """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
+    """Returns the sentence on a topic whose type does not carry `what`, with topics that do."""
     has = f"carries no {what}"
     if view.extractor.geodetic(view.bags.decode(stored), stored.type) is not None:
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
@@ -585,12 +623,12 @@ def describe_lack(view: View, what: str, stored: StoredMessage) -> str:
 
 
 def _active_answers(view: View) -> bool:
-    """Whether files that are being written answer, as far as they are on disk."""
+    """Whether the complete chunks of files that are being written answer."""
     return all(aside.answers for aside in view.snapshot.active)
 
 
 def _advice(view: View, reason: NoDataReason, at: Ns) -> Iterator[str]:
-    """Yields what may help who asked about a moment and later."""
+    """Yields sentences on what to ask instead of a moment."""
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     if earliest is not None and latest is not None:
         yield f"the memory covers {unix_text(earliest)} to {unix_text(latest)}"
@@ -601,4 +639,4 @@ def _advice(view: View, reason: NoDataReason, at: Ns) -> Iterator[str]:
             "the split being written is not read until it closes: ask about an earlier moment, "
             f"or again in {view.limits.closed_after_s:g} s"
         )
-    yield from _to_come(view, at)
+    yield from _describe_future(view, at)

@@ -6,8 +6,8 @@ import math
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
-from operator import itemgetter
-from typing import TYPE_CHECKING, Final
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -35,18 +35,18 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 _MOST_SLICES: Final = 64
-"""Of more between its ends, a block may have most slices without a pose."""
+"""If a block spans more slices, its poses are read to see which slices have some."""
 
 
 @dataclass
 class PoseRows:
-    """Poses that no other ones overlap in time.
+    """A block of poses that no other block overlaps in time. Its poses are read on demand.
 
     Attributes:
-        first: a log time (ns) that none of the poses is earlier than.
-        last: one that none is later than.
+        first: no pose is earlier than this log time (ns).
+        last: no pose is later.
         load: returns the poses.
-        rows: what they are read of; none if not all of them are poses here.
+        rows: the rows that they are read from; empty if some of these rows do not count.
     """
 
     first: Ns
@@ -55,16 +55,20 @@ class PoseRows:
     rows: Sequence[Rows] = ()
 
     def parts_between(self, start: Ns, stop: Ns) -> Sequence[int] | None:
-        """Returns the numbers of the whole parts whose rows at these log times are all poses here.
+        """Returns the numbers of the stored parts that have all poses between two log times.
 
-        None if there may be others, too.
+        None if some of the poses are not in whole parts.
         """
-        parts = [rows.part_between(start, stop) for rows in self.rows]
-        known = [part for part in parts if part is not None]
-        return known if known and len(known) == len(parts) else None
+        parts: list[int] = []
+        for rows in self.rows:
+            part = rows.part_between(start, stop)
+            if part is None:
+                return None
+            parts.append(part)
+        return parts or None
 
     def slices(self, length: Ns) -> Iterable[int]:
-        """Returns which slices of the clock may have poses, counted from the epoch."""
+        """Returns the slices of the clock that may have poses, counted from the epoch."""
         first, last = self.first // length, self.last // length
         if last - first < _MOST_SLICES:
             return range(first, last + 1)
@@ -89,10 +93,16 @@ def pose_rows(
     *,
     among: Callable[[Path], bool],
 ) -> Iterator[PoseRows]:
-    """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
+    """Yields blocks of the poses of a topic in a window, in order of time.
 
-    Positions are rounded to 0.1 mm, as the store has them. Why messages cannot be decoded is added
-    to `failures` as poses are read. `among`: which recordings count.
+    Positions are rounded to 0.1 mm, as in the store.
+
+    Args:
+        view: of the call.
+        topic: of the poses.
+        window: of log time.
+        failures: when poses are read, messages that cannot be decoded are added to it.
+        among: returns whether a recording counts.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -104,12 +114,12 @@ def pose_rows(
 
 
 def poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> dict[str, Poses]:
-    """Returns the poses of each of some bags, by their files; of none in which a message has none.
+    """Returns by file the poses of bags, without bags in which a message has no pose.
 
     Args:
         view: of the call.
-        tables: all rows of a topic, of these bags and of others.
-        files: of the bags.
+        tables: all rows of a topic, of these and other bags.
+        files: the paths of the bags.
     """
     reader = PoseReader(view, [])
     parts: dict[str, list[Poses]] = defaultdict(list)
@@ -121,54 +131,63 @@ def poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> d
     return {file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))}
 
 
+class _Sample(NamedTuple):
+    """The pose of one decoded message, and its speed (m/s), NaN without one."""
+
+    log_time: Ns
+    pose: Pose
+    speed: float
+
+
 class PoseReader:
-    """Reads the poses of rows by their columns, else by their messages.
+    """Reads the poses of rows from their columns, else from their messages.
 
     Args:
-        view: of the memory.
-        failures: why messages cannot be decoded is added to it.
-        beside: recordings that have poses at the same time; those of the other one do not count.
+        view: of the call.
+        failures: messages that cannot be decoded are added to it.
+        parallel: recordings with different poses at the same time: then the `other` one of a pair
+            does not count.
     """
 
     def __init__(
         self,
         view: View,
         failures: list[UndecodableError],
-        beside: Sequence[ParallelRecordings] = (),
+        parallel: Sequence[ParallelRecordings] = (),
     ) -> None:
         self._view = view
         self._failures = failures
-        self._beside = beside
+        self._parallel = parallel
         self._columns = PoseColumns(view.extractor)
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
-        """Returns the poses of rows that overlap in time, in the order of `blocks`."""
-        known = () if any(map(self._held_by_others, rows)) else rows
-        first, last = min(some.first for some in rows), max(some.last for some in rows)
-        return PoseRows(first, last, partial(self._joined, rows), known)
+        """Returns the block of rows that overlap in time, in the order of `blocks`."""
+        first, last = min(part.first for part in rows), max(part.last for part in rows)
+        all_count = not any(map(self._overruling, rows))
+        return PoseRows(first, last, partial(self._joined, rows), rows if all_count else ())
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
-        counting = map(self._without_others, rows)
-        return joined_poses([self.poses(some) for some in counting if len(some)])
+        counting = map(self._counting, rows)
+        return joined_poses([self.poses(part) for part in counting if len(part)])
 
-    def _without_others(self, rows: Rows) -> Rows:
-        """Returns the rows without those whose time another recording has."""
-        for beside in self._held_by_others(rows):
-            is_held = (rows.times >= beside.span.start) & (rows.times < beside.span.stop)
-            if beside.bags:
+    def _counting(self, rows: Rows) -> Rows:
+        """Returns the rows without those at whose time another recording counts."""
+        for pair in self._overruling(rows):
+            is_overruled = (rows.times >= pair.span.start) & (rows.times < pair.span.stop)
+            if pair.bags:
                 is_of_bags = np.zeros(len(rows), np.bool_)
                 for bag, positions in rows.bag_rows():
-                    is_of_bags[positions] = bag.file in beside.bags
-                is_held &= is_of_bags
-            rows = rows.some(np.flatnonzero(~is_held))
+                    is_of_bags[positions] = bag.file in pair.bags
+                is_overruled &= is_of_bags
+            rows = rows.some(np.flatnonzero(~is_overruled))
         return rows
 
-    def _held_by_others(self, rows: Rows) -> list[ParallelRecordings]:
-        """Returns the pairs by which another recording holds the time of these rows first."""
+    def _overruling(self, rows: Rows) -> list[ParallelRecordings]:
+        """Returns the pairs by which another recording counts at times of these rows."""
         return [
-            beside
-            for beside in self._beside
-            if beside.other == rows.recording and beside.span.overlaps(rows.first, rows.last)
+            pair
+            for pair in self._parallel
+            if pair.other == rows.recording and pair.span.overlaps(rows.first, rows.last)
         ]
 
     def poses(self, rows: Rows) -> Poses:
@@ -178,51 +197,52 @@ class PoseReader:
             InvalidArgumentsError: messages carry no position.
         """
         try:
-            poses = of_columns(self._view, rows, self._by_columns)
+            poses = of_columns(self._view, rows, self._read_columns)
         except NoPoseError:
             for message in messages_of(self._view, rows.some(np.array([0]))):
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
-        return self._by_messages(rows) if poses is None else joined_poses(poses)
+        return self._read_messages(rows) if poses is None else joined_poses(poses)
 
     def poses_of_all(self, rows: Rows) -> Poses | None:
-        """Returns the poses of rows, each at the place of its row; None where a row has none."""
+        """Returns one pose for each row; None if a row has none."""
         try:
             poses = self.poses(rows)
         except InvalidArgumentsError:
             return None
         return poses if len(poses) == len(rows) else None
 
-    def _by_columns(self, rows: Rows) -> Poses | None:
+    def _read_columns(self, rows: Rows) -> Poses | None:
         read = partial(self._columns.of, rows.table, rows.times, rows.index)
         if rows.index is None and self._view.call.stored:
-            # Of the poses of a part its path, track, standstills and sights are made.
+            # The path, track, standstills and sights of a part are all made of its poses.
             return rows.table.remember("poses", read, lambda poses: 1000 + 76 * len(poses or ()))
         return read()
 
-    def _by_messages(self, rows: Rows) -> Poses:
+    def _read_messages(self, rows: Rows) -> Poses:
         extractor = self._view.extractor
-        samples: list[tuple[Ns, Pose, float]] = []
+        samples: list[_Sample] = []
         for stored in messages_of(self._view, rows):
             message = self._view.bags.decode(stored, self._failures)
-            if message is not None:
-                pose = extractor.pose(message, stored.type)
-                twist = extractor.twist(message, stored.type)
-                if pose is None:
-                    raise InvalidArgumentsError(describe_lack(self._view, "position", stored))
-                speed = math.nan if twist is None else math.hypot(*twist.linear)
-                samples.append((stored.time, pose, speed))
-        # Those of a part come bag after bag, in the order in which bags were stored.
-        samples.sort(key=itemgetter(0))
-        times, poses, speeds = zip(*samples, strict=True) if samples else ((), (), ())
+            if message is None:
+                continue
+            pose = extractor.pose(message, stored.type)
+            twist = extractor.twist(message, stored.type)
+            if pose is None:
+                raise InvalidArgumentsError(describe_lack(self._view, "position", stored))
+            speed = math.nan if twist is None else math.hypot(*twist.linear)
+            samples.append(_Sample(stored.time, pose, speed))
+        # A part has bag after bag, in the order in which they were stored.
+        samples.sort(key=attrgetter("log_time"))
+        poses = [sample.pose for sample in samples]
         turns = [pose.orientation or (math.nan,) * 4 for pose in poses]
         places = np.array([pose.position for pose in poses], np.float64).reshape(-1, 3)
         frames = Texts.of([pose.frame_id for pose in poses])
         return Poses(
-            np.array(times, np.int64),
+            np.array([sample.log_time for sample in samples], np.int64),
             rounded(places, METRES),
             np.array(turns, np.float64).reshape(-1, 4),
             FrameCodes(frames.codes, frames.words),
-            np.array(speeds, np.float64),
+            np.array([sample.speed for sample in samples], np.float64),
         )

@@ -33,7 +33,7 @@ from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import seconds, unix_text
-from ros2_memory.history.no_data import between, beyond, no_data_at, not_recorded
+from ros2_memory.history.no_data import no_data_at, not_recorded, reason_between, reason_beyond
 from ros2_memory.history.scan import of_columns, scan
 
 if TYPE_CHECKING:
@@ -227,13 +227,14 @@ def _explain_failure(
         ):
             return then
         advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
-        return NoDataError(between(view, near), f"{then.detail}; {advice}")
+        return NoDataError(reason_between(view, near), f"{then.detail}; {advice}")
     inside = (
         topics
         and view.stream.first(topics, TimeWindow.until(at), newest_first=True)
         and view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
     )
-    return NoDataError(between(view, near) if inside else beyond(view, at), failure.detail)
+    reason = reason_between(view, near) if inside else reason_beyond(view, at)
+    return NoDataError(reason, failure.detail)
 
 
 def connects_in_time(

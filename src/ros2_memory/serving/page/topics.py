@@ -27,8 +27,8 @@ from ros2_memory.counts.numbers import SUM_SCALE, Part, PieceNumbers
 from ros2_memory.history.no_data import (
     resolve_topic,
     topics_of_robot,
-    topics_that_show,
     topics_with,
+    unmapped_topics_with,
 )
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
@@ -270,7 +270,7 @@ def _plottable_fields(view: View, topic: str) -> list[str]:
 def _places_robot(view: View) -> list[JsonValue]:
     """Returns the topics that can place the robot: its own poses, other poses, then fixes."""
     of_robot = {*topics_of_robot(view, "position")}
-    poses = _names(topics_with(view, "position") or topics_that_show(view))
+    poses = _names(topics_with(view, "position") or unmapped_topics_with(view))
     poses.sort(key=lambda topic: (topic not in of_robot, topic))
     fixes = _names(topics_with(view, "geodetic"))
     return [
