@@ -1,7 +1,7 @@
 """Search backwards in time for the last message that meets a condition.
 
-Zones and words of columns rule out parts. The times of the others are searched, with every message
-there that decides which ones count.
+Zones and words of columns rule out most messages. At the times of the others, messages are read
+from the merged stream, which decides which copies count.
 """
 
 from __future__ import annotations
@@ -63,19 +63,19 @@ _CONSTANT: Final = re.compile(
 _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
 _MOST_EMPTY: Final = 200
-"""Messages that are looked at for one with elements in its lists."""
+"""At most this many messages are read to find one with elements in its lists."""
 MOST_UNSURE: Final = 32
-"""Messages of a part that are read one by one, where its columns leave open what they meet."""
+"""Up to this many unsure rows of a part are left to their messages; for more, bags are decoded."""
 _MOST_LEFT: Final = 0.5
-"""Where a bag's columns leave open more of them, those of its type are left to the messages."""
-_IN_DEGREES: Final = frozenset({"latitude", "longitude", "altitude"})
+"""If the columns of a bag leave a larger share unsure, bags of that type are not decoded again."""
+_FIX_FIELDS: Final = frozenset({"latitude", "longitude", "altitude"})
 _MOST_TYPES: Final = 3
-"""Types of which the constants are looked at: each costs the channels of a file."""
+"""The constants of this many types are looked up: each reads the channels of a file."""
 _MOST_FRAMES: Final = 3
-"""Topics whose frame is named: each costs one message."""
-_TOGETHER_NS: Final = NS_PER_S
-"""Messages that may match and are no farther apart are read at once."""
-_MOST_TOGETHER: Final = 256
+"""The frames of this many topics are named: each reads one message."""
+_GROUP_GAP_NS: Final = NS_PER_S
+"""Candidates that are no farther apart are read as one group."""
+_LARGEST_GROUP: Final = 256
 _NO_TIMES: Final = np.empty(0, np.int64)
 
 
@@ -88,27 +88,31 @@ def condition_of(
     field: str | None,
     min_score: float | None,
 ) -> Condition:
-    """Returns the condition of a question; without a `min_score` of its own the configured one.
+    """Returns the condition of a question.
 
-    `pattern` is the name or glob of the topics. The field may be a full path in their messages.
-    Where all are of one type, the level of a log or status may be named (WARN), also without a
-    field where it is to be equal, as may a constant of the message definition where the field is a
-    number.
+    If all topics have one type, the value may be the name of a level (WARN) of a log or status, or
+    of a constant of the message definition if the field is a number.
+
+    Args:
+        view: of the call.
+        pattern: name or glob of the topics.
+        condition_type: such as "equals".
+        value: what is compared.
+        field: dot-path; may be a full path in the messages. Not needed for equal levels.
+        min_score: least score of detections; None for the configured one.
 
     Raises:
         NoDataError: no such topic is recorded.
         InvalidArgumentsError: it is no condition.
     """
-    memory = view.memory
-    limits = memory.limits
+    limits, timeline = view.limits, view.timeline
     least = limits.min_score if min_score is None else min_score
-    timeline = view.timeline
     types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
     type_name = next(iter(types)) if len(types) == 1 else ""
     if not field and condition_type == "equals":
         field = level_path(value, type_name)
     if field and type_name:
-        field = memory.extractor.own_path(field.strip(), type_name)
+        field = view.extractor.own_path(field.strip(), type_name)
         value = level_number(value, field, type_name)
         value = _constant_number(view, value, field, type_name)
     try:
@@ -123,13 +127,13 @@ def condition_of(
 
 
 def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
-    """Checks that a charge is not compared with percent where all messages state fractions.
+    """Checks that a charge is not compared with percent if all messages state fractions.
 
-    As sensor_msgs/BatteryState asks for; some drivers publish percent, or no charge. Nothing is
-    refused where there is no time to look at all messages.
+    sensor_msgs/BatteryState asks for a fraction, but some drivers publish percent, or no charge.
+    Nothing is refused if there is no time to look at all messages.
 
     Raises:
-        InvalidArgumentsError: it is.
+        InvalidArgumentsError: the limit is in percent, and the charges are fractions.
     """
     test = condition.test
     if condition.field != "percentage" or not isinstance(test, Beyond) or test.limit <= FULL_CHARGE:
@@ -142,7 +146,7 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
         )
     except QueryTimeoutError:
         return
-    if charged is not None and charge_of(brief.value(charged)) is not None and percent is None:
+    if percent is None and charged is not None and charge_of(brief.value(charged)) is not None:
         raise InvalidArgumentsError(
             "value: percentage is a fraction here, from 0 to 1: "
             f"{test.limit:g} % is {test.limit / 100:g}"
@@ -150,24 +154,25 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
 
 
 def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:
-    """Returns the number of a constant, where a condition on a number gives its whole name.
+    """Returns the number of a constant if the value is its name and the field a number.
 
-    Else the value. A field is a number where the definition has one of its name.
+    Else returns the value.
     """
     word = value.strip() if isinstance(value, str) else ""
     if not _CONSTANT_NAME.fullmatch(word):
         return value
-    is_number = re.compile(_NUMBER_FIELD.format(re.escape(field.rpartition(".")[2])), re.MULTILINE)
+    _, _, name = field.rpartition(".")
+    number_field = re.compile(_NUMBER_FIELD.format(re.escape(name)), re.MULTILINE)
     for schema in _schemas_of(view, type_name):
-        if is_number.search(_text_of(schema)):
-            constants = _CONSTANT.findall(_text_of(schema))
-            numbers = {number for name, number in constants if name == word}
+        text = _text_of(schema)
+        if number_field.search(text):
+            numbers = {number for constant, number in _CONSTANT.findall(text) if constant == word}
             return int(numbers.pop()) if len(numbers) == 1 else value
     return value
 
 
 def _schemas_of(view: View, type_name: str) -> list[Schema]:
-    """Returns the definitions of a type in the first file that has it; none where it is damaged."""
+    """Returns the definitions of a type in the first file that has it; none if it is damaged."""
     timeline = view.timeline
     topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
     if topic is None:
@@ -184,7 +189,7 @@ def _text_of(schema: Schema) -> str:
 
 
 def score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
-    """Returns the note for "never" on a limit of scores that was not asked for, or is above 1."""
+    """Returns a note for "never" if the least score was not asked for, or is above 1."""
     if not condition.min_score or (min_score is not None and min_score <= 1):
         return ()
     unless = "and most scores are from 0 to 1" if min_score else "unless min_score is given"
@@ -192,7 +197,10 @@ def score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...
 
 
 def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
-    """Returns the note on constants that have the word of a text condition, for "never"."""
+    """Returns a note for "never" if constants of the topics' types have the word of the condition.
+
+    Then a number stands for the word.
+    """
     test = condition.test
     word = test.folded if isinstance(test, Contains | Equals) else None
     if condition.field or not word:
@@ -211,24 +219,25 @@ def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tu
 
 
 def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
-    """Returns the note on the frames in which `near_position` compared; none for another test."""
+    """Returns a note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
     named = [f"{', '.join(frames)} ({topic})" for topic, frames in position_frames(view, topics)]
     if not named:
         return ()
     axes = "x and y" if condition.test.z is None else "x, y and z"
-    within = f"within {condition.test.tolerance_m:g} m"
-    compared = f"near_position compared {axes} ({within}) in the frame of each message: "
-    compared += listed(named)
-    return (f"{compared}; {_ELSEWHERE}",)
+    note = (
+        f"near_position compared {axes} (within {condition.test.tolerance_m:g} m) in the frame of "
+        f"each message: {listed(named)}; {_ELSEWHERE}"
+    )
+    return (note,)
 
 
 def note_no_fix(view: View, topic: str, window: TimeWindow, fields: Sequence[str]) -> None:
-    """Notes that numbers of a satellite receiver in a window include those without a fix."""
+    """Notes if numbers of a satellite receiver in a window are from messages without a fix."""
     types = view.timeline.types_of(topic)
     mapped = set(chain.from_iterable(map(view.extractor.fields_of, types)))
-    if "fix_status" not in mapped or not _IN_DEGREES.intersection(fields):
+    if "fix_status" not in mapped or not _FIX_FIELDS.intersection(fields):
         return
     no_fix = Condition(Beyond(0, above=False), "fix_status")
     newest = None
@@ -242,9 +251,9 @@ def note_no_fix(view: View, topic: str, window: TimeWindow, fields: Sequence[str
 
 
 def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) -> bool:
-    """Returns whether positions of other tools' replies are in another frame than `near_position`.
+    """Returns whether `near_position` compared in other frames than other tools use.
 
-    They are in the map where transforms lead there.
+    Other tools use the map if transforms lead there.
     """
     target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
@@ -257,15 +266,16 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
 
 
 def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> None:
-    """Checks that positions of the topics are in the frame of a `near_position` that names one.
+    """Checks that a topic has positions in the frame that `near_position` names, if it does.
 
     Raises:
-        InvalidArgumentsError: those of a topic are not.
+        InvalidArgumentsError: a topic has positions in other frames.
     """
-    test = condition.test
-    asked = test.frame_id if isinstance(test, NearPosition) else None
-    for topic, frames in position_frames(view, topics) if asked else ():
-        if (asked or "").lstrip("/") not in {frame.lstrip("/") for frame in frames}:
+    asked = condition.test.frame_id if isinstance(condition.test, NearPosition) else None
+    if not asked:
+        return
+    for topic, frames in position_frames(view, topics):
+        if asked.lstrip("/") not in {frame.lstrip("/") for frame in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
                 f"the frame of each message, which is {', '.join(frames)} on {topic}; {_ELSEWHERE}"
@@ -273,13 +283,13 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
 
 
 def position_frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Returns the first topics that have positions, and the frames of these."""
+    """Returns the topics that have positions, with the frames of these; reads the first few."""
     frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
     return [(topic, of_topic) for topic, of_topic in frames if of_topic]
 
 
 def _frames_of_newest(view: View, topic: str) -> list[str]:
-    """Returns the frames of the positions in a topic's newest message; none where not known."""
+    """Returns the frames of the positions in a topic's newest message; none if unknown."""
     try:
         stored = view.stream.last(topic)
     except QueryTimeoutError:
@@ -296,20 +306,22 @@ def _frames_of_newest(view: View, topic: str) -> list[str]:
 
 
 def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
-    """Returns the constants of a definition whose names have a word as a whole, with their values.
+    """Returns the constants of a definition that a word names, with their values.
 
-    Only the one whose name is the field's and the word, where there is one.
+    A constant whose whole name is the word, or the field and the word, comes alone. Else all are
+    returned that have the word between underscores.
     """
     wanted = "_".join(word.upper().split())
-    constants = _CONSTANT.findall(_text_of(schema)) if wanted else []
-    whole = {wanted, f"{field.upper()}_{wanted}"}
-    same = [(name, value) for name, value in constants if name in whole]
-    shown = same or [pair for pair in constants if f"_{wanted}_" in f"_{pair[0]}_"]
-    return [f"{name} = {value}" for name, value in dict.fromkeys(shown)]
+    constants = dict.fromkeys(_CONSTANT.findall(_text_of(schema))) if wanted else {}
+    whole_names = {wanted, f"{field.upper()}_{wanted}"}
+    named = [(name, value) for name, value in constants if name in whole_names]
+    if not named:
+        named = [(name, value) for name, value in constants if f"_{wanted}_" in f"_{name}_"]
+    return [f"{name} = {value}" for name, value in named]
 
 
 def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
-    """Returns the error of a search that found no match back to a time when it had to end."""
+    """Returns the error of a search that had to end without a match, back to a log time."""
     back_to, budget_s = unix_text(searched_to), view.call.deadline.budget_s
     return QueryTimeoutError(
         f"no match back to {back_to}, and {budget_s:g} s are over; "
@@ -319,10 +331,11 @@ def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
 
 
 class RowCondition:
-    """Finds which rows of scans meet a condition: by their columns, also by those of their bags.
+    """Finds which rows of scans meet a condition, by their columns.
 
-    A topic beyond its share of the store has not all of its columns there; where these leave many
-    rows open, the columns of the bags mostly say it. What they leave open only messages can say.
+    Large topics do not have all of their columns in the store. If these leave many rows unsure,
+    their bags are decoded: their columns mostly tell. Rows that stay unsure are left to the
+    messages.
 
     Args:
         view: of the call.
@@ -335,17 +348,17 @@ class RowCondition:
         self._left_to_messages: set[str] = set()
 
     def may_match(self, parts: PartZones) -> bool | Mask:
-        """Returns which parts may have a row that meets it, as known without reading a column."""
+        """Returns which parts may have a row that meets it, by their zones."""
         return self._test.may_match(parts)
 
     def unstated(self, rows: Rows) -> Mask:
-        """Returns which rows of a table say nothing of the field, as far as columns show it."""
+        """Returns which rows of a table lack the field, as far as columns show it."""
         return self._test.unstated(rows.table)
 
     def truth(self, rows: Rows) -> TruthValues:
-        """Returns which rows of a table meet the condition.
+        """Returns which rows of the table meet the condition.
 
-        Bags are read for the rows that count alone.
+        Bags are decoded only for rows that count.
 
         Raises:
             QueryTimeoutError: the call's time is over.
@@ -355,26 +368,26 @@ class RowCondition:
         if not is_stored or channel.type in self._left_to_messages or truth.is_settled:
             return truth
         index = np.arange(len(rows.table)) if rows.index is None else rows.index
-        left = np.flatnonzero(truth.unsure[index])
-        if left.size <= MOST_UNSURE:
+        unsure = np.flatnonzero(truth.unsure[index])
+        if unsure.size <= MOST_UNSURE:
             return truth
         surely, perhaps = truth.surely.copy(), truth.perhaps.copy()
-        for positions, decoded in decoded_rows(self._view, rows.some(left)):
-            of_bag = index[left[positions]]
-            decoded_truth, at = self._test.truth(decoded.table), decoded.index
-            surely[of_bag], perhaps[of_bag] = decoded_truth.surely[at], decoded_truth.perhaps[at]
-            if (perhaps & ~surely)[of_bag].mean() > _MOST_LEFT:
+        for positions, decoded in decoded_rows(self._view, rows.some(unsure)):
+            in_table = index[unsure[positions]]
+            of_bag, in_bag = self._test.truth(decoded.table), decoded.index
+            surely[in_table], perhaps[in_table] = of_bag.surely[in_bag], of_bag.perhaps[in_bag]
+            if (perhaps & ~surely)[in_table].mean() > _MOST_LEFT:
                 self._left_to_messages.add(channel.type)
                 break
         return TruthValues(surely, perhaps)
 
 
 class CandidateRows:
-    """Finds the times of messages of a window that may meet a condition.
+    """Finds the messages of a window that may meet a condition, by their columns.
 
     Attributes:
-        ruled_out: whether a message was left out, because its columns do not meet the condition.
-        has_looked: whether any message was looked at.
+        ruled_out: whether columns showed that some message does not meet the condition.
+        has_looked: whether any message, or its columns, were looked at.
     """
 
     def __init__(
@@ -382,53 +395,56 @@ class CandidateRows:
     ) -> None:
         self.ruled_out = False
         self.has_looked = False
-        newest = view.timeline.latest
-        # Of each topic, from when on all is looked at.
-        self._left: dict[str, Ns] = dict.fromkeys(topics, min(window.stop, newest + 1))
+        end = min(window.stop, view.timeline.latest + 1)
+        # By topic, the log time from which on all of its candidates are known.
+        self._scanned_to: dict[str, Ns] = dict.fromkeys(topics, end)
+        # The candidates that are read next, newest first: log time and topic.
         self._group: list[tuple[Ns, str]] = []
         self._view = view
         self._window = window
         self._test = RowCondition(view, condition)
 
-    def _windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
-        """Yields the times at which a match can lie, newest first, and of which topics it would be.
-
-        They do not overlap.
-        """
-        most = 1
-        times = heapq.merge(*map(self._times_of, self._left), reverse=True)
-        for time, topic in chain(times, [(MIN_NS - 1, "")]):
-            group = self._group
-            if group and (group[-1][0] - time > _TOGETHER_NS or len(group) >= most):
-                (latest, _), (earliest, _) = group[0], group[-1]
-                yield TimeWindow(earliest, latest + 1), sorted({topic for _, topic in group})
-                # The first that may match mostly does; where many do not, more are read at once.
-                most, self._group = min(2 * most, _MOST_TOGETHER), []
-            self._group.append((time, topic))
-
     def messages(self) -> Iterator[StoredMessage]:
-        """Yields the messages at the times at which a match can lie, newest first."""
+        """Yields the messages at the times of candidates, newest first."""
         for window, topics in self._windows():
             yield from self._view.stream.messages(topics, window, newest_first=True)
 
     @property
     def reached(self) -> Ns:
-        """The log time from which on all has been looked at, and what may match was searched."""
-        return max(
-            [*self._left.values(), *(time + 1 for time, _ in self._group[:1])], default=MIN_NS
-        )
+        """The log time from which on all messages were searched."""
+        unread = [time + 1 for time, _ in self._group[:1]]
+        return max([*self._scanned_to.values(), *unread], default=MIN_NS)
 
-    def _times_of(self, topic: str) -> Iterator[tuple[Ns, str]]:
-        """Yields the log times of messages of a topic that may match, newest first, each once."""
-        waiting = _NO_TIMES  # ascending; no table that is left is newer than what was yielded
+    def _windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
+        """Yields the windows of groups of candidates, newest first, with the topics of these.
 
-        def reached(last: Ns) -> None:
-            newest = max([last, *waiting[-1:].tolist()])
-            self._left[topic] = min(newest + 1, self._window.stop)
+        They do not overlap. The first candidate mostly matches, so the first group is small; if it
+        does not, groups grow.
+        """
+        largest = 1
+        by_topic = [self._candidates_of(topic) for topic in self._scanned_to]
+        candidates = heapq.merge(*by_topic, reverse=True)
+        for time, topic in chain(candidates, [(MIN_NS - 1, "")]):
+            group = self._group
+            if group:
+                (newest, _), (oldest, _) = group[0], group[-1]
+                if oldest - time > _GROUP_GAP_NS or len(group) >= largest:
+                    yield TimeWindow(oldest, newest + 1), sorted({name for _, name in group})
+                    largest = min(2 * largest, _LARGEST_GROUP)
+                    self._group = []
+            self._group.append((time, topic))
 
-        def newest_after(last: Ns) -> Iterator[tuple[Ns, str]]:
-            for time in map(int, waiting[np.searchsorted(waiting, last, "right") :][::-1]):
-                self._left[topic] = time + 1
+    def _candidates_of(self, topic: str) -> Iterator[tuple[Ns, str]]:
+        """Yields the log times of candidates of a topic, newest first, each once."""
+        pending = _NO_TIMES  # ascending: candidates that a later table may still precede
+
+        def note_progress(last: Ns) -> None:
+            newest = max([last, *pending[-1:].tolist()])
+            self._scanned_to[topic] = min(newest + 1, self._window.stop)
+
+        def pending_after(last: Ns) -> Iterator[tuple[Ns, str]]:
+            for time in map(int, pending[np.searchsorted(pending, last, "right") :][::-1]):
+                self._scanned_to[topic] = time + 1
                 yield time, topic
 
         for rows in scan(
@@ -438,14 +454,14 @@ class CandidateRows:
             newest_first=True,
             may_match=self._may_match,
             may_be_empty=True,
-            reached=reached,
+            reached=note_progress,
         ):
-            yield from newest_after(rows.last)
-            waiting = waiting[: np.searchsorted(waiting, rows.last, "right")]
-            waiting = np.union1d(waiting, self._candidates(rows))
-            reached(rows.last)
-        yield from newest_after(MIN_NS)
-        self._left[topic] = MIN_NS
+            yield from pending_after(rows.last)
+            pending = pending[: np.searchsorted(pending, rows.last, "right")]
+            pending = np.union1d(pending, self._candidate_times(rows))
+            note_progress(rows.last)
+        yield from pending_after(MIN_NS)
+        self._scanned_to[topic] = MIN_NS
 
     def _may_match(self, parts: PartZones) -> bool | Mask:
         may_match = self._test.may_match(parts)
@@ -453,46 +469,44 @@ class CandidateRows:
         self.ruled_out |= not np.all(may_match)
         return may_match
 
-    def _candidates(self, rows: Rows) -> IntArray:
+    def _candidate_times(self, rows: Rows) -> IntArray:
         self.has_looked = True
         truth = self._test.truth(rows)
         if truth.is_none:
             self.ruled_out = True
             return _NO_TIMES
-        may = truth.perhaps
-        if rows.index is not None:
-            may = may[rows.index]
-        self.ruled_out |= not may.all()
-        return rows.times[may]
+        perhaps = truth.perhaps if rows.index is None else truth.perhaps[rows.index]
+        self.ruled_out |= not perhaps.all()
+        return rows.times[perhaps]
 
 
 def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
-    """Notes when arrays at or below some fields were too long to be more than summarised."""
+    """Notes if long arrays at or below some fields are only summarised in messages of a window."""
     newest = view.stream.last(topic)
     if newest is None:
         return
     value = view.value(newest)
     paths = (view.extractor.own_path(field, newest.type) for field in fields)
     try:
-        for condition in chain(*(summary_conditions(path, value) for path in paths)):
-            candidates = CandidateRows(view, [topic], condition, window).messages()
-            long = next((at for at in candidates if condition.matches(view.value(at))), None)
-            if long is not None:
-                array, _, _ = (condition.field or "").rpartition(".")
-                view.notes.add_lack(
-                    f"{topic}: where {array} is long it is only summarised, last at "
-                    f"{unix_text(long.time)}, and its numbers are not looked at"
-                )
+        for condition in chain.from_iterable(summary_conditions(path, value) for path in paths):
+            for stored in CandidateRows(view, [topic], condition, window).messages():
+                if condition.matches(view.value(stored)):
+                    array, _, _ = (condition.field or "").rpartition(".")
+                    view.notes.add_lack(
+                        f"{topic}: where {array} is long it is only summarised, last at "
+                        f"{unix_text(stored.time)}, and its numbers are not looked at"
+                    )
+                    break
     except QueryTimeoutError:
         view.notes.add_lack(f"{topic}: out of time: some arrays may be only summarised")
 
 
 class ReverseSearch:
-    """A search for one condition on the topics of a name or glob.
+    """A search for a condition on the topics of a name or glob.
 
     Attributes:
-        topics: the recorded topics that match.
-        condition: what is searched for.
+        topics: the recorded topics that match the name or glob.
+        condition: the condition.
 
     Raises:
         InvalidArgumentsError: the condition names a frame in which a topic has no positions.
@@ -508,14 +522,14 @@ class ReverseSearch:
         self._has_decoded = False
 
     def newest(self, until: Ns, since: Ns = MIN_NS) -> StoredMessage | None:
-        """Returns the newest match before a moment; notes report what could not be tested.
+        """Returns the newest match before `until` and not before `since` (log times).
 
-        Reads the messages whose columns may match, until one does; none before `since`.
+        Notes report what could not be tested.
 
         Raises:
             InvalidArgumentsError: no value of the topics can meet the condition.
             NoDataError: no message could be decoded.
-            QueryTimeoutError: the call's time is over; reports how far back was searched.
+            QueryTimeoutError: the call's time is over. It has how far back was searched.
         """
         window = TimeWindow(since, until)
         candidates = CandidateRows(self._view, self.topics, self.condition, window)
@@ -536,9 +550,9 @@ class ReverseSearch:
         return None
 
     def close(self, window: TimeWindow, *, is_found: bool, ruled_out: bool) -> None:
-        """Ends a search that looked everywhere in a window, and notes what could not be tested.
+        """Ends a search that looked everywhere in a window; notes what could not be tested.
 
-        `ruled_out`: whether something in it was known to be no match, without being read.
+        `ruled_out`: whether columns showed that some message is no match.
 
         Raises:
             InvalidArgumentsError: nothing was found, and no value of the topics can be a match.
@@ -554,10 +568,10 @@ class ReverseSearch:
         self.note_untested(window)
 
     def require_testable(self) -> None:
-        """Checks that some value of the topics can meet the condition: else "never" is no answer.
+        """Checks that a value of the topics can meet the condition: else "never" is no answer.
 
         Raises:
-            InvalidArgumentsError: the newest value of none of the topics has what is tested.
+            InvalidArgumentsError: the newest values of all topics lack what is tested.
         """
         are_texts = all(is_text(self._view, topic) for topic in self.topics)
         is_number_in_texts = are_texts and isinstance(self.condition.test, Equals)
@@ -575,43 +589,49 @@ class ReverseSearch:
         """Checks that a message before a moment meets the condition, or that its topics may.
 
         Raises:
-            InvalidArgumentsError: none does, and no value of the topics can.
+            InvalidArgumentsError: no message does, and no value of the topics can.
         """
         try:
             self.require_testable()
         except InvalidArgumentsError:
-            # The topic may have had other messages before.
+            # Older messages may have had other fields; if not, this raises the error.
             self.newest(until)
 
     def _refusal(self, topic: str) -> str | None:
-        """Returns why no message of a topic can match, whichever type it has."""
+        """Returns why no message of a topic can match, of whichever type."""
         types = self._view.timeline.types_of(topic)
         if len(types) == 1:
-            return self._refusal_of(topic, MAX_NS, types[0])
+            return self._refusal_of_type(topic, MAX_NS, types[0])
         refusals = []
         for type_name, totals in self._view.census(topic).items():
-            refusal = self._refusal_of(topic, totals.last + 1, type_name)
+            refusal = self._refusal_of_type(topic, totals.last + 1, type_name)
             if refusal is None:
                 return None
             refusals.append(f"of {type_name} {refusal}")
         return "; ".join(refusals) or None
 
-    def _refusal_of(self, topic: str, before: Ns, type_name: str) -> str | None:
-        """Returns why no message of a type can match, by the newest one that shows its fields."""
-        window = TimeWindow(MIN_NS, before)
-        messages = self._view.stream.messages([topic], window, newest_first=True)
-        looked_at = islice(messages, _MOST_EMPTY)
-        own = (stored for stored in looked_at if stored.type == type_name)
-        newest = next(own, None)
-        value = None if newest is None else self._view.value(newest)
-        if newest is None or value is None:
-            return None
+    def _refusal_of_type(self, topic: str, before: Ns, type_name: str) -> str | None:
+        """Returns why no message of a type can match, by the newest message with its fields."""
         condition = self.condition.of_type(type_name, self._view.extractor)
         field, test = condition.field or "", condition.test
-        if field and not shows_field(value, field):
-            # An empty list does not show what its elements have, nor a part of the joints the rest.
-            values = map(self._view.value, own)
-            value = next((older for older in values if shows_field(older, field)), value)
+        messages = self._view.stream.messages(
+            [topic], TimeWindow(MIN_NS, before), newest_first=True
+        )
+        newest, value = None, None
+        for stored in islice(messages, _MOST_EMPTY):
+            if stored.type != type_name:
+                continue
+            read = self._view.value(stored)
+            if newest is None:
+                newest, value = stored, read
+                if value is None:
+                    return None
+            # An empty list does not show what its elements have, nor one joint what others have.
+            if not field or shows_field(read, field):
+                value = read
+                break
+        if newest is None:
+            return None
         refusal = refusal_for(condition, value)
         word = test.folded if isinstance(test, Contains | Equals) else None
         if refusal is None or word is None:
@@ -620,12 +640,12 @@ class ReverseSearch:
         constants = _constants_named(newest.record.channel.schema, name, word)
         if not constants:
             return refusal
-        # Without a field the number is also found in the bytes of an id.
-        ask = "" if field else ": ask equals on the field of that number"
-        return f"{refusal}, such as {listed(constants)}{ask}"
+        # Without a field, the number would also match in the bytes of an id.
+        advice = "" if field else ": ask equals on the field of that number"
+        return f"{refusal}, such as {listed(constants)}{advice}"
 
     def matches(self, stored: StoredMessage) -> bool | None:
-        """Whether a message meets the condition; None where it does not say, or is not decoded."""
+        """Whether a message meets the condition; None if it lacks the field, or is not decoded."""
         failures: list[UndecodableError] = []
         with self._view.call.stages.timed("extract"):
             message = self._view.bags.decode(stored, failures)
@@ -635,16 +655,17 @@ class ReverseSearch:
                 own = self.condition.of_type(stored.type, self._view.extractor)
                 return None if own.is_unstated(value) else own.matches(value)
         key = stored.topic, stored.type
-        # The newest is reported, in whatever order messages are tested.
+        # The newest failure is reported; messages may be tested in any order.
         if key not in self._failures or self._failures[key][1] < stored.time:
             self._failures[key] = failures[0], stored.time
         return None
 
     def note_untested(self, window: TimeWindow) -> None:
-        """Notes which topics have messages in a window that could not be tested, or not wholly."""
+        """Notes on which topics messages of a window could not be tested, or only in part."""
         self._note_undecodable(window.start)
-        for topic in self.topics if self.condition.looks_at_numbers else ():
-            note_summarised(self._view, topic, [self.condition.array], window)
+        if self.condition.looks_at_numbers:
+            for topic in self.topics:
+                note_summarised(self._view, topic, [self.condition.array], window)
 
     def _note_undecodable(self, since: Ns) -> None:
         for (topic, type_name), (error, newest) in self._failures.items():

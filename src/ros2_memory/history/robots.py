@@ -1,8 +1,8 @@
 """Recordings of several robots that are answered together, as one history.
 
-Recordings that hold a topic at the same time are of one robot where a handover joins them, or where
-most messages of one are in the other too. At other times they are of several where a frame has one
-parent here and another one there.
+Recordings that hold a topic at the same time are of one robot if a handover joins them, or if most
+messages of one are in the other too. Recordings of different times are of several robots if a frame
+has different parents in them.
 """
 
 from __future__ import annotations
@@ -39,40 +39,40 @@ if TYPE_CHECKING:
     from ros2_memory.history.stored_message import StoredMessage
 
 _NEAR_NS: Final = 10 * NS_PER_S
-"""How far around one message others count as recorded at the same time."""
+"""Recordings are of the time of a message if they are this near."""
 _SLOW_NS: Final = 600 * NS_PER_S
-"""As far where recordings overlap at that time: some topics have a message in minutes."""
+"""Recordings are compared this far around a message: some topics have one only in minutes."""
 _TRIED: Final = 7
-"""How many messages are looked for in the other recording: a subscriber may miss some."""
+"""So many messages are looked for in the other recording: a subscriber may miss some."""
 _MAX_PAIRS: Final = 20
-"""Pairs of recordings of which messages are compared."""
+"""At most so many pairs of recordings are compared."""
 _MAX_TOPICS: Final = 3
-"""Topics of a question that are compared."""
+"""At most so many topics of a question are compared."""
 _MAX_COMPARED: Final = 8
-"""Topics of a pair that are compared; robots may share some (`/clock`, a map)."""
+"""At most so many topics of a pair are compared: robots may share some (`/clock`, a map)."""
 _MAX_TREES: Final = 32
-"""Recordings of which static transforms are compared, the newest."""
+"""The static transforms of so many recordings are compared, the newest."""
 _MAX_STATIC: Final = 50
-"""Messages of static transforms that are read of one recording."""
+"""At most so many messages of static transforms are read of a recording."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
-"""Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
-_MADE: Final[Key[frozenset[Path]]] = Key()
-"""Of a call: the recordings that this bag directory's recorder made, one after the other."""
+"""Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
+_OWN: Final[Key[frozenset[Path]]] = Key()
+"""Of a call: the recordings that the recorder of the bag directory made."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
-"""Of a memory: the parent of each static frame of a recording that is closed."""
+"""Of a memory: by path of a closed recording, the parent of each static frame."""
 SET_BACK: Final = "the clock was set back between recordings"
-"""The begin of a sentence on recordings that one recorder made, and that overlap in time."""
+"""Begins a sentence on recordings that one recorder made, and that overlap in time."""
 ADVICE: Final = "; data.recording selects one recording"
-"""The end of a sentence on robots that are mixed."""
+"""Ends a sentence on mixed robots."""
 _RECENT_NS: Final = 60 * NS_PER_S
 _DESCRIBED: Final[Key[list[tuple[Ns, tuple[str, ...]]]]] = Key()
-"""Of a memory: when it was last looked whether robots are mixed, and what was found."""
+"""Of a memory: when `describe_mixed` last checked, and its sentences."""
 
 
 class Mixed(NamedTuple):
-    """Two recordings that overlap in time, and a topic on which each has messages of its own.
+    """Two recordings that overlap in time, and a topic on which they have different messages.
 
-    `topic` is None where they share none, or the messages of those that they share.
+    `topic` is None if no such topic was found.
     """
 
     pair: Overlapping
@@ -80,7 +80,7 @@ class Mixed(NamedTuple):
 
 
 class Contradiction(NamedTuple):
-    """Two recordings (paths) in which a frame has different parents."""
+    """Two recordings, by their paths, in which a frame has different parents."""
 
     recordings: tuple[str, str]
     frame: str
@@ -104,33 +104,37 @@ class Contradiction(NamedTuple):
 def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     """Returns the recordings that overlap in time, with a topic on which they differ.
 
-    Overlaps are known from the index; those that a clock made, which was set back while one of the
-    recordings ran, show no second robot. A few messages are read once of each of the first pairs.
+    The index knows the overlaps. Messages of the first `_MAX_PAIRS` are compared, unless the clock
+    was set back during one of the recordings: that makes an overlap without a second robot.
     """
-    view = View(memory, call)  # notes on what is read here are of no answer
+    view = View(memory, call)  # its notes belong to no answer
     mixed: list[Mixed] = []
     pairs = overlapping_recordings(view.snapshot, memory.index.joined_with)
-    bags, steps = recordings_of(view.snapshot) if pairs else {}, _steps_back(view)
+    if not pairs:
+        return ()
+    bags, steps = recordings_of(view.snapshot), _steps_back(view)
     for pair in pairs:
         by_clock = pair.end - pair.start <= max(steps[pair.first], steps[pair.second])
-        is_compared = not by_clock and len(mixed) < _MAX_PAIRS
-        try:
-            mixed.append(Mixed(pair, _differing_topic(view, pair, bags) if is_compared else None))
-        except QueryTimeoutError:
-            break
+        topic: str | None = None
+        if not by_clock and len(mixed) < _MAX_PAIRS:
+            try:
+                topic = _differing_topic(view, pair, bags)
+            except QueryTimeoutError:
+                break
+        mixed.append(Mixed(pair, topic))
     return tuple(mixed)
 
 
 def are_of_one_recorder(memory: Memory, pair: Overlapping) -> bool:
-    """Whether this bag directory's recorder made both, one after the other by its list.
+    """Whether the recorder of the bag directory made both recordings, one after the other.
 
-    Then they overlap in time since the clock was set back.
+    Then they overlap because the clock was set back.
     """
-    return _made_in(memory.index.bag_dir).issuperset((pair.first, pair.second))
+    return _own_recordings(memory.index.bag_dir).issuperset((pair.first, pair.second))
 
 
-def _made_in(bag_dir: Path) -> frozenset[Path]:
-    """Returns the recordings that a bag directory's recorder made; none if that is not known."""
+def _own_recordings(bag_dir: Path) -> frozenset[Path]:
+    """Returns the recordings that the recorder of a bag directory made; none if unknown."""
     try:
         return frozenset(bag_dir / name for name in OwnRecordings(bag_dir).in_order())
     except OSError:
@@ -138,35 +142,31 @@ def _made_in(bag_dir: Path) -> frozenset[Path]:
 
 
 def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...]:
-    """Returns frames that have one parent in one recording and another in another one.
-
-    By static transforms. Of this program's own recordings in one folder the newest is compared
-    alone: they are of one robot.
-    """
+    """Returns the static frames that have different parents in two recordings, each frame once."""
     view = View(memory, call)
-    parents_by_path = memory.memo.of(_PARENTS, dict)
+    remembered = memory.memo.of(_PARENTS, dict)
     trees: dict[str, Mapping[str, str]] = {}
     for path, bags in _recordings_to_compare(view):
         try:
-            parents = parents_by_path.get(path) or _static_parents(view, bags)
+            parents = remembered.get(path) or _static_parents(view, bags)
         except QueryTimeoutError:
             break
         if not any(bag.state is BagState.ACTIVE for bag in bags):
-            parents_by_path[path] = parents
+            remembered[path] = parents
         trees[path] = parents
     contradictions: dict[str, Contradiction] = {}
-    for (first_path, parents), (other, others) in combinations(trees.items(), 2):
-        for frame in sorted(parents.keys() & others.keys()):
-            if parents[frame] != others[frame]:
-                both = (parents[frame], others[frame])
-                contradictions.setdefault(frame, Contradiction((first_path, other), frame, both))
+    for (first, parents), (other, other_parents) in combinations(trees.items(), 2):
+        for frame in sorted(parents.keys() & other_parents.keys()):
+            both = parents[frame], other_parents[frame]
+            if both[0] != both[1] and frame not in contradictions:
+                contradictions[frame] = Contradiction((first, other), frame, both)
     return tuple(contradictions.values())
 
 
 def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
-    """Returns sentences where robots, or times, are plainly mixed; a minute old at most.
+    """Returns sentences on robots, or times, that are mixed; at most a minute old.
 
-    With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
+    A check takes 0.1 s with a week of bags, and the page asks every few seconds.
     """
     now, described = memory.clock.now(), memory.memo.of(_DESCRIBED, list)
     for described_at, sentences in described:
@@ -178,38 +178,42 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
 
 
 def _mixed_sentences(memory: Memory, call: Call) -> Iterator[str]:
-    mixed = [both for both in mixed_recordings(memory, call) if both.topic is not None]
-    for is_one, what, but in (
-        (False, "robots are mixed", "answers treat them as one robot"),
-        (True, SET_BACK, "one recorder made them, one after the other"),
-    ):
-        overlapping = [both for both in mixed if are_of_one_recorder(memory, both.pair) is is_one]
-        if not overlapping:
-            continue
-        names = sorted({name for recordings in overlapping for name in recordings.pair.names})
-        first = overlapping[0]
-        yield (
-            f"{what}: {listed(names)} overlap in time (from {iso_local(first.pair.start)}), each "
-            f"with different messages on {first.topic}, but {but}{ADVICE}"
-        )
+    differing = [mixed for mixed in mixed_recordings(memory, call) if mixed.topic is not None]
+    by_clock = [mixed for mixed in differing if are_of_one_recorder(memory, mixed.pair)]
+    robots = [mixed for mixed in differing if mixed not in by_clock]
+    if robots:
+        yield _describe_overlaps("robots are mixed", robots, "answers treat them as one robot")
+    if by_clock:
+        yield _describe_overlaps(SET_BACK, by_clock, "one recorder made them, one after the other")
     contradictions = contradicting_frames(memory, call)
     if contradictions:
         more = len(contradictions) - 1
         yield f"robots are mixed: {contradictions[0]}{f' (and {more} more)' if more else ''}"
 
 
+def _describe_overlaps(what: str, overlapping: Sequence[Mixed], but: str) -> str:
+    names = sorted({name for mixed in overlapping for name in mixed.pair.names})
+    first = overlapping[0]
+    return (
+        f"{what}: {listed(names)} overlap in time (from {iso_local(first.pair.start)}), each "
+        f"with different messages on {first.topic}, but {but}{ADVICE}"
+    )
+
+
 def _differing_topic(
     view: View, pair: Overlapping, recordings: Mapping[str, Sequence[BagFile]]
 ) -> str | None:
+    """Returns a topic on which two recordings have different messages; the robot's own first."""
     both = TimeWindow(pair.start, pair.end + 1)
-    bags = [
+    first, second = (
         [bag for bag in recordings.get(str(path), ()) if bag.reaches_into(both)]
         for path in (pair.first, pair.second)
-    ]
-    shared = set.intersection(*map(_topics_of, bags)) - view.timeline.transient_local
+    )
+    shared = (_topics_of(first) & _topics_of(second)) - view.timeline.transient_local
     of_robot = [topic for topic in (view.pose_topic, *view.limits.tf_topics) if topic in shared]
     for topic in islice([*of_robot, *sorted(shared.difference(of_robot))], _MAX_COMPARED):
-        if _bags_differ(view, topic, [_bag_spans(some, topic) for some in bags], both):
+        extents = _bag_extents(first, topic), _bag_extents(second, topic)
+        if _bags_differ(view, topic, extents, both):
             return topic
     return None
 
@@ -218,35 +222,37 @@ def _topics_of(bags: Sequence[BagFile]) -> set[str]:
     return {topic for bag in bags for topic in bag.summary.schema.positions}
 
 
-def _bag_spans(bags: Sequence[BagFile], topic: str) -> list[TopicExtent]:
+def _bag_extents(bags: Sequence[BagFile], topic: str) -> list[TopicExtent]:
     holding = (bag for bag in bags if topic in bag.summary.schema.positions)
     return [TopicExtent(bag, *bag.summary.span_of((topic,))) for bag in holding]
 
 
 def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
-    """Returns the newest recordings with static transforms, of this program's one in a folder."""
+    """Returns the newest recordings with static transforms, with their bags; none if it is one.
+
+    The recordings that this program made in one folder are of one robot: only the newest of them
+    counts.
+    """
     topics = view.limits.tf_static_topics
     root = f"{view.bag_dir}/"
-    bags_of: dict[str, Sequence[BagFile]] = {}
-    newest: dict[str, str] = {}
+    newest: dict[str, tuple[str, Sequence[BagFile]]] = {}
     holding = recordings_of(view.snapshot, lambda schema: any(map(schema.positions.get, topics)))
-    for path, bags in holding.items():
+    in_order = sorted(holding.items(), key=lambda recording: recording[1][0].start)
+    for path, bags in in_order:
         folder, _, name = path.rpartition("/")
         if not is_kept_apart(path.removeprefix(root)):
-            bags_of[path] = bags
             maker = folder if has_own_name(name) else path
-            if maker not in newest or bags_of[newest[maker]][0].start < bags[0].start:
-                newest[maker] = path
-    ordered = sorted(newest.values(), key=lambda path: bags_of[path][0].start)
-    return [(path, bags_of[path]) for path in ordered[-_MAX_TREES:]] if len(ordered) > 1 else []
+            newest.pop(maker, None)
+            newest[maker] = path, bags
+    return [*newest.values()][-_MAX_TREES:] if len(newest) > 1 else []
 
 
 def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
-    """Returns the parent of each static frame of a recording, as it was stated last."""
+    """Returns the last parent of each static frame of a recording."""
     parents: dict[str, str] = {}
     window = TimeWindow.everything()
     for topic in view.limits.tf_static_topics:
-        spans = _bag_spans(bags, topic)
+        spans = _bag_extents(bags, topic)
         merged = view.stream.merged(spans, [topic], window) if spans else ()
         for stored in islice(merged, _MAX_STATIC):
             message = view.bags.decode(stored)
@@ -257,17 +263,18 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
 
 
 class ParallelRecordings(NamedTuple):
-    """Two recordings with messages of their own on a topic at the same time.
+    """Two recordings with different messages on a topic at the same time.
 
-    Or one, with itself, in which the clock was set back.
+    Or one recording in which the clock was set back, twice.
 
     Attributes:
-        first: the one that holds the topic first.
+        first: the recording that holds the topic first.
         other: the other one.
         span: when both hold the topic.
-        by_clock: whether that is as where a clock was set back between two recordings: it is the
-            end of the first and the begin of the other, and less than half of each; or no longer
-            than the clock was set back while one of them ran; or one recorder made both.
+        by_clock: whether a clock that was set back explains it: between the two recordings (the
+            span is the end of the first and the begin of the other, and less than half of each), or
+            during one of them (the span is no longer than the step); or one recorder made both.
+        bags: the files of the other recording that overlap the first; empty for all.
     """
 
     first: Path
@@ -275,15 +282,14 @@ class ParallelRecordings(NamedTuple):
     span: TimeWindow
     by_clock: bool
     bags: frozenset[str] = frozenset()
-    """Of the other one, the files of which messages are beside those of the first; none: all."""
 
     @property
     def is_twice(self) -> bool:
-        """Whether it is one recording, which has a time twice."""
+        """Whether it is one recording that has a time twice."""
         return self.first == self.other
 
-    def described(self, topic: str) -> str:
-        """Returns what a clock made, as a sentence without a full stop."""
+    def describe_by_clock(self, topic: str) -> str:
+        """Returns a sentence, without a full stop, on a pair that a clock explains."""
         span = f"from {unix_text(self.span.start)} to {unix_text(self.span.stop - 1)}"
         if self.is_twice:
             return (
@@ -296,18 +302,17 @@ class ParallelRecordings(NamedTuple):
 
 
 def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
-    """Checks that a path by this topic is that of one robot: else it jumps between several.
+    """Checks that a path by this topic is of one robot: else it would jump between several.
 
-    A note says where recordings overlap as after a clock was set back, and of which the path is
-    there.
+    If a clock explains an overlap, a note says which recording the path follows there.
 
     Raises:
-        NoDataError: recordings hold messages of their own on the topic at the same time.
+        NoDataError: recordings hold different messages on the topic at the same time.
     """
-    beside = parallel_or_twice(view, topic, window)
-    # Transforms are of all recordings at once, so a path by them is not that of one there.
+    parallel = parallel_or_twice(view, topic, window)
+    # A path by transforms uses all recordings at once: it cannot follow one of them.
     by_transforms = topic in view.limits.tf_topics
-    names = _recording_names([pair for pair in beside if by_transforms or not pair.by_clock])
+    names = _recording_names([pair for pair in parallel if by_transforms or not pair.by_clock])
     if names:
         raise NoDataError(
             NoDataReason.MIXED,
@@ -315,143 +320,162 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"{topic} at the same time, as from several robots: {listed(names)}; one path over "
             "them would be wrong: ask about a time with one of them, or set data.recording to one",
         )
-    for pair in beside:
+    for pair in parallel:
         before = "files from before" if pair.is_twice else pair.first.name
-        view.notes.add(f"{pair.described(topic)}: the path there is that of {before}")
+        view.notes.add(f"{pair.describe_by_clock(topic)}: the path there is that of {before}")
 
 
 def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
-    """Notes the recordings that hold messages of their own on a topic at the same time.
+    """Notes recordings with different messages on a topic at the same time, and times held twice.
 
-    And the times that one holds twice. Returns these times, without those that two recordings share
-    by a clock which was set back.
+    Returns these times, without the overlaps of two recordings that a clock explains.
     """
-    beside = parallel_or_twice(view, topic, window)
-    names = _recording_names([pair for pair in beside if not pair.by_clock])
+    parallel = parallel_or_twice(view, topic, window)
+    names = _recording_names([pair for pair in parallel if not pair.by_clock])
     if names:
         view.notes.add(
             f"{len(names)} recordings have different messages on {topic} at the same time, as "
             f"from several robots, and the answer does not separate them: {listed(names)}"
         )
-    for pair in beside:
+    for pair in parallel:
         if pair.by_clock:
-            view.notes.add(f"{pair.described(topic)}: the answer does not separate the two")
-    spans = [pair.span for pair in beside if pair.is_twice or not pair.by_clock]
+            view.notes.add(f"{pair.describe_by_clock(topic)}: the answer does not separate the two")
+    spans = [pair.span for pair in parallel if pair.is_twice or not pair.by_clock]
     return united((span.start, span.stop) for span in spans)
 
 
-def _recording_names(beside: Sequence[ParallelRecordings]) -> list[str]:
-    return sorted({path.name for pair in beside for path in (pair.first, pair.other)})
+def _recording_names(pairs: Sequence[ParallelRecordings]) -> list[str]:
+    return sorted({path.name for pair in pairs for path in (pair.first, pair.other)})
 
 
 def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
-    """Returns all that would make a path by a topic go to and fro between two times of a robot.
+    """Returns what would make a path by a topic jump to and fro.
 
-    Recordings beside each other not of latched topics, which each recording receives again, nor
-    where that is not known.
+    That is recordings with different messages at the same time, and recordings that have a time
+    twice. Recordings are not compared on latched topics, which each recording receives again.
     """
+    parallel: list[ParallelRecordings] = []
+    if topic not in view.timeline.transient_local:
+        parallel += _parallel_recordings(view, topic, window) or ()
     holding = view.timeline.recordings(topic)
-    is_latched = topic in view.timeline.transient_local
-    beside = [] if is_latched else _recordings_beside(view, topic, window) or []
-    twice = (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
-    return [*beside, *twice]
+    parallel += (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
+    return parallel
 
 
 def recordings_apart(
     view: View, topics: Sequence[str], window: TimeWindow
 ) -> frozenset[Path] | None:
-    """Returns the recordings that are beside another one on some topics, latched ones too.
+    """Returns the recordings that differ from a parallel one on some topics, latched ones too.
 
-    None where that is not known.
+    None if unknown; see `_parallel_recordings`.
     """
     apart: set[Path] = set()
     for topic in topics:
-        pairs = _recordings_beside(view, topic, window)
+        pairs = _parallel_recordings(view, topic, window)
         if pairs is None:
             return None
         apart.update(path for pair in pairs for path in (pair.first, pair.other))
     return frozenset(apart)
 
 
-def _recordings_beside(
+def _parallel_recordings(
     view: View, topic: str, window: TimeWindow
 ) -> list[ParallelRecordings] | None:
-    """Returns the recordings that hold messages of their own on a topic at the same time.
+    """Returns the recordings with different messages on a topic at the same time.
 
-    None where the time for the answer is over before it is known, or a lake does not hold the
-    messages.
+    None if the call's time is over before that is known, or if a lake does not hold the messages.
     """
     differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
     try:
-        for beside in _overlapping_pairs(view, topic, window):
-            pair = beside.first, beside.other
-            # Of several robots in a folder there may be thousands of pairs.
-            is_known = not beside.by_clock and apart.issuperset(pair)
-            if not is_known and _differ(view, topic, pair, beside.span.intersect(window)):
-                differing.append(beside)
-                apart.update(() if beside.by_clock else pair)
+        for parallel in _overlapping_pairs(view, topic, window):
+            pair = parallel.first, parallel.other
+            # Several robots in one folder have thousands of pairs: each recording is enough once.
+            is_known = not parallel.by_clock and apart.issuperset(pair)
+            if not is_known and _differ(view, topic, pair, parallel.span.intersect(window)):
+                differing.append(parallel)
+                apart.update(() if parallel.by_clock else pair)
     except (QueryTimeoutError, NotInLakeError):
         return None
     finally:
-        # The answer itself needed nothing of what was read here.
+        # The answer itself does not need what was read here.
         view.notes.retract_outside(keep=noted_before)
     return differing
 
 
 def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
-    """Notes, for the first topics, the recordings that hold messages of their own at one time.
-
-    Returns these times; see `note_robots`.
-    """
+    """Does `note_robots` for the first few topics; returns the times of all."""
     spans_by_topic = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]
     return united(chain.from_iterable(spans_by_topic))
 
 
 def note_robots_near(view: View, stored: StoredMessage) -> None:
-    """Notes recordings with messages of their own around the time of a message; see `note_robots`.
-
-    Or that one has this time twice.
-    """
+    """Does `note_robots` around a message, if recordings overlap there."""
     topic, at = stored.topic, stored.time
     pairs = _overlapping_pairs(view, topic, TimeWindow.around(at, _NEAR_NS))
     if any(chain(pairs, _times_recorded_twice(view, TimeWindow(at, at + 1)))):
         note_robots(view, topic, TimeWindow.around(at, _SLOW_NS))
 
 
+class _TopicSpan(NamedTuple):
+    """A recording, and the first and last log time of a topic in it."""
+
+    first: Ns
+    last: Ns
+    path: Path
+
+
 def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields pairs of recordings that hold a topic at the same time in a window."""
-    open_spans: list[tuple[Ns, Ns, Path]] = []
-    steps = _steps_back(view)
     recordings = dict(view.timeline.recordings(topic))
-    # A thinned day lies around what moments and rules have of it.
+    # A thinned day contains the bags of moments and rules of that day.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
-    spans = [(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
-    for first, last, path in sorted(spans):
-        open_spans = [(since, until, other) for since, until, other in open_spans if until >= first]
-        for since, until, other in open_spans:
-            span = TimeWindow(first, min(last, until) + 1)
-            # One that a wrong clock dated spans years, mostly without a bag.
-            near = view.timeline.segments_in(span.widened(COPY_HORIZON_NS))
-            is_there = until <= last or any(
-                str(other) in some.bags.folders and other in some.recordings(topic) for some in near
-            )
+    spans = [_TopicSpan(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
+    steps = _steps_back(view)
+    going_on: list[_TopicSpan] = []
+    for later in sorted(spans):
+        going_on = [earlier for earlier in going_on if earlier.last >= later.first]
+        for earlier in going_on:
+            span = TimeWindow(later.first, min(later.last, earlier.last) + 1)
+            is_there = earlier.last <= later.last or _has_bags_near(view, topic, earlier.path, span)
             if is_there and window.overlaps(span.start, span.stop - 1):
-                shortest = min(last - first, until - since)
-                is_edge = since < first and until < last and 2 * (until - first) < shortest
-                is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
-                own = view.memo.of(_MADE, lambda: _made_in(view.bag_dir))
-                by_clock = is_edge or is_step or own.issuperset((other, path))
-                yield ParallelRecordings(other, path, span, by_clock)
-        open_spans.append((first, last, path))
+                step = max(steps[later.path], steps[earlier.path])
+                by_clock = (
+                    _is_short_edge(earlier, later)
+                    or span.stop - 1 - span.start <= step
+                    or _are_own(view, earlier.path, later.path)
+                )
+                yield ParallelRecordings(earlier.path, later.path, span, by_clock)
+        going_on.append(later)
+
+
+def _has_bags_near(view: View, topic: str, recording: Path, span: TimeWindow) -> bool:
+    """Whether a recording holds a topic near a span: a misdated one spans years without a bag."""
+    segments = view.timeline.segments_in(span.widened(COPY_HORIZON_NS))
+    return any(
+        str(recording) in segment.bags.folders and recording in segment.recordings(topic)
+        for segment in segments
+    )
+
+
+def _is_short_edge(earlier: _TopicSpan, later: _TopicSpan) -> bool:
+    """Whether two recordings overlap at their ends only, by less than half of each."""
+    shortest = min(later.last - later.first, earlier.last - earlier.first)
+    is_edge = earlier.first < later.first and earlier.last < later.last
+    return is_edge and 2 * (earlier.last - later.first) < shortest
+
+
+def _are_own(view: View, *recordings: Path) -> bool:
+    own = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir))
+    return own.issuperset(recordings)
 
 
 def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
-    """Yields recordings in which the clock was set back, with the bags from after that.
+    """Yields the recordings in which the clock was set back, with the bags after that.
 
-    Of a bag in which that happened it is not known which messages are from before, and when that
-    was to the period of its fastest topic.
+    Within a bag the moment is known only to the period of its fastest topic, and which messages are
+    from before it is not known.
     """
     for fault in view.snapshot.dating.faults:
         if fault.kind is not FaultyClock.SET_BACK:
@@ -477,7 +501,7 @@ def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRe
 
 
 def _steps_back(view: View) -> Mapping[Path, Ns]:
-    """Returns how far the clock was set back at most while a recording ran; 0 for others."""
+    """Returns by recording the farthest step back of its clock (ns); 0 by default."""
     steps: dict[Path, Ns] = defaultdict(int)
     for fault in view.snapshot.dating.faults:
         if fault.kind is FaultyClock.SET_BACK:
@@ -486,59 +510,64 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
 
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
-    """Whether two recordings hold messages in a window, and each lacks most of the other's."""
-    differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
-    if key in differing:
-        return differing[key]
+    """Whether two recordings that no handover joins hold different messages in a window."""
+    remembered, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
+    if key in remembered:
+        return remembered[key]
     if view.sessions.are_joined(*pair):
         return False
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
-    bags = [[span for span in near if span.bag.recording == path] for path in pair]
-    differ = all(bags) and _bags_differ(view, topic, bags, both)
+    first, other = ([extent for extent in near if extent.bag.recording == path] for path in pair)
+    differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
-        differing[key] = differ
+        remembered[key] = differ
     return differ
 
 
 def _bags_differ(
     view: View,
     topic: str,
-    bags: Sequence[Sequence[TopicExtent]],
+    bags: tuple[Sequence[TopicExtent], Sequence[TopicExtent]],
     both: TimeWindow,
 ) -> bool:
-    """Whether two lists of bags hold messages in a window, and each lacks most of the other's.
+    """Whether the bags of two recordings each lack most messages of the other's in a window.
 
-    Two runs of a simulation share some, as those of a robot that has not moved yet.
+    Most, not all: two runs of a simulation share some, while the robot has not moved yet.
     """
-    return all(_lacks_most(view, topic, pair, both) for pair in (bags, bags[::-1]))
+    first, other = bags
+    return _lacks_most(view, topic, first, other, both) and _lacks_most(
+        view, topic, other, first, both
+    )
 
 
 def _lacks_most(
     view: View,
     topic: str,
-    bags: Sequence[Sequence[TopicExtent]],
+    first: Sequence[TopicExtent],
+    other: Sequence[TopicExtent],
     both: TimeWindow,
 ) -> bool:
-    """Whether the second lacks most of some messages that the first has all over a window."""
-    first, other = bags
+    """Whether `other` lacks most messages of `first`, by a sample from all over a window."""
     length = both.stop - both.start
     edges = [both.start + length * nth // _TRIED for nth in range(_TRIED + 1)]
     tried, lacking = 0, 0
     for start, stop in pairwise(edges):
         stored = next(_merged_messages(view, topic, first, TimeWindow(start, stop)), None)
-        if stored is not None:
-            near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
-            copies = _merged_messages(view, topic, other, near)
-            tried += 1
-            lacking += all(copy.identity != stored.identity for copy in copies)
+        if stored is None:
+            continue
+        tried += 1
+        near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
+        copies = _merged_messages(view, topic, other, near)
+        if all(copy.identity != stored.identity for copy in copies):
+            lacking += 1
         if 2 * lacking > _TRIED:
-            return True  # whatever the others are
+            return True  # the rest of the sample cannot change that
     return 2 * lacking > tried
 
 
 def _merged_messages(
     view: View, topic: str, bags: Sequence[TopicExtent], window: TimeWindow
 ) -> Iterator[StoredMessage]:
-    inside = [span for span in bags if window.overlaps(span.first, span.last)]
+    inside = [extent for extent in bags if window.overlaps(extent.first, extent.last)]
     return view.stream.merged(inside, [topic], window)

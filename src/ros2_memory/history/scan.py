@@ -1,8 +1,8 @@
 """Scans of topics within one call: what `columns.scan` yields, under the call's deadline.
 
-And how many messages there are in pieces of a window, each counted once. The index knows that of
-every bag in which no piece ends, where no other recording may hold copies. Of the rest the times of
-messages are looked at, and where recordings overlap those that count.
+Also counts the messages in pieces of a window, each message once. The index has the numbers of bags
+that lie in one piece and share no time with another recording. Of other bags, the times of the
+messages that count are read.
 """
 
 from __future__ import annotations
@@ -46,17 +46,13 @@ def scan(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-
-    def noted(rows: Rows) -> Rows:
+    for rows in open_scan(view, topic, window, **how).rows(newest_first=newest_first):
         view.note_thinned(TimeWindow(rows.first, rows.last + 1))
-        return rows
-
-    rows = open_scan(view, topic, window, **how).rows(newest_first=newest_first)
-    return map(noted, rows) if view.timeline.thinned else rows
+        yield rows
 
 
 class Wanted(TypedDict, total=False):
-    """What of a topic a scan is of; each is as in `Scan`."""
+    """Options of `Scan`; see there."""
 
     shared: Sequence[Span]
     may_match: Callable[[PartZones], bool | Mask]
@@ -84,12 +80,18 @@ def open_scan(
     reached: Callable[[Ns], None] = lambda _: None,
     **wanted: Unpack[Wanted],
 ) -> Scan:
-    """Returns the scan of a topic in a window.
+    """Returns the scan of a topic in a window; notes report what cannot be read.
 
-    What cannot be read is noted. `reached` is called before each table with a log time that what
-    is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
-    times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
-    a message counts in each recording that holds it.
+    Args:
+        view: of the call.
+        topic: its name.
+        window: of log time.
+        columns: whether rows have more than times. Without columns, messages that cannot be decoded
+            have rows, too.
+        copies: whether a message counts in each recording that holds it.
+        reached: called before each table, with a log time. Rows that are left are not earlier; with
+            `newest_first`, not later.
+        **wanted: options of `Scan`.
     """
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
@@ -122,19 +124,19 @@ def joined_back(
     *,
     beside: Ns = 0,
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what `make` returns of the rows of a scan, the newest first, each with a time.
+    """Yields what `make` returns for the stretches of a scan, the newest first.
 
-    Nothing of it is earlier than that (log time, ns). What follows from whole parts alone is joined
-    by stretches of the clock, and remembered.
+    With each result comes a log time (ns) that nothing of it is earlier than. The results of a
+    stretch of whole parts are joined, and remembered as one.
 
     Args:
         view: of the call.
         opened: the scan.
-        kind: of what is made.
-        make: returns what follows from the rows that begin in a stretch, the newest first. Of one
-            without parts the call may leave out what is not `stored`.
-        key_of: returns under which key that of a stretch is remembered; None: under none.
-        beside: how far before and after a stretch (ns) rows are part of it, too.
+        kind: the kind of the results.
+        make: returns the results for rows that begin in a stretch, the newest first. If the stretch
+            has no parts and the call is for the store, it may leave out what is not stored.
+        key_of: returns the key by which the result of a stretch is remembered; None for none.
+        beside: how far (ns) before and after a stretch its results depend on rows.
     """
     for stretch in opened.stretches(beside):
         view.note_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
@@ -145,11 +147,11 @@ def joined_back(
         view.bags.check_deadline()
         results: list[tuple[Ns, T]] = []
         join = partial(_joined, kind, make(stretch), results)
-        before = key.start - opened.window.start  # they are wanted next
+        before = key.start - opened.window.start  # earlier stretches are wanted next
         try:
             joined = remembered(view, joining(kind), key, join, also_before=before)
         except QueryTimeoutError:
-            # What there was time for is an answer, too, with a note.
+            # The results so far are an answer, too, with a note.
             yield from results
             raise
         for result in reversed(joined.fragments):
@@ -159,7 +161,7 @@ def joined_back(
 def _joined(
     kind: FragmentKind[T], made: Iterable[tuple[Ns, T]], results: list[tuple[Ns, T]]
 ) -> Joined[T]:
-    """Returns what was made, the newest first, as one; `results` has it one by one."""
+    """Joins what was made, the newest first; adds it to `results` one by one, in case it ends."""
     results.extend(made)
     return Joined(kind.join([result for _, result in results[::-1]]) if results else [])
 
@@ -172,10 +174,10 @@ def remembered(
     *,
     also_before: Ns = 0,
 ) -> T:
-    """Returns what is stored under a key, else what `make` returns.
+    """Returns the fragment with a key, or makes and remembers it.
 
-    That is remembered unless something could not be read; see `joined_back`. A key of None stands
-    for what may still change. `also_before`: see `Fragments.get`.
+    It is not remembered if something could not be read meanwhile, or if the key is None: then it
+    may still change. `also_before` is as in `Fragments.get`.
     """
     fragments = view.memory.scanner.fragments(kind)
     fragment = None if key is None else fragments.get(key, also_before)
@@ -215,31 +217,31 @@ def read_until_late(
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
-    """Yields the rows of a scan, those together that overlap in time: no other lies between.
+    """Yields the rows of a scan in blocks: rows of different blocks do not overlap in time.
 
-    Those together are in the order that their messages of one log time have; see `Rows.order`.
+    Within a block they are sorted by `Rows.order`, which decides between messages of one log time.
     """
-    together: list[Rows] = []
+    block: list[Rows] = []
     for rows in scanned:
-        is_apart = together and (
-            rows.last < min(other.first for other in together)
-            if newest_first
-            else rows.first > max(other.last for other in together)
-        )
+        if newest_first:
+            is_apart = bool(block) and rows.last < min(other.first for other in block)
+        else:
+            is_apart = bool(block) and rows.first > max(other.last for other in block)
         if is_apart:
-            yield _in_order(together)
-            together = []
-        together.append(rows)
-    if together:
-        yield _in_order(together)
+            yield _in_order(block)
+            block = []
+        block.append(rows)
+    if block:
+        yield _in_order(block)
 
 
-def _in_order(together: list[Rows]) -> list[Rows]:
-    return sorted(together, key=lambda rows: rows.order) if len(together) > 1 else together
+def _in_order(block: list[Rows]) -> list[Rows]:
+    # Mostly a block is one table: then its order need not be computed.
+    return sorted(block, key=lambda rows: rows.order) if len(block) > 1 else block
 
 
 def decoded_rows(view: View, rows: Rows) -> Iterator[tuple[IntArray, Rows]]:
-    """Yields some rows as their bags have them, with their positions among those that count."""
+    """Decodes rows from their bags; yields them with their positions in `rows`."""
     times, ranks, channel = rows.times, rows.ranks, rows.table.channel
     for bag, positions in rows.bag_rows():
         wanted = times[positions]
@@ -254,67 +256,71 @@ def decoded_rows(view: View, rows: Rows) -> Iterator[tuple[IntArray, Rows]]:
 
 
 def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list[V] | None:
-    """Returns what is read of the columns of some rows: of those in the store, else in their bags.
+    """Reads the columns of rows; decodes their bags if the store has left columns out.
 
-    A topic beyond its share has few in the store. None where only the messages have it.
+    Returns one value, or a value for each bag. None if only the messages can tell.
     """
-    values = read(rows)
-    # Without any column ("") a stored table is for its type, which its bag does not change; one of
-    # a bag may be so for the size of all its messages together.
+    value = read(rows)
+    if value is not None:
+        return [value]
+    # "" stands for all columns. A stored table lacks them because of its type: its bags do not have
+    # them either. A table of a bag may lack them because of its size.
     left_out, is_stored = rows.table.left_out, isinstance(rows.table, StoredTable)
-    if values is not None or not left_out or ("" in left_out) == is_stored:
-        return None if values is None else [values]
-    by_bag, left = list[V](), len(rows)
+    if not left_out or ("" in left_out) == is_stored:
+        return None
+    values: list[V] = []
+    missing = len(rows)
     for positions, decoded in decoded_rows(view, rows):
-        values, left = read(decoded), left - positions.size
-        if values is None:
+        value = read(decoded)
+        if value is None:
             return None
-        by_bag.append(values)
-    return by_bag if by_bag and not left else None
+        values.append(value)
+        missing -= positions.size
+    return values if values and not missing else None
 
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
-    """Yields the messages of some rows, read from their bags: bag after bag, in log-time order."""
+    """Yields the messages of rows, read from their bags: bag after bag, in log-time order."""
     return (stored for _, stored in messages_at(view, rows))
 
 
 def messages_at(view: View, rows: Rows) -> Iterator[tuple[int, StoredMessage]]:
-    """Does as `messages_of`, each with the position of its row among those that count."""
+    """Yields `messages_of`, each with its position in `rows`."""
     times, ranks, channel = rows.times, rows.ranks, rows.table.channel
     for bag, positions in rows.bag_rows():
         wanted = times[positions]
         window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
         keys = zip(wanted.tolist(), ranks[positions].tolist(), strict=True)
         position_of = dict(zip(keys, positions.tolist(), strict=True))
-        met = Counter[Ns]()
+        rank_of = Counter[Ns]()  # tells messages of one log time apart
         for stored in view.bags.read(bag, [channel.topic], window):
             if stored.type == channel.type:
-                position = position_of.get((stored.time, met[stored.time]))
+                position = position_of.get((stored.time, rank_of[stored.time]))
                 if position is not None:
                     yield position, stored
-                met[stored.time] += 1
+                rank_of[stored.time] += 1
 
 
 def positions_in(times: Ints, window: TimeWindow) -> Ints:
-    """Returns the positions of those times that are in a window."""
+    """Returns the positions of the times that are in a window."""
     return np.flatnonzero((times >= window.start) & (times < window.stop))
 
 
 class Counted(NamedTuple):
-    """How many messages each piece holds, and the log times of its first and last one."""
+    """For each piece the number of its messages, and the log times of the first and the last."""
 
     messages: IntArray
     first: IntArray
     last: IntArray
 
     def add(self, pieces: IntArray, messages: IntArray, first: IntArray, last: IntArray) -> None:
-        """Adds messages to pieces, each of which may be named several times."""
+        """Adds numbers of messages to pieces; a piece may occur several times."""
         np.add.at(self.messages, pieces, messages)
         np.minimum.at(self.first, pieces, first)
         np.maximum.at(self.last, pieces, last)
 
     def add_times(self, times: IntArray, edges: IntArray) -> None:
-        """Adds a message at each of some log times (ns) to the piece that it lies in."""
+        """Adds messages, by their log times (ns), to the pieces that `edges` separate."""
         pieces = np.searchsorted(edges, times, side="right")
         self.add(pieces, np.ones_like(times), times, times)
 
@@ -322,23 +328,21 @@ class Counted(NamedTuple):
 def count_messages(
     view: View, topic: str, window: TimeWindow, edges: IntArray, *, proves: bool = False
 ) -> Counted:
-    """Returns how many messages of a topic lie in each piece of a window.
-
-    Messages that cannot be decoded count, too.
+    """Counts the messages of a topic in each piece of a window, including undecodable ones.
 
     Args:
-        view: the call's.
+        view: of the call.
         topic: its name.
         window: of log time.
-        edges: where pieces begin (ns), ascending; what is before the first is piece 0.
-        proves: whether messages are read for their times, as indexes of bags may lie.
+        edges: where pieces begin (ns), ascending; piece 0 is before the first edge.
+        proves: whether messages themselves are read for their times: the index of a bag may lie.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
     size = len(edges) + 1
     counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
-    # Which of repeated messages count, no bag shows alone.
+    # No bag alone shows which of repeated messages count.
     is_repeated = view.stream.may_be_repeated([topic])
     shared = open_scan(view, topic, window).shared
     shared_ends = np.array([*shared, (MAX_NS, MAX_NS)], np.int64).T
@@ -350,12 +354,11 @@ def count_messages(
             continue
         bags, firsts, lasts, messages = column
         pieces = np.searchsorted(edges, firsts, side="right")
-        is_here = (firsts < window.stop) & (lasts >= window.start)
-        is_cut = _are_cut(column, window, edges, shared_ends) | is_repeated
-        is_in = is_here & ~is_cut
-        counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
-        for row in np.flatnonzero(is_here & is_cut).tolist():
-            # A bag has a row for each type of the topic.
+        is_in_window = (firsts < window.stop) & (lasts >= window.start)
+        must_be_read = _must_be_read(column, window, edges, shared_ends) | is_repeated
+        is_known = is_in_window & ~must_be_read
+        counted.add(pieces[is_known], messages[is_known], firsts[is_known], lasts[is_known])
+        for row in np.flatnonzero(is_in_window & must_be_read).tolist():
             to_read.add(segment.bags[bags[row]].file)
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
     for rows in scan(view, topic, window, columns=proves, shared=shared, within=united(spans)):
@@ -364,11 +367,14 @@ def count_messages(
     return counted
 
 
-def _are_cut(column: TopicColumn, window: TimeWindow, edges: IntArray, shared_ends: Ints) -> Mask:
-    """Returns which bags have to be read: those of several pieces, and those with shared times.
+def _must_be_read(
+    column: TopicColumn, window: TimeWindow, edges: IntArray, shared_ends: Ints
+) -> Mask:
+    """Returns which rows are of bags that must be read: the index does not have their numbers.
 
-    A bag of which one type of the topic has to be read is read under all. `shared_ends` has the
-    starts and the stops of shared times, which are in order and apart.
+    They lie in several pieces, or have times that recordings share. A bag that must be read for one
+    type of the topic is read for all of its types. `shared_ends` has the starts and the stops of
+    shared times, in order.
     """
     bags, firsts, lasts, _ = column
     is_cut = (firsts < window.start) | (lasts >= window.stop)
@@ -381,17 +387,19 @@ def _are_cut(column: TopicColumn, window: TimeWindow, edges: IntArray, shared_en
 def pick(
     view: View, topic: str, window: TimeWindow, at_most: int
 ) -> tuple[int, Iterator[StoredMessage]]:
-    """Returns how many messages of a topic a window holds, and `at_most` of them, evenly spaced.
+    """Counts the messages of a topic in a window, and picks `at_most` of them, evenly spaced.
 
-    The first and the last are always among them. Each is read when it is its turn.
+    The first and the last are always picked. Each message is read when the iterator reaches it.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    edges = np.unique(view.bounds(topic, window)[0])
+    firsts, _ = view.bounds(topic, window)
+    edges = np.unique(firsts)
     counts = count_messages(view, topic, window, edges, proves=True).messages
     ends = np.cumsum(counts)
-    chosen = np.array(evenly(int(ends[-1]), at_most), np.int64)
+    total = int(ends[-1])
+    chosen = np.array(evenly(total, at_most), np.int64)
     opened = open_scan(view, topic, window)
 
     def read() -> Iterator[StoredMessage]:
@@ -399,16 +407,22 @@ def pick(
         bounds = [MIN_NS, *edges.tolist(), MAX_NS]
         for piece in np.unique(pieces).tolist():
             part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
-            nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
-            tables = [
-                rows.some(positions_in(rows.times, part))
-                for rows in _in_order([*opened.rows(among=part)])
-            ]
-            begins = np.cumsum([0, *map(len, tables)])
-            times = np.concatenate([np.empty(0, np.int64), *(rows.times for rows in tables)])
-            order = np.argsort(times, kind="stable")
-            for place in order[nth[nth < times.size]].tolist():  # a bag may be deleted since
-                table = int(np.searchsorted(begins, place, side="right")) - 1
-                yield from messages_of(view, tables[table].some(place - begins[table : table + 1]))
+            in_piece = chosen[pieces == piece] - (ends[piece] - counts[piece])
+            yield from _nth_messages(view, opened, part, in_piece)
 
-    return int(ends[-1]), read()
+    return total, read()
+
+
+def _nth_messages(
+    view: View, opened: Scan, part: TimeWindow, numbers: Ints
+) -> Iterator[StoredMessage]:
+    """Yields the messages of a part with these numbers, counted from 0 in log-time order."""
+    tables = [
+        rows.some(positions_in(rows.times, part)) for rows in _in_order([*opened.rows(among=part)])
+    ]
+    begins = np.cumsum([0, *map(len, tables)])
+    times = np.concatenate([np.empty(0, np.int64), *(rows.times for rows in tables)])
+    order = np.argsort(times, kind="stable")
+    for row in order[numbers[numbers < times.size]].tolist():  # a bag may be deleted since
+        table = int(np.searchsorted(begins, row, side="right")) - 1
+        yield from messages_of(view, tables[table].some(row - begins[table : table + 1]))
