@@ -1,14 +1,14 @@
 """Sessions: which recordings are of one robot in one run, and the transforms that they hold.
 
-A transform holds in the session in which it was published: another robot, or the same one after a
-restart, has its own. A session is a recording and those that it is joined with by handovers, and
-what was carried of these when their bags were deleted.
+A transform holds in its own session: another robot, or the same one after a restart, publishes its
+own. A session is a recording, the recordings that handovers join with it, and what was carried of
+these when their bags were deleted.
 
-Recordings of one time may be of one robot, for which two recorders were started. So a session with
-moving transforms alone borrows the static ones of other frames from one that has these alone, and
-one without any borrows from the one session beside it that has some. Nothing is lent where two
-recordings hold poses at that time: these are two robots. Only a handover proves that two recordings
-are of one robot, so a reply that uses borrowed transforms has to note it.
+Two recorders may record one robot at the same time. So a session with only moving transforms
+borrows the static ones of a session with only static ones, of other frames; and a session without
+transforms borrows from the one session at its time that has some. Nothing is lent if two recordings
+hold poses at that time: these are two robots. Only a handover proves that two recordings are of one
+robot, so a reply that uses borrowed transforms notes it.
 """
 
 from __future__ import annotations
@@ -55,22 +55,22 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 Session: TypeAlias = frozenset[str]
-"""The folders of its recordings, as they were named when they were recorded."""
+"""The folders of its recordings, by their names when they were recorded."""
 
 _AROUND_NS: Final = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
 _FEW_SESSIONS: Final = 4
-"""Sessions of which static transforms are looked up one by one."""
+"""After this many sessions, the static transforms of all are looked up at once."""
 _UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
 
 
 class _TransformSpans(NamedTuple):
-    """What sessions follow from: folders, with the log times of their first and last messages.
+    """What sessions follow from. A span has the log times of the first and last message.
 
     Attributes:
-        kinds: those of moving and of static transforms.
-        poses: those of the robot's own poses.
-        joined: by folder, all that are joined with it by handovers.
+        kinds: by folder, the span of its moving transforms; the same of its static ones.
+        poses: folders with the robot's own poses, and the spans of these.
+        joined: by folder, the folders that handovers join with it.
     """
 
     kinds: tuple[Mapping[str, Span], Mapping[str, Span]]
@@ -79,28 +79,28 @@ class _TransformSpans(NamedTuple):
 
 
 _RECORDED: Final[Key[_TransformSpans]] = Key()
-"""Of a timeline: sidecars are read for it."""
+"""Of a timeline: sidecar files are read for it."""
 _RECORDINGS: Final[Key[dict[tuple[str, ...], dict[str, dict[Path, Span]]]]] = Key()
-"""Of a timeline: by topics, then by where they were recorded, the recordings that hold them."""
+"""Of a timeline: by topics, then by folder, the recordings that hold them, with their spans."""
 _LINKED: Final[Key[set[tuple[tuple[str, str], Session | None]]]] = Key()
-"""Of a timeline: what one call found, the next need not look for."""
+"""Of a timeline: `Sessions.linked`, so that the next call need not search again."""
 
 
 class Sessions:
-    """The sessions of a view that hold transforms, and these.
+    """The sessions of a view, and their transforms.
 
     Args:
         view: one call's view of the memory. Two sessions that hold the topic of the robot's own
             poses (`View.pose_topic`) at once are two robots.
 
     Attributes:
-        chosen: for a session with one that may lend to it and two frames, whose transforms hold.
-        linked: frames that are known to be connected in a session, or in some.
-        parts: by a session that is joined by lending, the two that it is of.
+        chosen: by session with lender, own session and two frames, the one whose transforms hold.
+        linked: pairs of frames that are connected in a session; with None, in any session.
+        parts: by session with its lender, the two sessions.
     """
 
     def __init__(self, view: View) -> None:
-        # A view holds its sessions: so the arrays of a call are freed as it ends.
+        # The view refers to its sessions: without a circle, its arrays are freed as the call ends.
         self._view: View = proxy(view)
         self._names = HardLinks(view.bag_dir)
         self._root = str(view.bag_dir).rstrip("/")
@@ -114,31 +114,33 @@ class Sessions:
         self.parts: dict[Session, tuple[Session, Session]] = {}
 
     def folder(self, recording: Path) -> str:
-        """Returns where a recording was recorded; a saved moment keeps it elsewhere."""
+        """Returns the folder in which a recording was made; a saved moment keeps it elsewhere."""
         return self._names.recorded_as(str(recording))
 
     def recordings_of(self, session: Session, topics: tuple[str, ...]) -> Mapping[Path, Span]:
         """Returns the recordings of a session that hold some topics.
 
-        With the log times of the first and the last message of these.
+        With the log times of the first and last message of these topics.
         """
-        if topics not in self._recordings:
-            self._recordings[topics] = self._recordings_with(topics)
-        by_folder = self._recordings[topics]
-        held = (by_folder.get(folder, {}) for folder in sorted(session))
-        return {path: span for recordings in held for path, span in recordings.items()}
+        by_folder = self._recordings_with(topics)
+        recordings: dict[Path, Span] = {}
+        for folder in sorted(session):
+            recordings |= by_folder.get(folder, {})
+        return recordings
 
-    def _recordings_with(self, topics: Iterable[str]) -> dict[str, dict[Path, Span]]:
-        """Returns the recordings that hold some topics, by where they were recorded."""
-        by_folder: dict[str, dict[Path, Span]] = {}
-        for topic in topics:
-            for path, span in self._view.timeline.recordings(topic).items():
-                there = by_folder.setdefault(self.folder(path), {})
-                there[path] = wider(there.get(path), span)
-        return by_folder
+    def _recordings_with(self, topics: tuple[str, ...]) -> Mapping[str, Mapping[Path, Span]]:
+        """Returns by folder the recordings that hold some topics, as `recordings_of`."""
+        if topics not in self._recordings:
+            by_folder: dict[str, dict[Path, Span]] = {}
+            for topic in topics:
+                for path, span in self._view.timeline.recordings(topic).items():
+                    in_folder = by_folder.setdefault(self.folder(path), {})
+                    in_folder[path] = wider(in_folder.get(path), span)
+            self._recordings[topics] = by_folder
+        return self._recordings[topics]
 
     def has(self, session: Session, stored: StoredMessage) -> bool:
-        """Whether a message is of a session; a carried one that names no recording is of each."""
+        """Whether a message is of a session. A carried one without an origin is of each."""
         folder = self.folder(stored.bag.recording)
         if folder != self._carried:
             return folder in session
@@ -148,11 +150,11 @@ class Sessions:
         return any(f"{self._root}/{name}" in session for name in origin.recordings)
 
     def has_all_kinds(self, session: Session) -> bool:
-        """Whether a session holds moving and static transforms: then it borrows none."""
+        """Whether a session holds moving and static transforms, and so borrows none."""
         return len(self._kinds(session)) == len(self._spans.kinds)
 
     def holds_carried(self, recording: Path) -> bool:
-        """Whether a recording is of carried messages."""
+        """Whether a recording consists of carried messages."""
         return self.folder(recording) == self._carried
 
     def may_hold(self, session: Session, recording: Path) -> bool:
@@ -171,10 +173,9 @@ class Sessions:
         return other.name in joined_with(first) or first.name in joined_with(other)
 
     def lending_to(self, recording: Path, at: Ns) -> Session:
-        """Returns the session whose transforms hold for a message of a recording.
+        """Returns the session whose transforms hold for messages of a recording at a moment.
 
-        That is more than the recording's own session where another one lends; empty where none has
-        any.
+        With another session, if that lends to the recording's own one. Empty without transforms.
         """
         folder = self.folder(recording)
         if (folder, at) not in self._lending:
@@ -182,32 +183,36 @@ class Sessions:
         return self._lending[folder, at]
 
     def recorded_at(self, moment: Ns) -> list[list[Session]] | None:
-        """Returns the sessions whose transforms hold at a moment; None if none was recorded.
+        """Returns the sessions whose transforms hold at a moment; None if nothing was recorded.
 
-        In groups, of which those of the first count that has an answer: the sessions that went on
-        then; those that had ended or not begun yet, by `_AROUND_NS` at most. What had ended comes
-        before what had not begun, and what is nearer before what is farther.
+        In two groups, of which the first that has an answer counts: the sessions that went on then,
+        and those that ended or began within `_AROUND_NS` of it. In the latter, ended sessions come
+        before those that had not begun, and the nearest come first.
         """
         around = self._around(moment)
         if not around:
             return None
-        apart = {each: _apart(span, moment) for each, span in around.items() if self._kinds(each)}
-        nearest = sorted(apart, key=lambda session: apart[session])
-        then = dict.fromkeys(self._with_lender(s, moment) for s in nearest if not any(apart[s]))
-        beside = dict.fromkeys(self._with_lender(s, moment) for s in nearest if any(apart[s]))
-        groups = [*then], [each for each in beside if each not in then]
+        distances = {
+            session: _time_before_and_after(span, moment)
+            for session, span in around.items()
+            if self._kinds(session)
+        }
+        then: dict[Session, None] = {}
+        beside: dict[Session, None] = {}
+        for session in sorted(distances, key=distances.__getitem__):
+            group = beside if any(distances[session]) else then
+            group[self._with_lender(session, moment)] = None
+        groups = [*then], [session for session in beside if session not in then]
         return [group for group in groups if group]
 
     def names(self, session: Session, at: Ns) -> str:
-        """Returns the names of a session's recordings at a moment; of all if none went on."""
-        recordings = sorted(session - {self._carried})
-        around = [
-            folder for folder in recordings if folder in self._folders_around(at)
-        ] or recordings
-        return " and ".join(folder.rpartition("/")[2] for folder in around) or "deleted recordings"
+        """Returns the names of a session's recordings around a moment; of all if none is there."""
+        folders = sorted(session - {self._carried})
+        folders = [folder for folder in folders if folder in self._folders_around(at)] or folders
+        return " and ".join(folder.rpartition("/")[2] for folder in folders) or "deleted recordings"
 
     def nearest_to(self, moment: Ns) -> list[Session]:
-        """Returns all sessions that hold transforms, the nearest in time first."""
+        """Returns all sessions with transforms, the nearest in time first."""
         near = sorted(
             (_distance(span, moment), folder)
             for by_folder in self._spans.kinds
@@ -216,51 +221,56 @@ class Sessions:
         return [*dict.fromkeys(self._session_of(folder) for _, folder in near)]
 
     def _with_lender(self, session: Session, at: Ns) -> Session:
-        """Returns a session with the one that lends to it; empty where it has no transforms."""
+        """Returns a session joined with its only lender, if it has one.
+
+        Else the session itself; empty if it has no transforms.
+        """
         kinds = self._kinds(session)
-        if self.has_all_kinds(session) or self._are_two_robots(at):
-            return session if kinds else frozenset()
-        beside = [other for other in self._around(at) if other != session and self._kinds(other)]
-        if kinds:
-            partners = [other for other in beside if self._are_complementary(session, other)]
-        else:
-            partners = [*dict.fromkeys(self._with_lender(other, at) for other in beside)]
-        if len(partners) == 1:
-            completed = session | partners[0]
-            self.parts[completed] = session, partners[0]
-            return completed
+        lenders: list[Session] = []
+        if not self.has_all_kinds(session) and not self._are_two_robots(at):
+            beside = [other for other in self._around(at) if other != session]
+            beside = [other for other in beside if self._kinds(other)]
+            if kinds:
+                lenders = [other for other in beside if self._are_complementary(session, other)]
+            else:
+                lenders = [*dict.fromkeys(self._with_lender(other, at) for other in beside)]
+        if len(lenders) == 1:
+            joined = session | lenders[0]
+            self.parts[joined] = session, lenders[0]
+            return joined
         return session if kinds else frozenset()
 
     def _are_two_robots(self, at: Ns) -> bool:
-        """Whether two sessions near a moment hold poses of the same time."""
-        poses = self._spans.poses
-        near = [(folder, span) for folder, span in poses if _distance(span, at) <= _AROUND_NS]
-        return any(
-            max(first, begin) <= min(last, end)
-            and self._session_of(first_folder) != self._session_of(other)
-            for (first_folder, (first, last)), (other, (begin, end)) in combinations(near, 2)
-        )
+        """Whether two sessions hold poses at the same time, near a moment."""
+        near = [
+            (folder, span)
+            for folder, span in self._spans.poses
+            if _distance(span, at) <= _AROUND_NS
+        ]
+        for (folder, (first, last)), (other, (begin, end)) in combinations(near, 2):
+            overlap = max(first, begin) <= min(last, end)
+            if overlap and self._session_of(folder) != self._session_of(other):
+                return True
+        return False
 
     def _are_complementary(self, first: Session, other: Session) -> bool:
-        """Whether one has moving transforms alone, the other static ones alone, of other frames."""
+        """Whether one session has only moving transforms, the other only static ones.
+
+        And of other frames.
+        """
         if self._kinds(first) & self._kinds(other):
             return False
         topics = (*self._view.moving_topics, *self._view.static_topics)
-        frames, others = (
-            {child for _, child in self.pairs(topics, session)} for session in (first, other)
-        )
-        return frames.isdisjoint(others)
+        frames = {child for _, child in self.pairs(topics, first)}
+        return frames.isdisjoint(child for _, child in self.pairs(topics, other))
 
     def _kinds(self, session: Session) -> frozenset[int]:
-        """Returns which kinds of transforms a session holds; carried ones count as its own."""
+        """Returns the positions in `_TransformSpans.kinds` of what a session holds."""
         kinds = enumerate(self._spans.kinds)
         return frozenset(kind for kind, spans in kinds if session & spans.keys())
 
     def _around(self, moment: Ns) -> dict[Session, Span]:
-        """Returns the sessions that were being recorded around a moment.
-
-        With the log times of the first and the last message of their bags that are near.
-        """
+        """Returns the sessions that were recorded around a moment, with the span of their bags."""
         around: dict[Session, Span] = {}
         for folder, span in sorted(self._folders_around(moment).items()):
             session = self._session_of(folder)
@@ -268,7 +278,10 @@ class Sessions:
         return around
 
     def _folders_around(self, moment: Ns) -> dict[str, Span]:
-        """Returns the folders of the recordings that went on around a moment; see `_around`."""
+        """Returns the recordings with bags within `_AROUND_NS` of a moment, by folder.
+
+        With the first and last log time in these bags.
+        """
         spans: dict[str, Span] = {}
         for bag in self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS)):
             folder = self.folder(bag.recording)
@@ -281,8 +294,8 @@ class Sessions:
             return frozenset({folder})
         return self._spans.joined.get(folder) or frozenset({folder, self._carried})
 
-    def _spans_of(self, topics: Iterable[str]) -> dict[str, Span]:
-        """Returns the log times of the first and the last message of some topics, by folder."""
+    def _spans_of(self, topics: tuple[str, ...]) -> dict[str, Span]:
+        """Returns by folder the first and last log time of some topics."""
         by_folder = self._recordings_with(topics)
         return {folder: enclosing(spans.values()) for folder, spans in by_folder.items()}
 
@@ -291,12 +304,13 @@ class Sessions:
         topics = (*view.moving_topics, *view.static_topics, view.pose_topic)
         recordings = map(view.timeline.recordings, topics)
         paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
-        chains = components(
-            (folder, f"{folder.rpartition('/')[0]}/{name}")
-            for folder, path in (paths.items() if len(paths) > 1 else ())
-            if str(path) in view.timeline.handed_over
-            for name in view.memory.index.joined_with(path)
-        )
+        handovers: list[tuple[str, str]] = []
+        for folder, path in paths.items():
+            if len(paths) > 1 and str(path) in view.timeline.handed_over:
+                parent, _, _ = folder.rpartition("/")
+                names = view.memory.index.joined_with(path)
+                handovers += [(folder, f"{parent}/{name}") for name in names]
+        chains = components(handovers)
         return _TransformSpans(
             (self._spans_of(view.moving_topics), self._spans_of(view.static_topics)),
             [*self._spans_of((view.pose_topic,)).items()],
@@ -307,37 +321,37 @@ class Sessions:
         self, session: Session, topics: tuple[str, ...], window: TimeWindow
     ) -> list[TopicExtent]:
         """Returns the bags of a session that hold messages of some topics in a window."""
-        # A session is mostly some minutes of a week, whose bags are many.
-        part = window.intersect(self._span_of(session, topics))
-        chosen = self.recordings_of(session, topics)
-        bags = self._view.stream.overlapping_bags(topics, part)
-        return [span for span in bags if span.bag.recording in chosen]
+        # A week has many bags, and a session mostly lasts some hours.
+        part = window.intersect(self._window_of(session, topics))
+        recordings = self.recordings_of(session, topics)
+        extents = self._view.stream.overlapping_bags(topics, part)
+        return [extent for extent in extents if extent.bag.recording in recordings]
 
     def newest(self, topic: str, window: TimeWindow, recording: Path) -> StoredMessage | None:
-        """Returns the newest message of a topic in a window, from the session of a recording.
+        """Returns the newest message of a topic in a window from the session of a recording.
 
-        From any session where that one has no message of the topic at all.
+        From any session, if that one has no message of the topic at all.
         """
         newest, session = self._view.stream.newest(topic, window), self.of(recording)
         if not self.recordings_of(session, (topic,)):
             return newest
-        bags = self.bags_of(session, (topic,), window)
-        if newest is not None and newest.bag in {span.bag for span in bags}:
+        extents = self.bags_of(session, (topic,), window)
+        if newest is not None and any(extent.bag == newest.bag for extent in extents):
             return newest
-        merged = self._view.stream.merged(bags, [topic], window, newest_first=True)
+        merged = self._view.stream.merged(extents, [topic], window, newest_first=True)
         return next(self._view.bags.track_sources(merged), None)
 
     def moving(self, session: Session, window: TimeWindow) -> list[StampedTransform]:
-        """Returns the moving transforms that a session received in a window, in log-time order."""
-        stream, topics = self._view.stream, self._view.moving_topics
-        bags = self.bags_of(session, topics, window)
-        merged = stream.merged(bags, topics, window)
+        """Returns the moving transforms of a session in a window, in log-time order."""
+        topics = self._view.moving_topics
+        extents = self.bags_of(session, topics, window)
+        merged = self._view.stream.merged(extents, topics, window)
         tracked = self._view.bags.track_sources(merged)
         of_session = (stored for stored in tracked if self.has(session, stored))
         return [*decoded_transforms(self._view, of_session)]
 
     def received(self, session: Session | None, rows: Rows) -> Iterator[StampedTransform]:
-        """Yields the transforms in some rows that are of a session; None: of any."""
+        """Yields the transforms of a session, or with None of all, in the messages of rows."""
         messages = messages_of(self._view, rows)
         if session is not None:
             messages = (stored for stored in messages if self.has(session, stored))
@@ -346,42 +360,34 @@ class Sessions:
     def static(self, session: Session) -> Sequence[StampedTransform]:
         """Returns the static transforms of a session, in log-time order.
 
-        One that is equal to the one before of its child is left out: each split may have all again.
-        So few messages of a part are read: those by whose columns something is new.
+        A transform that repeats the one before of its child is left out: each split may have all
+        again. So only the messages are read whose columns show something new.
 
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        view, caches = self._view, self._view.memory.scanner.caches
-        if session not in self._static:
-            timeline, known = caches.statics.get(view.static_topics) or (None, {})
-            if timeline is not view.timeline:
-                known = {}
-            self._static |= known
+        view, cache = self._view, self._view.memory.scanner.caches.statics
+        if session in self._static:
+            return self._static[session]
+        timeline, cached = cache.get(view.static_topics) or (None, {})
+        known = dict(cached) if timeline is view.timeline else {}
+        if session not in known:
+            noted = view.notes.added
+            if len(self._static) == _FEW_SESSIONS and not view.call.stored:
+                # A call that asks for so many asks for more.
+                known = {**self._all_static(), **known}
             if session not in known:
-                self._static |= self._with_static(session, known)
+                received = (self._static_received(topic, session) for topic in view.static_topics)
+                known[session] = _without_repeats(chain.from_iterable(received))
+            # A note has to be in each answer, so what it is about is not cached.
+            if view.notes.added == noted and not view.call.used_active:
+                size = 300 * len(known) + 500 * sum(map(len, known.values()))
+                cache.put(view.static_topics, (view.timeline, known), size)
+        self._static |= known
         return self._static[session]
 
-    def _with_static(
-        self, session: Session, known: Mapping[Session, Sequence[StampedTransform]]
-    ) -> Mapping[Session, Sequence[StampedTransform]]:
-        """Returns the static transforms of one more session; for many, of all."""
-        view, before = self._view, self._view.notes.added
-        if len(self._static) == _FEW_SESSIONS and not view.call.stored:
-            # Who has asked for so many asks for more, also where nothing of it is remembered.
-            known = {**self._all_static(), **known}
-            self._static.update(known)
-        if session not in known:
-            received = (self._static_received(topic, session) for topic in view.static_topics)
-            known = {**known, session: _without_repeats(chain.from_iterable(received))}
-        # What was noted must be noted in each answer.
-        if view.notes.added == before and not view.call.used_active:
-            size = 300 * len(known) + 500 * sum(map(len, known.values()))
-            view.memory.scanner.caches.statics.put(view.static_topics, (view.timeline, known), size)
-        return known
-
     def _all_static(self) -> dict[Session, Sequence[StampedTransform]]:
-        """Returns those of all sessions that are stored, unless some are carried."""
+        """Returns the static transforms of all stored sessions; empty if some are carried."""
         view = self._view
         coverage = view.memory.scanner.coverage(view.timeline)
         recordings = chain.from_iterable(map(view.timeline.recordings, view.static_topics))
@@ -392,10 +398,10 @@ class Sessions:
             received[self.of(view.bag_dir / statics.recording)] += statics.transforms
         for recording in {bag.recording for bag in coverage.missing}:
             received.pop(self.of(recording), None)
-        return {session: _without_repeats(found) for session, found in received.items()}
+        return {session: _without_repeats(statics) for session, statics in received.items()}
 
     def static_back(self, window: TimeWindow) -> Iterator[Statics]:
-        """Yields the static transforms of the parts in a window, of bags that are stored."""
+        """Yields the static transforms of stored parts that begin in a window."""
         for topic in self._view.static_topics:
             opened = open_scan(self._view, topic, window, copies=True, stored=True)
 
@@ -408,15 +414,15 @@ class Sessions:
                 yield statics
 
     def _static_received(self, topic: str, session: Session) -> Iterator[StampedTransform]:
-        """Yields static transforms of a topic; of equal ones that follow in a part the first."""
-        for rows in scan(self._view, topic, self._span_of(session, (topic,)), copies=True):
+        """Yields the static transforms of a topic, mostly without repeats within a part."""
+        for rows in scan(self._view, topic, self._window_of(session, (topic,)), copies=True):
             if self.holds_carried(rows.recording):
                 yield from self.received(session, rows)
             elif self.folder(rows.recording) in session:
                 yield from self._static_changes(rows).transforms
 
     def _static_changes(self, rows: Rows) -> Statics:
-        """Returns the static transforms in some rows that differ from those before, as received."""
+        """Returns the static transforms in rows, without repeats, and remembers those of a part."""
 
         def make() -> Statics:
             times = static_times(rows.table, rows.times, rows.index)
@@ -427,8 +433,8 @@ class Sessions:
         key = None if rows.part is None else FragmentKey(rows.first, "", (rows.part,))
         return remembered(self._view, STATICS, key, make)
 
-    def _span_of(self, session: Session, topics: tuple[str, ...]) -> TimeWindow:
-        """Returns when a session has some topics: mostly some hours of a week."""
+    def _window_of(self, session: Session, topics: tuple[str, ...]) -> TimeWindow:
+        """Returns the window in which a session has some topics; empty if it has none."""
         spans = self.recordings_of(session, topics).values()
         if not spans:
             return TimeWindow(0, 0)
@@ -437,18 +443,18 @@ class Sessions:
 
     @cached_property
     def edges(self) -> tuple[FrameEdge, ...]:
-        """Every parent and child pair that was recorded, sorted; `static` where published so.
+        """Every recorded pair of parent and child, sorted.
 
-        A pair that was published in both directions appears once, as moving. A pair with an unnamed
-        frame is invalid in tf2, and is left out with a note; so are those that only bags have for
-        which there was no time.
+        A pair that was published both as static and as moving is moving. A pair with an unnamed
+        frame is invalid in tf2, and is left out with a note. Another note says if there was no time
+        for older bags.
         """
         view = self._view
         reading = view.call.partial_after(READING_S)
         pairs = dict.fromkeys(self.pairs(view.static_topics), True)
         for topic in view.moving_topics:
-            for found in self.pairs_back(topic, None):
-                pairs |= dict.fromkeys(found, False)
+            for moving_pairs in self.pairs_back(topic, None):
+                pairs |= dict.fromkeys(moving_pairs, False)
                 if reading.expired():
                     view.notes.add_lack("out of time: frames that only older bags have are missing")
                     break
@@ -462,17 +468,20 @@ class Sessions:
         return tuple(edges)
 
     def pairs(self, topics: Iterable[str], session: Session | None = None) -> set[Pair]:
-        """Returns the pairs of these topics; with a `session` those that it received."""
+        """Returns the pairs of topics, of a session or of all."""
         pair_sets = (self.pairs_back(topic, session) for topic in topics)
         return set[Pair]().union(*chain.from_iterable(pair_sets))
 
     def pairs_back(
         self, topic: str, session: Session | None, window: TimeWindow | None = None
     ) -> Iterator[frozenset[Pair]]:
-        """Yields the pairs of a topic (in a window), table by table, those of the newest first."""
+        """Yields the pairs of a topic (in a window), of a session or of all, the newest first.
+
+        Each set is of one table.
+        """
         window = TimeWindow.everything() if window is None else window
         if session is not None:
-            window = window.intersect(self._span_of(session, (topic,)))
+            window = window.intersect(self._window_of(session, (topic,)))
         for rows in scan(
             self._view, topic, window, newest_first=True, copies=True, may_be_empty=True
         ):
@@ -480,22 +489,23 @@ class Sessions:
                 yield self._pairs_in(rows, session if self.holds_carried(rows.recording) else None)
 
     def _pairs_in(self, rows: Rows, session: Session | None) -> frozenset[Pair]:
-        """Returns the pairs in some rows; with a `session` those that are of it."""
-        view, known_pairs = self._view, self._view.memory.scanner.caches.pairs
+        """Returns the pairs in rows, of a session or of all; remembers those of a part."""
+        view, cache = self._view, self._view.memory.scanner.caches.pairs
         part = rows.part if session is None else None
-        pairs = None if part is None else known_pairs.get(part)
+        pairs = None if part is None else cache.get(part)
         if pairs is not None:
             return pairs
-        before, by_columns = view.notes.added, None
+        noted = view.notes.added
+        by_columns = None
         if session is None:
-            by_columns = of_columns(view, rows, lambda some: pairs_in(some.table, some.index))
+            by_columns = of_columns(view, rows, lambda read: pairs_in(read.table, read.index))
         if by_columns is None:
             received = self.received(session, rows)
             pairs = frozenset((transform.parent, transform.child) for transform in received)
         else:
             pairs = frozenset[Pair]().union(*by_columns)
-        if part is not None and view.notes.added == before:
-            known_pairs.put(part, pairs, 200 + 200 * len(pairs))
+        if part is not None and view.notes.added == noted:
+            cache.put(part, pairs, 200 + 200 * len(pairs))
         return pairs
 
 
@@ -514,7 +524,7 @@ def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterato
 
 
 def _without_repeats(static: Iterable[StampedTransform]) -> list[StampedTransform]:
-    """Returns transforms by log time without those equal to the one before of their child."""
+    """Returns transforms by log time, without those that repeat the one before of their child."""
     latest: dict[str, StampedTransform] = {}
     changes: list[StampedTransform] = []
     for transform in sorted(static, key=lambda transform: transform.log_time):
@@ -527,25 +537,28 @@ def _without_repeats(static: Iterable[StampedTransform]) -> list[StampedTransfor
 
 
 def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
-    """Returns, by node of an undirected graph, all that are connected with it, itself included."""
-    component: dict[str, set[str]] = {}
+    """Returns for each node of an undirected graph all nodes that are connected with it.
+
+    A node is connected with itself.
+    """
+    component_of: dict[str, set[str]] = {}
     for first, other in pairs:
-        ends = [component.setdefault(node, {node}) for node in (first, other)]
+        ends = [component_of.setdefault(node, {node}) for node in (first, other)]
         small, large = sorted(ends, key=len)
         if small is not large:
             large |= small
-            component.update(dict.fromkeys(small, large))
-    return component
+            component_of.update(dict.fromkeys(small, large))
+    return component_of
 
 
-def _apart(span: Span, moment: Ns) -> Span:
-    """Returns how long a moment is before the begin of a span of time, and after its end."""
+def _time_before_and_after(span: Span, moment: Ns) -> tuple[Ns, Ns]:
+    """Returns how long a moment is before a span, and after it; 0 within the slack of floats."""
     first, last = span
     before, after = first - moment, moment - last
     return max(before - AT_OR_BEFORE_SLACK_NS, 0), max(after - AT_OR_BEFORE_SLACK_NS, 0)
 
 
 def _distance(span: Span, moment: Ns) -> Ns:
-    """Returns how far a moment is from a span of time."""
+    """Returns how far a moment is from a span."""
     first, last = span
     return max(first - moment, moment - last, 0)

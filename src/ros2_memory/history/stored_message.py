@@ -1,4 +1,4 @@
-"""Messages as bags have them, and what the copies of one in several recordings share."""
+"""An undecoded message with its bag."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class StoredMessage(NamedTuple):
 
     @property
     def topic(self) -> str:
-        """The name of its topic."""
+        """Name of the topic."""
         return self.record.channel.topic
 
     @property
     def type(self) -> str:
-        """The name of its type."""
+        """Name of the message type."""
         return self.record.channel.type
 
     @property
     def identity(self) -> tuple[Ns, int]:
-        """What its copies share, of messages of its topic: publish time and CRC-32 of payload."""
+        """Publish time and CRC-32 of the payload: copies of a message of a topic share these."""
         return self.record.publish_time, crc32(self.record.payload)

@@ -1,7 +1,7 @@
 """Transforms between two frames, gathered from the history.
 
-Windows are in log time. A moving transform is looked for close to the moment first, then further
-away, up to the length of tf2's cache (10 s); a static one however far back it was recorded.
+Windows are in log time. Moving transforms are read close to the moment first, then further away, up
+to the length of tf2's cache (10 s). A static transform holds however long ago it was recorded.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Mask
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
-"""How far around the moment moving transforms are read; the last is the length of tf2's cache."""
+"""How far around the moment moving transforms are read, until they lead to the frame."""
 
 _LONGER_NS: Final = 3600 * NS_PER_S
-"""How far around the moment frames are looked for that are unknown then."""
+"""How far around the moment a frame is searched that is unknown then."""
 _BORROWED: Final = Reason(
     "is placed by transforms of another recording of the same time; no handover proves that both "
     "are of one robot",
@@ -58,12 +58,19 @@ _BORROWED: Final = Reason(
     many="are placed by transforms of others of the same time; no handovers prove that they are of "
     "one robot",
 )
-_OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
+_TIMELESS: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
+"""Reasons that read as if no time had the frames."""
 _STAMPS: Final = "transforms.header.stamp"
 
 
 class FoundTransform(NamedTuple):
-    """A transform, the clock in which the moment was meant, and how far around it was read."""
+    """A transform that was looked up at a moment.
+
+    Attributes:
+        transform: the transform.
+        clock: the clock in which the moment was meant.
+        reach: how far around the moment (ns) transforms were read.
+    """
 
     transform: Transform
     clock: TfClock
@@ -81,10 +88,16 @@ def transform_at(
 ) -> FoundTransform:
     """Returns the pose of `child` in `parent` at a moment, by tf2's rules.
 
-    With the `recording` of a message the transforms of that recording's session are used; else
-    those of the session that was recorded then; of one that was within 10 s, if that has none.
-    Where several were, and differ, a note reports it.
-    The reason why there is none takes far longer to find: `explains=False` leaves it out.
+    A note reports if several sessions of that time have different transforms.
+
+    Args:
+        view: of the call.
+        parent: the frame that the pose is in.
+        child: the frame that is placed.
+        at: the moment.
+        recording: of a message: only transforms of its session count. Otherwise those of the
+            session that was recorded then; if it has none, of a session within 10 s.
+        explains: whether an error gives the reason by the whole memory, which takes far longer.
 
     Raises:
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
@@ -102,13 +115,14 @@ def transform_at(
         groups = [[session] for session in sessions.nearest_to(at)]
     answers: list[tuple[Session, FoundTransform]] = []
     failures: list[NoDataError] = []
+    # Without any session, the empty one gives the reason.
     for group in groups or [[frozenset[str]()]]:
         for session in group:
             try:
                 answer = _transform_of_session(view, session, frames, at, explains=explains)
                 answers.append((session, answer))
             except NoDataError as error:
-                # A traceback has this frame, which has the failures: they would stay for long.
+                # The traceback refers to this frame, and so to the failures: a circle.
                 failures.append(error.with_traceback(None))
         if answers:
             break
@@ -122,9 +136,9 @@ def transform_at(
 def _note_sessions(
     view: View, frames: tuple[str, str], at: Ns, answers: Sequence[tuple[Session, FoundTransform]]
 ) -> None:
-    """Notes where sessions differ in a transform, of which the first counts, or are combined."""
-    sessions, (session, counting) = view.sessions, answers[0]
-    if not all(alike(counting.transform, answer.transform) for _, answer in answers):
+    """Notes if sessions differ in a transform, or if two were combined; the first answer counts."""
+    sessions, (session, first) = view.sessions, answers[0]
+    if not all(alike(first.transform, answer.transform) for _, answer in answers):
         view.notes.add(
             f"{len(answers)} sessions recorded around that time have different transforms; "
             f"this is that of {sessions.names(session, at)}"
@@ -138,31 +152,30 @@ def _note_sessions(
 
 
 def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:
-    """Returns the session whose transforms place a message of a recording; a note if borrowed.
+    """Returns the session whose transforms place a message of a recording.
 
-    They are borrowed where those of the recording's own session do not lead from one frame to the
-    other, and those of the one other session that lends do.
+    That is the recording's own session, or, with a note, the session joined with its lender, if
+    only the latter leads from one frame to the other.
     """
     sessions = view.sessions
-    session, own_session = sessions.lending_to(recording, at), sessions.of(recording)
-    if not session or session == own_session:
-        return session
-    key = (session, own_session, frames)
+    joined, own = sessions.lending_to(recording, at), sessions.of(recording)
+    if not joined or joined == own:
+        return joined
+    key = (joined, own, frames)
     if key not in sessions.chosen:
-        borrows = not connects_in_time(view, frames, session=own_session) and connects_in_time(
-            view, frames, session=session
-        )
-        sessions.chosen[key] = session if borrows else own_session
-        if borrows:
-            lender = sessions.names(session - own_session, at)
-            view.notes.add(Note(_BORROWED, sessions.names(own_session, at), f"those of {lender}"))
+        sessions.chosen[key] = own
+        leads_alone = connects_in_time(view, frames, session=own)
+        if not leads_alone and connects_in_time(view, frames, session=joined):
+            sessions.chosen[key] = joined
+            lender = sessions.names(joined - own, at)
+            view.notes.add(Note(_BORROWED, sessions.names(own, at), f"those of {lender}"))
     return sessions.chosen[key]
 
 
 def _transform_of_session(
     view: View, session: Session, frames: tuple[str, str], at: Ns, *, explains: bool
 ) -> FoundTransform:
-    """Returns the pose of a child in its parent by one session; raises as `transform_at`."""
+    """Returns the pose of a child in a parent by one session; raises as `transform_at`."""
     limits, (parent, child) = view.limits, frames
     static = static_at(view.sessions.static(session), at)
 
@@ -176,7 +189,7 @@ def _transform_of_session(
         with suppress(NoDataError):
             return look_up(moving, half_width)
     moving = view.sessions.moving(session, TimeWindow.around(at, longest))
-    # Here, too, no variable has an error.
+    # No local variable may refer to an error: its traceback refers to this frame.
     try:
         return look_up(moving, longest)
     except NoDataError as error:
@@ -197,7 +210,7 @@ def frames_of(
     moving: Iterable[StampedTransform],
     target: str,
 ) -> FrameTree:
-    """Returns frames in a target frame by some transforms, of which none holds on."""
+    """Returns the frame tree of some transforms, looked up in a target frame."""
     clock = view.limits.tf_clock
     return FrameTree(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
 
@@ -211,29 +224,24 @@ def _explain_failure(
     *,
     nothing_near: bool,
 ) -> NoDataError:
-    """Returns the failure of a lookup near a moment in terms of the whole memory.
+    """Explains the failure of a lookup near a moment by the whole memory.
 
-    A frame that is unknown near the moment, and known within `_LONGER_NS` of it, is a gap.
+    A frame that is unknown near the moment, but known within `_LONGER_NS` of it, is a gap.
     """
-    topics = view.moving_topics
-    near = TimeWindow.around(at, TF_CACHE_NS)
+    topics, near = view.moving_topics, TimeWindow.around(at, TF_CACHE_NS)
     if topics and nothing_near:
         return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
-    if failure.reason in _OF_ALL_TIMES:
-        then = _near_failure(failure, at)
-        unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if not unknown or not connects_in_time(
-            view, frames, TimeWindow.around(at, _LONGER_NS), session
-        ):
-            return then
-        advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
-        return NoDataError(reason_between(view, near), f"{then.detail}; {advice}")
-    inside = (
-        topics
-        and view.stream.first(topics, TimeWindow.until(at), newest_first=True)
-        and view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
-    )
-    reason = reason_between(view, near) if inside else reason_beyond(view, at)
+    if failure.reason in _TIMELESS:
+        near_failure = _near_failure(failure, at)
+        around = TimeWindow.around(at, _LONGER_NS)
+        is_unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
+        if is_unknown and connects_in_time(view, frames, around, session):
+            advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
+            return NoDataError(reason_between(view, near), f"{near_failure.detail}; {advice}")
+        return near_failure
+    before = view.stream.first(topics, TimeWindow.until(at), newest_first=True)
+    is_between = before and view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
+    reason = reason_between(view, near) if is_between else reason_beyond(view, at)
     return NoDataError(reason, failure.detail)
 
 
@@ -243,10 +251,7 @@ def connects_in_time(
     window: TimeWindow | None = None,
     session: Session | None = None,
 ) -> bool:
-    """Whether transforms recorded in a window, and static ones, lead from one frame to the other.
-
-    False, too, where the time for the answer is over before that is known.
-    """
+    """Does `connects`; returns False if the call's time is over before that is known."""
     try:
         return connects(view, frames, window, session)
     except QueryTimeoutError:
@@ -259,7 +264,9 @@ def connects(
     window: TimeWindow | None = None,
     session: Session | None = None,
 ) -> bool:
-    """Whether transforms lead from one frame to the other; the newest are looked at first.
+    """Whether transforms of a session, or of any, lead from one frame to the other.
+
+    Moving transforms count only in the window; the newest are read first.
 
     Raises:
         QueryTimeoutError: the call's time is over before that is known.
@@ -273,32 +280,33 @@ def connects(
         *(sessions.pairs_back(topic, session) for topic in view.static_topics),
         *(sessions.pairs_back(topic, session, window) for topic in view.moving_topics),
     ]
-    # Of all topics in turn: mostly the newest table of each is enough.
-    for newest_pairs in zip_longest(*by_topic, fillvalue=frozenset[Pair]()):
-        fresh = frozenset[Pair]().union(*newest_pairs)
-        if not fresh <= pairs:
-            pairs |= fresh
-            named = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
-            if target in connected_with(origin, filter(is_edge, named)):
-                if window is None:
-                    linked.add((frames, session))
-                return True
+    # One table of each topic at a time: mostly the newest of each is enough.
+    for tables in zip_longest(*by_topic, fillvalue=frozenset[Pair]()):
+        more = frozenset[Pair]().union(*tables)
+        if more <= pairs:
+            continue
+        pairs |= more
+        named = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
+        if target in connected_with(origin, filter(is_edge, named)):
+            if window is None:
+                linked.add((frames, session))
+            return True
     return False
 
 
 def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
-    """Returns why a lookup by header stamps failed; the log times may be anywhere."""
+    """Explains the failure of a lookup by header stamps: log times do not matter."""
     if nothing_near:
         return NoDataError(
             NoDataReason.OUTSIDE_RANGE,
             f"no moving transform has a header stamp within {seconds(TF_CACHE_NS)} of "
             f"{unix_text(at)}; data.tf_clock selects transforms by header stamp, not by log time",
         )
-    return _near_failure(failure, at) if failure.reason in _OF_ALL_TIMES else failure
+    return _near_failure(failure, at) if failure.reason in _TIMELESS else failure
 
 
 def _near_failure(failure: NoDataError, at: Ns) -> NoDataError:
-    """Returns a failure that sounds as if it were about all times with the time it is about."""
+    """Returns a failure with the time that it is about."""
     return NoDataError(
         failure.reason,
         f"within {seconds(TF_CACHE_NS)} of {unix_text(at)}: {failure.detail}; "
@@ -307,7 +315,10 @@ def _near_failure(failure: NoDataError, at: Ns) -> NoDataError:
 
 
 def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTransform]:
-    """Yields the moving transforms stamped around a moment, wherever in log time they are."""
+    """Yields the moving transforms of a session that are stamped around a moment.
+
+    They may be anywhere in log time.
+    """
     sessions = view.sessions
     earliest, latest = at - TF_CACHE_NS, at + TF_CACHE_NS
 
@@ -315,7 +326,7 @@ def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTrans
         zones = parts.zone(_STAMPS)
         return zones.reaches(earliest - 1, above=True) & zones.reaches(latest + 1, above=False)
 
-    def near(rows: Rows) -> Rows | None:
+    def select_near(rows: Rows) -> Rows | None:
         stamped = stamped_between(rows.table, rows.index, earliest, latest)
         return None if stamped is None else rows.some(stamped)
 
@@ -323,12 +334,12 @@ def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTrans
     for topic in view.moving_topics:
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
             if sessions.may_hold(session, rows.recording):
-                for near_rows in of_columns(view, rows, near) or [rows]:
+                for near_rows in of_columns(view, rows, select_near) or [rows]:
                     yield from sessions.received(session, near_rows)
 
 
 def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
-    """Returns the transforms of a session in some rows, by their columns, else by their messages.
+    """Returns the transforms of a session in rows, from their columns, else from their messages.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -344,7 +355,7 @@ def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
     joined = joined_edges(tables)
     if len(tables) == 1:
         return joined
-    # As those of bags come in the order of their log times.
+    # Several bags were decoded, not in the order of time.
     return {
         pair: rows_of(edge, np.argsort(edge.log_times, kind="stable"))
         for pair, edge in joined.items()
@@ -352,10 +363,10 @@ def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
 
 
 def frames_over(view: View, session: Session, window: TimeWindow, target: str) -> FrameTree:
-    """Returns the frames of a session in a window, looked up in a target frame.
+    """Returns the frame tree of a session in a window, looked up in a target frame.
 
-    They are the same however the history is cut: moving transforms are read from so far around the
-    window that others change nothing in it, and static ones hold from when they were received.
+    It does not depend on how the history is cut into windows: moving transforms are also read
+    around the window, and static ones hold from when they were received.
 
     Raises:
         QueryTimeoutError: the call's time is over.

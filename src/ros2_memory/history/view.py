@@ -1,8 +1,8 @@
 """One call's view of the history, opened for the times that its question names.
 
-A view is a snapshot of the index, its bags, and these as one stream. Seconds come in as floats of
-Unix seconds or of a duration. "Ago" counts from the wall clock or, for replayed and simulated bags
-(`data.now: latest`), from the newest recorded moment. The clock is read once for each call.
+A view is a snapshot of the index, its bags, and these as one stream. Times of a question are floats
+of seconds. "Ago" counts from the wall clock or, for replayed and simulated bags (`data.now:
+latest`), from the newest recorded moment. The clock is read once for each call.
 """
 
 from __future__ import annotations
@@ -47,14 +47,17 @@ if TYPE_CHECKING:
 
 
 _CENSUSES: Final[Key[dict[str, dict[str, TopicTotals]]]] = Key()
-"""Of a timeline: its topics' censuses."""
+"""Of a timeline: by topic, its census."""
 
 
 class View:
     """What one call sees of a memory; it stays the same while the call lasts.
 
-    `reach` is the latest log time that the question is about: where the index does not reach as
-    far, it is scanned again.
+    Args:
+        memory: the memory.
+        call: the call.
+        reach: the latest log time that the question is about. The bag directory is scanned again if
+            the index does not reach it.
 
     Attributes:
         limits: the settings of the memory.
@@ -62,7 +65,9 @@ class View:
         bag_dir: where its bags are.
         bags: each bag by itself.
         stream: all bags as one stream.
+        snapshot: the index.
         timeline: the bags in the order of time.
+        notes: what the reply reports besides its answer.
         memo: what was found out in this call.
     """
 
@@ -80,110 +85,127 @@ class View:
 
     @cached_property
     def sessions(self) -> Sessions:
-        """Which recordings belong together, and the transforms that they hold."""
+        """Which recordings are of one robot in one run, and their transforms."""
         return Sessions(self)
 
     @cached_property
     def moving_topics(self) -> tuple[str, ...]:
         """The recorded topics of transforms that move (`data.tf_topics`)."""
-        return tuple(filter(self.timeline.topics().__contains__, self.limits.tf_topics))
+        recorded = self.timeline.types
+        return tuple(topic for topic in self.limits.tf_topics if topic in recorded)
 
     @cached_property
     def static_topics(self) -> tuple[str, ...]:
         """The recorded topics of static transforms (`data.tf_static_topics`)."""
-        return tuple(filter(self.timeline.topics().__contains__, self.limits.tf_static_topics))
+        return tuple(
+            topic for topic in self.limits.tf_static_topics if topic in self.timeline.types
+        )
 
     @cached_property
     def pose_topic(self) -> str:
-        """The topic that the robot is placed by: `data.pose_topic`, or the only one of its poses.
+        """The topic that places the robot: `only_pose_topic`, or `data.pose_topic`.
 
-        See `only_pose_topic`; it need not be recorded.
+        The latter need not be recorded.
         """
         return only_pose_topic(self) or self.limits.pose_topic
 
     @cached_property
     def has_poses(self) -> bool:
-        """Whether a topic has the robot's poses; else transforms may place it."""
+        """Whether a topic has the robot's poses; if not, transforms may place it."""
         return has_poses(self)
 
     def value(self, stored: StoredMessage) -> JsonValue:
-        """Returns all that a message has; None where it cannot be decoded."""
+        """Returns a message as JSON; None if it cannot be decoded."""
         message = self.bags.decode(stored)
         return None if message is None else self.extractor.exact(message, stored.type)
 
     def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
-        """Returns the first and the last log time of a topic in each bag of a window, or near."""
-        none = np.empty(0, np.int64)
-        segments = self.timeline.segments_in(window)
-        columns = filter(None, (segment.column(topic) for segment in segments))
-        bounds = [(column.firsts, column.lasts) for column in columns]
-        firsts, lasts = zip((none, none), *bounds, strict=True)
+        """Returns the first and last log times of a topic in each bag of a window, or near it."""
+        firsts, lasts = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        for segment in self.timeline.segments_in(window):
+            column = segment.column(topic)
+            if column is not None:
+                firsts.append(column.firsts)
+                lasts.append(column.lasts)
         return np.concatenate(firsts), np.concatenate(lasts)
 
     def note_thinned(self, window: TimeWindow) -> None:
-        """Records that what was read lies in a window, where that is partly in thinned days."""
+        """Records for the reply if a window that was read lies partly in thinned days."""
+        if not self.timeline.thinned:
+            return
         for part in map(window.intersect, self.call.asked or (window,)):
             if not part.empty:
                 thinned = overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1)
                 self.call.used_thinned |= thinned
 
     def gaps(self, window: TimeWindow, *, around: bool = False) -> Sequence[Span]:
-        """Returns the gaps of the snapshot that a window overlaps, without steps of the clock.
+        """Returns the gaps that overlap a window, without steps of the clock.
 
-        Or only the one that is `around` all of it.
+        With `around`, only a gap that has the whole window inside.
         """
         first, last = window.asked()
-        bounds = (window.start, window.stop - 1) if around else (last, first)
-        pauses = [pause.span for pause in self.snapshot.pauses]
-        touched = {(start, end) for start, end in pauses if start < bounds[0] and bounds[1] < end}
-        # What is a gap follows from all bags; at most moments there is not even a pause.
-        gaps = [gap for gap in self.snapshot.gaps if gap in touched] if touched else []
+        starts_before, ends_after = (window.start, window.stop - 1) if around else (last, first)
+        pauses = {
+            pause.span
+            for pause in self.snapshot.pauses
+            if pause.start < starts_before and ends_after < pause.end
+        }
+        # Most windows have no pause: then the gaps, which follow from all bags, are not needed.
+        gaps = [gap for gap in self.snapshot.gaps if gap in pauses] if pauses else []
         return without_steps(self, gaps) if gaps else gaps
 
     def census(self, topic: str) -> dict[str, TopicTotals]:
-        """Returns what is recorded of a topic under each of its types, each message counted once.
+        """Returns by type the totals of a topic, each message counted once.
 
-        From the summaries of bags; messages are read only where recordings overlap. What is counted
-        without a doubt stays in memory until a bag comes or goes.
+        They follow from the summaries of bags; messages are read only where recordings overlap.
+        Remembered until a bag comes or goes, if everything could be read.
         """
-        counted = self.timeline.memo.of(_CENSUSES, dict)
-        if topic in counted:
-            return counted[topic]
-        before = self.notes.added
+        remembered = self.timeline.memo.of(_CENSUSES, dict)
+        if topic in remembered:
+            return remembered[topic]
+        noted = self.notes.added
         with self.notes.isolated():
-            censuses = self._read_census(topic)
-            if self.notes.complete and self.notes.added == before and not self.call.used_active:
-                counted[topic] = censuses
-        return censuses
+            census = self._read_census(topic)
+            if self.notes.complete and self.notes.added == noted and not self.call.used_active:
+                remembered[topic] = census
+        return census
 
     def _read_census(self, topic: str) -> dict[str, TopicTotals]:
-        counted = self.timeline.totals(topic)
+        census = self.timeline.totals(topic)
         opened = open_scan(self, topic, TimeWindow.everything(), columns=False)
-        for rows in opened.copies():
-            type_name = rows.table.channel.type
-            first, last, messages = counted[type_name]
-            last = last if rows.span[1] < last else self._last_of(opened, type_name)
-            counted[type_name] = TopicTotals(first, last, messages - len(rows))
-        return {type_name: totals for type_name, totals in counted.items() if totals.messages}
+        for copies in opened.copies():
+            type_name = copies.table.channel.type
+            first, last, messages = census[type_name]
+            _, last_copy = copies.span
+            if last_copy >= last:
+                last = self._last_counted(opened, type_name)
+            census[type_name] = TopicTotals(first, last, messages - len(copies))
+        return {type_name: totals for type_name, totals in census.items() if totals.messages}
 
-    def _last_of(self, opened: Scan, type_name: str) -> Ns:
-        """Returns the log time of the newest message of a type that counts."""
-        for together in blocks(opened.rows(newest_first=True), newest_first=True):
-            for rows in together:
+    def _last_counted(self, opened: Scan, type_name: str) -> Ns:
+        """Returns the log time of the newest message of a type that is no copy."""
+        for block in blocks(opened.rows(newest_first=True), newest_first=True):
+            last = MIN_NS
+            for rows in block:
                 self.note_thinned(TimeWindow(rows.first, rows.last + 1))
-            lasts = [some.span[1] for some in together if some.table.channel.type == type_name]
-            if lasts:
-                return max(lasts)
+                if rows.table.channel.type == type_name:
+                    _, last_row = rows.span
+                    last = max(last, last_row)
+            if last > MIN_NS:
+                return last
         return MIN_NS
 
 
 @dataclass(frozen=True, slots=True)
 class AtTime:
-    """A moment: at Unix seconds, or so many seconds before now; or several. Exactly one is set.
+    """The moment, or the moments, that a question is about. Exactly one of the first three is set.
 
-    `each` are several; `insights.at_each` asks a query about one after the other. `rest_s`: a
-    message counts as of the moment, too, if it is at most so much later; what is interpolated does
-    not.
+    Attributes:
+        at_s: Unix seconds.
+        ago_s: seconds before now.
+        each: several moments; `insights.at_each` asks about one after the other.
+        rest_s: a message still counts if it is at most so much later than `at_s`: the time was
+            given with fewer digits. Nothing is interpolated there.
     """
 
     at_s: float | None = None
@@ -193,15 +215,15 @@ class AtTime:
 
     @property
     def end_s(self) -> float:
-        """The last time that counts, in Unix seconds, of one at Unix seconds."""
+        """The last Unix seconds at which a message counts."""
         return (self.at_s or 0.0) + self.rest_s
 
 
 @dataclass(frozen=True, slots=True)
 class TimeRange:
-    """An inclusive window: from `start_s` to `end_s`, or the last so many seconds.
+    """An inclusive window: from `start_s` to `end_s` (Unix seconds), or the last `last_s` seconds.
 
-    For a recap alone also the `before_s` seconds before `around_s`.
+    For a recap, it may also be the `before_s` seconds before `around_s`.
     """
 
     start_s: float | None = None
@@ -212,13 +234,13 @@ class TimeRange:
 
     @classmethod
     def over(cls, window: TimeWindow) -> TimeRange:
-        """Returns the range that holds what a window holds; it has some length, as recaps want."""
+        """Returns the range of a window, at least 1 ms long: a recap needs some length."""
         start_s = unix_from_ns(window.start)
         return cls(start_s, max(unix_from_ns(window.stop - 1), start_s + 0.001))
 
 
 def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, Ns | None]:
-    """Returns the view for a moment, the moment, and now where the question was relative.
+    """Returns the view for a moment, the moment, and now if the moment was relative to it.
 
     Raises:
         InvalidArgumentsError: the seconds are not finite, or negative where they count back.
@@ -267,7 +289,7 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
 
 
 def last_window(now: Ns, length: Ns) -> TimeWindow:
-    """Returns the window of a length up to now, with the slack of a float of seconds."""
+    """Returns the window of a length (ns) up to now, with the slack of floats of seconds."""
     start = now - length - START_SLACK_NS
     return TimeWindow(max(start, MIN_NS), min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
 
@@ -292,7 +314,7 @@ def search_window(span: TimeRange, now: Ns) -> TimeWindow:
 
 
 def clamped(view: View, window: TimeWindow) -> TimeWindow:
-    """Returns the window without what lies before both the epoch and the memory."""
+    """Returns the window without the time before both the epoch and the memory."""
     earliest = view.snapshot.earliest
     floor = min(0, 0 if earliest is None else earliest) - START_SLACK_NS
     return TimeWindow(max(window.start, floor), max(window.stop, floor + 1))
@@ -302,7 +324,7 @@ def ns_argument(name: str, value_s: float) -> Ns:
     """Returns an argument in seconds as nanoseconds.
 
     Raises:
-        InvalidArgumentsError: it is not finite; the sentence names the argument.
+        InvalidArgumentsError: it is not finite. `name` is the name of the argument.
     """
     try:
         return ns_from_unix(value_s)
@@ -311,10 +333,10 @@ def ns_argument(name: str, value_s: float) -> Ns:
 
 
 def open_view(memory: Memory, call: Call, reach: Ns | None) -> View:
-    """Returns a view of a memory that holds something; see `View`.
+    """Returns a view of a memory.
 
     Raises:
-        NoDataError: it holds nothing.
+        NoDataError: the memory holds nothing.
     """
     view = View(memory, call, reach)
     require_bags(view)
@@ -322,7 +344,7 @@ def open_view(memory: Memory, call: Call, reach: Ns | None) -> View:
 
 
 def open_search(memory: Memory, call: Call, span: TimeRange) -> tuple[View, Ns, TimeWindow]:
-    """Returns the view for a search, the present, and the window that is asked for until then.
+    """Returns the view for a search, now, and the window to search.
 
     Raises:
         InvalidArgumentsError: the bounds make no window.
