@@ -181,35 +181,40 @@ class BagAccess:
         Messages before `since` are read only to recognise copies: there is no note on them.
         """
         self.check_deadline()
-        part, reader = _indexed_part(bag, window), self.memory.reader
-        records: Iterator[Record] | None = None
-        is_thin = is_thinned(bag.file)
+        part, is_thin = _indexed_part(bag, window), is_thinned(bag.file)
         # The stage "read" is the time of the reader, without that of the caller between messages.
         clock, spent, count = time.perf_counter_ns, 0, 0
+        begin = clock()
+        try:
+            for record in self._records(bag, topics, part, newest_first, since):
+                spent += clock() - begin
+                count += 1
+                if is_thin:
+                    self.call.note_thinned(record.log_time, record.log_time)
+                if count % _DEADLINE_CHECK_INTERVAL == 0:
+                    self.check_deadline()
+                yield StoredMessage(bag, record)
+                begin = clock()
+        finally:
+            self.call.stages.add("read", spent)
+
+    def _records(
+        self, bag: BagFile, topics: Sequence[str], part: TimeWindow, newest_first: bool, since: Ns
+    ) -> Iterator[Record]:
+        """Yields the records that can be read; after a lost part the reader continues."""
+        records: Iterator[Record] | None = None
         while True:
-            begin = clock()
             try:
                 if records is None:
+                    reader = self.memory.reader
                     records = reader.records(bag.path, topics, part, newest_first=newest_first)
-                for record in records:
-                    spent += clock() - begin
-                    count += 1
-                    if is_thin:
-                        self.call.note_thinned(record.log_time, record.log_time)
-                    if count % _DEADLINE_CHECK_INTERVAL == 0:
-                        self.check_deadline()
-                    yield StoredMessage(bag, record)
-                    begin = clock()
+                yield from records
             except BagError as error:
                 self._note_unreadable(bag, error, TimeWindow(since, MAX_NS))
                 if error.lost is None:
                     return
-                # Only part of the bag is lost: the reader continues after it.
             else:
                 return
-            finally:
-                self.call.stages.add("read", spent)
-                spent = 0
 
     def tables(
         self,

@@ -495,7 +495,7 @@ class Notes:
     ) -> None:
         """Removes the notes that concern none of the windows, except the notes to `keep`.
 
-        What else was read depends on the store, and a reply must not.
+        Which bags are read besides depends on what is stored, and the reply must not.
         """
         self._notes = {
             key: note

@@ -108,8 +108,11 @@ def note_unread(
     if must_be_complete:
         notes.add(*describe_thinned(view.snapshot, window))
     if os.path.lexists(bag_dir / OWN_FOLDER):
+        deleted = [_span_text(*span) for span in deleted_between(view, window)]
+        if deleted:
+            named = listed(deleted[-MAX_NAMED:], len(deleted))
+            notes.add(f"recorded, and deleted since: {named}")
         notes.add(
-            *_describe_deleted(view, window),
             *(f"{of}{sentence}" for sentence in describe_lost(bag_dir, window)),
             *(f"{of}{sentence}" for sentence in describe_cut(bag_dir, window)),
             *describe_excluded(bag_dir, window),
@@ -306,11 +309,6 @@ def deleted_by_gap(view: View, window: TimeWindow) -> Iterator[tuple[Ns, Spans]]
         deleted = [(start, stop) for start, stop in parts if stop - start > snapshot.shortest_gap]
         if deleted:
             yield end, deleted
-
-
-def _describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
-    if spans := [_span_text(*span) for span in deleted_between(view, window)]:
-        yield f"recorded, and deleted since: {listed(spans[-MAX_NAMED:], len(spans))}"
 
 
 def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
@@ -692,10 +690,11 @@ def unknown_times(
     between = without([around], united([*known, *mixed, *gaps]))
     long = [(begin, stop) for begin, stop in between if stop - begin > SILENCE_NS]
     unknown: Spans = []
+    shown = TimeWindow(max(start, first), min(end, last))
     for begin, stop in united([*long, *without(mixed, gaps)]):
-        inside = max(begin, start, first), min(stop, end, last)
-        if inside[0] < inside[1]:
-            unknown.append(inside)
+        inside = TimeWindow(begin, stop).intersect(shown)
+        if not inside.empty:
+            unknown.append((inside.start, inside.stop))
     if unknown and not any(begin <= end and start <= stop for begin, stop in known):
         view.notes.add(f"{what} is not known at any time of the window")
     return unknown

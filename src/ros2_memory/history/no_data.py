@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.layout import is_derived, is_thinned
-from ros2_memory.bag_dir.state_files import excluded_between, read_losses
+from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import overlaps_any
@@ -25,6 +25,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.context import short_name
 from ros2_memory.history.coverage import (
     being_written,
+    cut_spans,
     gap_around,
     note_unread,
     note_unrecorded,
@@ -37,7 +38,7 @@ from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -92,16 +93,6 @@ def topics_of_robot(view: View, what: str) -> list[str]:
     `what` is as in `topics_with`.
     """
     return [topic for topic in _types_with(view, what) if not _OF_OTHERS.search(topic)]
-
-
-def has_poses(view: View) -> bool:
-    """Whether a topic has the robot's poses. `View.has_poses` remembers it."""
-    extractor = view.extractor
-    # The configured topic first: it is cheap to know, and mostly enough.
-    for type_name in view.timeline.types_of(view.limits.pose_topic):
-        if not extractor.is_mapped(type_name) or "position" in extractor.kinds_of(type_name):
-            return True
-    return bool(topics_of_robot(view, "position") or unmapped_topics_with(view))
 
 
 def resolve_pose_topic(
@@ -300,9 +291,9 @@ def not_recorded(view: View, name: str) -> NoDataError:
         NoDataError: nothing is recorded at all.
     """
     require_bags(view)
-    snapshot, names = view.snapshot, {name, f"/{name}"}
+    snapshot, names, everything = view.snapshot, {name, f"/{name}"}, TimeWindow.everything()
     reason = NoDataReason.TOPIC_NOT_RECORDED
-    if not names.isdisjoint(_cut_topics(view, TimeWindow.everything())):
+    if any(cut_spans(view.bag_dir, topic, everything) for topic in names):
         reason, detail = NoDataReason.DELETED, f"every message of {name} was deleted"
     elif not names.isdisjoint(snapshot.silent_topics):
         detail = f"{name} is declared in the bags, but no message of it was recorded"
@@ -312,7 +303,7 @@ def not_recorded(view: View, name: str) -> NoDataError:
     near = similar(name, topics, 5) or similar(stem, topics, 5)
     hint = f"similar: {', '.join(near)}" if near else "list_recorded_topics lists all"
     error = NoDataError(reason, f"{detail}; {hint}")
-    return with_notes(view, TimeWindow.everything(), error)
+    return with_notes(view, everything, error)
 
 
 def no_data_at(
@@ -356,7 +347,7 @@ def no_data_at(
     if (
         deleted
         or excluded_between(view.bag_dir, at, at + 1)
-        or _cut_topics(view, window).issuperset(topics)
+        or _are_cut(view, topics, window)
         or _is_thinned(view, this_moment)
     ):
         reason = NoDataReason.DELETED
@@ -389,10 +380,9 @@ def _distances(
         yield f"the nearest newer one is {later} after it, at {unix_text(newer.time)}"
 
 
-def _cut_topics(view: View, window: TimeWindow) -> set[str]:
-    """Returns the topics whose messages in a window were cut out by request or retention."""
-    losses = read_losses(view.bag_dir, window.start, window.stop)
-    return {loss.topic for loss in losses if loss.by in {"expired", "forgotten"}}
+def _are_cut(view: View, topics: Iterable[str], window: TimeWindow) -> bool:
+    """Whether messages of all topics were cut out of a window, by request or retention."""
+    return all(cut_spans(view.bag_dir, topic, window) for topic in topics)
 
 
 def _is_thinned(view: View, window: TimeWindow) -> bool:
@@ -432,7 +422,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         reason = reason_between(view, window)
     else:
         reason = reason_beyond(view, min(end, max(start, view.memory.clock.now())))
-    if _cut_topics(view, window).issuperset(topics) or _is_thinned(view, window):
+    if _are_cut(view, topics, window) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
     detail += _advice(view, reason, start)
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
@@ -519,7 +509,7 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     It names topics there that carry the same (poses, velocities). Where a folder has bags of
     several robots, the nearest message of a topic may be another robot's.
     """
-    if _cut_topics(view, window).issuperset(topics):
+    if _are_cut(view, topics, window):
         return []
     timeline, whole = view.timeline, view.snapshot.metadata_folders
     names: dict[str, None] = {}

@@ -6,8 +6,7 @@ import math
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
-from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -131,14 +130,6 @@ def poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> d
     return {file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))}
 
 
-class _Sample(NamedTuple):
-    """The pose of one decoded message, and its speed (m/s), NaN without one."""
-
-    log_time: Ns
-    pose: Pose
-    speed: float
-
-
 class PoseReader:
     """Reads the poses of rows from their columns, else from their messages.
 
@@ -222,7 +213,9 @@ class PoseReader:
 
     def _read_messages(self, rows: Rows) -> Poses:
         extractor = self._view.extractor
-        samples: list[_Sample] = []
+        times: list[Ns] = []
+        poses: list[Pose] = []
+        speeds: list[float] = []
         for stored in messages_of(self._view, rows):
             message = self._view.bags.decode(stored, self._failures)
             if message is None:
@@ -231,18 +224,18 @@ class PoseReader:
             twist = extractor.twist(message, stored.type)
             if pose is None:
                 raise InvalidArgumentsError(describe_lack(self._view, "position", stored))
-            speed = math.nan if twist is None else math.hypot(*twist.linear)
-            samples.append(_Sample(stored.time, pose, speed))
-        # A part has bag after bag, in the order in which they were stored.
-        samples.sort(key=attrgetter("log_time"))
-        poses = [sample.pose for sample in samples]
+            times.append(stored.time)
+            poses.append(pose)
+            speeds.append(math.nan if twist is None else math.hypot(*twist.linear))
         turns = [pose.orientation or (math.nan,) * 4 for pose in poses]
         places = np.array([pose.position for pose in poses], np.float64).reshape(-1, 3)
         frames = Texts.of([pose.frame_id for pose in poses])
-        return Poses(
-            np.array([sample.log_time for sample in samples], np.int64),
+        unsorted = Poses(
+            np.array(times, np.int64),
             rounded(places, METRES),
             np.array(turns, np.float64).reshape(-1, 4),
             FrameCodes(frames.codes, frames.words),
-            np.array([sample.speed for sample in samples], np.float64),
+            np.array(speeds, np.float64),
         )
+        # A part has bag after bag, in the order in which they were stored.
+        return unsorted.rows(np.argsort(unsorted.times, kind="stable"))

@@ -489,14 +489,14 @@ def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeW
     paths = (view.extractor.own_path(field, newest.type) for field in fields)
     try:
         for condition in chain.from_iterable(summary_conditions(path, value) for path in paths):
-            for stored in CandidateRows(view, [topic], condition, window).messages():
-                if condition.matches(view.value(stored)):
-                    array, _, _ = (condition.field or "").rpartition(".")
-                    view.notes.add_lack(
-                        f"{topic}: where {array} is long it is only summarised, last at "
-                        f"{unix_text(stored.time)}, and its numbers are not looked at"
-                    )
-                    break
+            candidates = CandidateRows(view, [topic], condition, window).messages()
+            long = next((one for one in candidates if condition.matches(view.value(one))), None)
+            if long is not None:
+                array, _, _ = (condition.field or "").rpartition(".")
+                view.notes.add_lack(
+                    f"{topic}: where {array} is long it is only summarised, last at "
+                    f"{unix_text(long.time)}, and its numbers are not looked at"
+                )
     except QueryTimeoutError:
         view.notes.add_lack(f"{topic}: out of time: some arrays may be only summarised")
 

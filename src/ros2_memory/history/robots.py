@@ -157,8 +157,9 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     contradictions: dict[str, Contradiction] = {}
     for (first, parents), (other, other_parents) in combinations(trees.items(), 2):
         for frame in sorted(parents.keys() & other_parents.keys()):
-            both = parents[frame], other_parents[frame]
-            if both[0] != both[1] and frame not in contradictions:
+            parent, other_parent = parents[frame], other_parents[frame]
+            if parent != other_parent and frame not in contradictions:
+                both = (parent, other_parent)
                 contradictions[frame] = Contradiction((first, other), frame, both)
     return tuple(contradictions.values())
 

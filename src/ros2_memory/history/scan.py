@@ -294,11 +294,12 @@ def messages_at(view: View, rows: Rows) -> Iterator[tuple[int, StoredMessage]]:
         position_of = dict(zip(keys, positions.tolist(), strict=True))
         rank_of = Counter[Ns]()  # tells messages of one log time apart
         for stored in view.bags.read(bag, [channel.topic], window):
-            if stored.type == channel.type:
-                position = position_of.get((stored.time, rank_of[stored.time]))
-                if position is not None:
-                    yield position, stored
-                rank_of[stored.time] += 1
+            if stored.type != channel.type:
+                continue
+            position = position_of.get((stored.time, rank_of[stored.time]))
+            rank_of[stored.time] += 1
+            if position is not None:
+                yield position, stored
 
 
 def positions_in(times: Ints, window: TimeWindow) -> Ints:

@@ -192,18 +192,19 @@ class Sessions:
         around = self._around(moment)
         if not around:
             return None
-        distances = {
+        apart = {
             session: _time_before_and_after(span, moment)
             for session, span in around.items()
             if self._kinds(session)
         }
-        then: dict[Session, None] = {}
-        beside: dict[Session, None] = {}
-        for session in sorted(distances, key=distances.__getitem__):
-            group = beside if any(distances[session]) else then
-            group[self._with_lender(session, moment)] = None
-        groups = [*then], [session for session in beside if session not in then]
-        return [group for group in groups if group]
+        then: list[Session] = []
+        beside: list[Session] = []
+        for session in sorted(apart, key=apart.__getitem__):
+            group = beside if any(apart[session]) else then
+            holding = self._with_lender(session, moment)
+            if holding not in then and holding not in beside:
+                group.append(holding)
+        return [group for group in (then, beside) if group]
 
     def names(self, session: Session, at: Ns) -> str:
         """Returns the names of a session's recordings around a moment; of all if none is there."""

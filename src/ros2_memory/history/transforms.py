@@ -333,9 +333,10 @@ def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTrans
     everything = TimeWindow.everything()
     for topic in view.moving_topics:
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
-            if sessions.may_hold(session, rows.recording):
-                for near_rows in of_columns(view, rows, select_near) or [rows]:
-                    yield from sessions.received(session, near_rows)
+            if not sessions.may_hold(session, rows.recording):
+                continue
+            for near_rows in of_columns(view, rows, select_near) or [rows]:
+                yield from sessions.received(session, near_rows)
 
 
 def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:

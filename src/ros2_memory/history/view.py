@@ -32,7 +32,12 @@ from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.clock_steps import without_steps
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
-from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
+from ros2_memory.history.no_data import (
+    only_pose_topic,
+    require_bags,
+    topics_of_robot,
+    unmapped_topics_with,
+)
 from ros2_memory.history.scan import blocks, open_scan
 from ros2_memory.history.sessions import Sessions
 from ros2_memory.index.segment import TopicTotals
@@ -112,7 +117,12 @@ class View:
     @cached_property
     def has_poses(self) -> bool:
         """Whether a topic has the robot's poses; if not, transforms may place it."""
-        return has_poses(self)
+        # The configured topic first: it is cheap to know, and mostly enough.
+        for type_name in self.timeline.types_of(self.limits.pose_topic):
+            kinds = self.extractor.kinds_of(type_name)
+            if "position" in kinds or not self.extractor.is_mapped(type_name):
+                return True
+        return bool(topics_of_robot(self, "position") or unmapped_topics_with(self))
 
     def value(self, stored: StoredMessage) -> JsonValue:
         """Returns a message as JSON; None if it cannot be decoded."""

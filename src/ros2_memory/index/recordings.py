@@ -211,20 +211,25 @@ def _overlaps_of(snapshot: Snapshot) -> tuple[dict[str, Ns], dict[tuple[str, str
     lengths: dict[str, Ns] = {}
     overlaps: dict[tuple[str, str], _Overlap] = {}
     ends: dict[str, Ns] = {}  # when recordings end that may overlap the next bag
+    for recording, start, end in _recorded_spans(snapshot):
+        for other in [name for name in ends if name != recording]:
+            if ends[other] <= start:
+                del ends[other]
+                continue
+            pair = (min(other, recording), max(other, recording))
+            overlap = overlaps.get(pair, _Overlap(start, start, 0))
+            overlaps[pair] = overlap.extended(start, min(ends[other], end))
+        before = ends.get(recording, start)
+        lengths[recording] = lengths.get(recording, 0) + max(end - max(start, before), 0)
+        ends[recording] = max(before, end)
+    return lengths, overlaps
+
+
+def _recorded_spans(snapshot: Snapshot) -> Iterator[tuple[str, Ns, Ns]]:
+    """Yields the recording of each bag, and its first and last log time."""
     for bags, paths in _with_recordings(snapshot, snapshot.whole_segments):
         for path, start, end in zip(paths, bags.starts.tolist(), bags.ends.tolist(), strict=True):
-            recording = _saved_from(path) if _IN_MOMENTS in path else path
-            for other in [name for name in ends if name != recording]:
-                if ends[other] <= start:
-                    del ends[other]
-                    continue
-                pair = (min(other, recording), max(other, recording))
-                overlap = overlaps.get(pair, _Overlap(start, start, 0))
-                overlaps[pair] = overlap.extended(start, min(ends[other], end))
-            before = ends.get(recording, start)
-            lengths[recording] = lengths.get(recording, 0) + max(end - max(start, before), 0)
-            ends[recording] = max(before, end)
-    return lengths, overlaps
+            yield _saved_from(path) if _IN_MOMENTS in path else path, start, end
 
 
 def _saved_from(folder: str) -> str:

@@ -126,18 +126,7 @@ def steps_of(timeline: Timeline) -> list[StepBack]:
 
     Damaged bags are passed over: their times may be wrong.
     """
-    code_of: dict[Series, int] = {}
-    all_codes, all_numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for rows in (segment.bags for segment in timeline.segments):
-        stems, positions, numbers = rows.names
-        codes_of_stems = [
-            code_of.setdefault(stem.series, len(code_of)) if is_recording(stem.series) else -1
-            for stem in stems
-        ]
-        is_damaged = rows.with_schema(attrgetter("is_damaged"))
-        all_codes.append(np.where(is_damaged, -1, np.array(codes_of_stems)[positions]))
-        all_numbers.append(numbers)
-    series, numbers = np.concatenate(all_codes), np.concatenate(all_numbers)
+    series, numbers = _series_and_numbers(timeline)
     bags, starts, ends = timeline.bags, timeline.starts, timeline.ends
     order = np.lexsort((numbers, series))
     before, after = order[:-1], order[1:]
@@ -149,6 +138,24 @@ def steps_of(timeline: Timeline) -> list[StepBack]:
         StepBack(bags[earlier], bags[later], int(ends[earlier]) - int(starts[later]))
         for earlier, later in zip(before[is_late].tolist(), after[is_late].tolist(), strict=True)
     ]
+
+
+def _series_and_numbers(timeline: Timeline) -> tuple[Ints, Ints]:
+    """Returns for each bag a code of its series and its number there.
+
+    The code is -1 for damaged bags, and for bags that are no splits.
+    """
+    code_of: dict[Series, int] = {}
+    codes, numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for bags in (segment.bags for segment in timeline.segments):
+        code_of_stem = [
+            code_of.setdefault(stem.series, len(code_of)) if is_recording(stem.series) else -1
+            for stem in bags.names.stems
+        ]
+        is_damaged = bags.with_schema(attrgetter("is_damaged"))
+        codes.append(np.where(is_damaged, -1, np.array(code_of_stem)[bags.names.positions]))
+        numbers.append(bags.names.numbers)
+    return np.concatenate(codes), np.concatenate(numbers)
 
 
 def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:

@@ -300,14 +300,10 @@ class Timeline:
         """
         faulty = []
         for segment in self.segments:
-            if segment.first[0] >= window.stop:
-                break
-            for bag in segment.faulty:
-                end = bag.end
-                if bag.state is BagState.INCOMPLETE and end < bag.mtime_ns <= end + MAX_FILE_NS:
-                    end = bag.mtime_ns
-                if window.overlaps(bag.start, end):
-                    faulty.append(bag)
+            if segment.first[0] < window.stop:
+                faulty += [
+                    bag for bag in segment.faulty if window.overlaps(bag.start, _end_of_faults(bag))
+                ]
         return faulty
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
@@ -333,6 +329,11 @@ class Timeline:
             )
         )
         return segment.bags[int(holds_topic.argmax())]
+
+
+def _end_of_faults(bag: BagFile) -> Ns:
+    is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
+    return bag.mtime_ns if bag.state is BagState.INCOMPLETE and is_late else bag.end
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:
