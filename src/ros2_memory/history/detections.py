@@ -27,10 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray, Mask
+    from ros2_memory.storage.base import IntArray
 
 _LONGEST_LATENCY_NS: Final = 10 * NS_PER_S
 """A large model may look at an image for this long before it says what is in it."""
@@ -116,32 +115,29 @@ class DetectionRows:
 
     Args:
         view: has the bags.
+
+    Attributes:
+        columns: reads the columns of a table.
     """
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._columns = DetectionColumns(view.extractor)
-
-    def may_match(self, parts: PartZones) -> bool | Mask:
-        """Returns which parts may have a detection, by their zones."""
-        return self._columns.may_match(parts)
+        self.columns = DetectionColumns(view.extractor)
 
     def may_have_any(self, rows: Rows) -> bool:
         """Returns whether the table of some rows may have a detection."""
-        return self._columns.may_have_any(rows.table)
-
-    def have_labels(self, rows: Rows) -> bool:
-        """Returns whether the type of some rows has fields for labels, not only texts."""
-        return self._columns.has_labels(rows.table)
+        return self.columns.may_have_any(rows.table)
 
     def of(self, rows: Rows) -> Detected:
         """Returns the detections of rows, without messages that cannot be decoded."""
-        detected = of_columns(self._view, rows, self._read_columns)
-        return self._read_messages(rows) if detected is None else joined_detected(detected)
+        parts = of_columns(self._view, rows, self._read_columns)
+        detected = self._read_messages(rows) if parts is None else joined_detected(parts)
+        places = METRES.nearest(detected.found.places)
+        return detected._replace(found=detected.found._replace(places=places))
 
     def _read_columns(self, rows: Rows) -> Detected | None:
         """Returns the detections of rows; None if the columns do not have all of them."""
-        columns = self._columns.of(rows.table)
+        columns = self.columns.of(rows.table)
         if columns is None:
             return None
         detections, stamps, frames = columns
@@ -149,7 +145,7 @@ class DetectionRows:
             detections, frames = detections.at(rows.index), frames.rows(rows.index)
             stamps = None if stamps is None else stamps[rows.index]
         stamps = rows.times if stamps is None else stamps
-        return _rounded(Detected(rows.times, stamps, detections, frames))
+        return Detected(rows.times, stamps, detections, frames)
 
     def _read_messages(self, rows: Rows) -> Detected:
         extractor = self._view.extractor
@@ -167,13 +163,11 @@ class DetectionRows:
             messages.append(_Message(stored.time, stamp, detections, frame))
         # A part has bag after bag, in the order in which they were stored.
         messages.sort(key=attrgetter("log_time"))
-        return _rounded(
-            Detected(
-                np.array([message.log_time for message in messages], np.int64),
-                np.array([message.stamp for message in messages], np.int64),
-                detections_by([message.detections for message in messages]),
-                Texts.of([message.frame for message in messages]),
-            )
+        return Detected(
+            np.array([message.log_time for message in messages], np.int64),
+            np.array([message.stamp for message in messages], np.int64),
+            detections_by([message.detections for message in messages]),
+            Texts.of([message.frame for message in messages]),
         )
 
 
@@ -217,8 +211,3 @@ def _stamp_or_log_time(view: View, stored: StoredMessage) -> Ns:
 
 def _stamp_of(message: object) -> Ns | None:
     return nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
-
-
-def _rounded(detected: Detected) -> Detected:
-    places = METRES.nearest(detected.found.places)
-    return detected._replace(found=detected.found._replace(places=places))

@@ -442,10 +442,11 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
             is_there = earlier.last <= later.last or _has_bags_near(view, topic, earlier.path, span)
             if is_there and window.overlaps(span.start, span.stop - 1):
                 step = max(steps[later.path], steps[earlier.path])
+                own = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir))
                 by_clock = (
                     _is_short_edge(earlier, later)
                     or span.stop - 1 - span.start <= step
-                    or _are_own(view, earlier.path, later.path)
+                    or own.issuperset((earlier.path, later.path))
                 )
                 yield ParallelRecordings(earlier.path, later.path, span, by_clock)
         going_on.append(later)
@@ -465,11 +466,6 @@ def _is_short_edge(earlier: _TopicSpan, later: _TopicSpan) -> bool:
     shortest = min(later.last - later.first, earlier.last - earlier.first)
     is_edge = earlier.first < later.first and earlier.last < later.last
     return is_edge and 2 * (earlier.last - later.first) < shortest
-
-
-def _are_own(view: View, *recordings: Path) -> bool:
-    own = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir))
-    return own.issuperset(recordings)
 
 
 def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:

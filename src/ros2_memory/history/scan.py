@@ -320,11 +320,6 @@ class Counted(NamedTuple):
         np.minimum.at(self.first, pieces, first)
         np.maximum.at(self.last, pieces, last)
 
-    def add_times(self, times: IntArray, edges: IntArray) -> None:
-        """Adds messages, by their log times (ns), to the pieces that `edges` separate."""
-        pieces = np.searchsorted(edges, times, side="right")
-        self.add(pieces, np.ones_like(times), times, times)
-
 
 def count_messages(
     view: View, topic: str, window: TimeWindow, edges: IntArray, *, proves: bool = False
@@ -364,7 +359,9 @@ def count_messages(
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
     for rows in scan(view, topic, window, columns=proves, shared=shared, within=united(spans)):
         for _, positions in rows.bag_rows(to_read):
-            counted.add_times(rows.times[positions], edges)
+            times = rows.times[positions]
+            pieces = np.searchsorted(edges, times, side="right")
+            counted.add(pieces, np.ones_like(times), times, times)
     return counted
 
 

@@ -195,14 +195,11 @@ class View:
     def _last_counted(self, opened: Scan, type_name: str) -> Ns:
         """Returns the log time of the newest message of a type that is no copy."""
         for block in blocks(opened.rows(newest_first=True), newest_first=True):
-            last = MIN_NS
             for rows in block:
                 self.note_thinned(TimeWindow(rows.first, rows.last + 1))
-                if rows.table.channel.type == type_name:
-                    _, last_row = rows.span
-                    last = max(last, last_row)
-            if last > MIN_NS:
-                return last
+            spans = [rows.span for rows in block if rows.table.channel.type == type_name]
+            if spans:
+                return max(last for _, last in spans)
         return MIN_NS
 
 

@@ -65,11 +65,6 @@ class KnownBags:
     tree: Tree
     timeline: Timeline
 
-    @property
-    def saved(self) -> Mapping[str, Stamp]:
-        """By path, the files in saved moments, including those that do not count."""
-        return self.tree.saved
-
 
 class TableChange(NamedTuple):
     """What one scan changed. The first scan adds all bags.

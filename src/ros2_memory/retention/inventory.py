@@ -179,7 +179,7 @@ class Inventory:
                 continue
             name, is_named = path[len(recording) + 1 :], recording in named
             is_own = judge is None or judge(recording)(name)
-            is_saved = path in known.saved
+            is_saved = path in known.tree.saved
             # A split is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
             if not (is_own or is_saved or is_new):
@@ -214,7 +214,7 @@ class Inventory:
         device = self._root.stat().st_dev
         with suppress(OSError):
             device = (self._root / MOMENTS_FOLDER).stat().st_dev
-        return {(device, stamp.inode): stamp.size for stamp in known.saved.values()}
+        return {(device, stamp.inode): stamp.size for stamp in known.tree.saved.values()}
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the few bags that may still change: the index has a note on each."""

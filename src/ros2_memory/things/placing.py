@@ -178,7 +178,9 @@ class Placer:
             named = [
                 rows for rows in units_of_topic if _OF_DETECTORS.search(rows.table.channel.type)
             ]
-            if messages.found.rows.size or any(map(self.rows.have_labels, named)):
+            if messages.found.rows.size or any(
+                self.rows.columns.has_labels(rows.table) for rows in named
+            ):
                 detectors.add(topic)
         return messages_of_topics, detectors
 

@@ -500,7 +500,7 @@ class SightReader:
     def _rows(self, window: TimeWindow) -> Iterator[Rows]:
         """Yields the rows in a window that may have detections."""
         for topic in self._topics:
-            scanned = scan(self._view, topic, window, may_match=self._placer.rows.may_match)
+            scanned = scan(self._view, topic, window, may_match=self._placer.rows.columns.may_match)
             yield from filter(self._placer.rows.may_have_any, scanned)
 
 
