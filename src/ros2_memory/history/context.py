@@ -446,7 +446,7 @@ class Notes:
 
     @contextmanager
     def isolated(self) -> Iterator[None]:
-        """Has `complete` tell within the block only about the block.
+        """Within the block, `complete` starts as True, and is about the block alone.
 
         So a result is remembered if all of its own bags could be read, whatever failed before.
         """

@@ -577,13 +577,10 @@ class ReverseSearch:
         is_number_in_texts = are_texts and isinstance(self.condition.test, Equals)
         if not self.condition.can_be_refused and not is_number_in_texts:
             return
-        refusals = []
-        for topic in self.topics:
-            refusal = self._refusal(topic)
-            if refusal is None:
-                return
-            refusals.append(refusal)
-        raise InvalidArgumentsError(f"{self.topics[0]}: {refusals[0]}")
+        first, *others = self.topics
+        refusal = self._refusal(first)
+        if refusal is not None and all(self._refusal(topic) is not None for topic in others):
+            raise InvalidArgumentsError(f"{first}: {refusal}")
 
     def require_met(self, until: Ns) -> None:
         """Checks that a message before a moment meets the condition, or that its topics may.
@@ -670,6 +667,5 @@ class ReverseSearch:
     def _note_undecodable(self, since: Ns) -> None:
         for (topic, type_name), (error, newest) in self._failures.items():
             if newest >= since:
-                self._view.notes.complete = False
                 kind = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
-                self._view.notes.add(Note(kind, f"{topic} ({type_name})"))
+                self._view.notes.add_lack(Note(kind, f"{topic} ({type_name})"))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections import Counter
+from collections import defaultdict
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -113,15 +113,8 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
     """
     if not snapshot.metadata_folders:
         return []
-    own = OwnRecordings(bag_dir)
-    bags: Counter[str] = Counter()
-    messages: Counter[str] = Counter()
-    for segment in snapshot.timeline.segments:
-        for name, tally in segment.tallies.items():
-            bags[name] += tally.bags
-            messages[name] += tally.messages
+    own, deletions, present = OwnRecordings(bag_dir), read_deleted(bag_dir), _tallies(snapshot)
     absent: list[Absent] = []
-    deletions = read_deleted(bag_dir)
     for folder, listing in _folder_listings(snapshot, bag_dir, known):
         if listing is None or listing.bags is None:
             absent.append(Absent(folder, unreadable=True))
@@ -130,11 +123,20 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
         is_own = bool(listing.first) and _may_delete_splits(own, bag_dir, Path(folder))
         deletion = deletions.get(folder.removeprefix(f"{bag_dir}/"))
         deleted = frozenset[str]() if deletion is None else frozenset(deletion.files)
-        present = Tally(bags[folder], messages[folder])
-        lack = _compare(folder, listing, present, deleted, is_own=is_own)
+        lack = _compare(folder, listing, present[folder], deleted, is_own=is_own)
         if lack.files or lack.messages:
             absent.append(lack)
     return absent
+
+
+def _tallies(snapshot: Snapshot) -> dict[str, Tally]:
+    """Returns by folder the number of its bags and of their messages."""
+    tallies: dict[str, Tally] = defaultdict(Tally)
+    for segment in snapshot.timeline.segments:
+        for folder, (bags, messages) in segment.tallies.items():
+            known = tallies[folder]
+            tallies[folder] = Tally(known.bags + bags, known.messages + messages)
+    return tallies
 
 
 def absent_files(absent: Sequence[Absent]) -> list[SetAside]:
