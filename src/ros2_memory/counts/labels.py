@@ -277,7 +277,7 @@ def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Topic
     reader = DetectionRows(view)
     left_out = 0
     for overlapping in blocks(scan(view, topic, window, newest_first=True), newest_first=True):
-        detected = joined_detected([reader.of(rows) for rows in overlapping])
+        detected = joined_detected([reader.read(rows) for rows in overlapping])
         left_out += sum(map(len, overlapping)) - detected.log_times.size
         if detected.log_times.size:
             yield _TopicBlock(topic, detected)

@@ -81,7 +81,7 @@ class QuerySettings:
 
     @property
     def closed_after_s(self) -> float:
-        """The age (s) by which a message answers, because its split is closed.
+        """The age (s) at which a message certainly answers: its split is closed by then.
 
         A split that is screened first waits for the next split, and for the search.
         """

@@ -271,7 +271,7 @@ def _span_text(start: Ns, end: Ns) -> str:
 
 
 def _unrecorded_parts(snapshot: Snapshot, gap: Span, gone: Sequence[Span]) -> Sequence[Span]:
-    """Returns the parts of a gap outside the times of which messages are gone."""
+    """Returns a gap without the times `gone`, in which messages were recorded and removed."""
     parts = without([gap], gone)
     if parts == [gap]:
         return parts

@@ -128,7 +128,7 @@ class DetectionRows:
         """Returns whether the table of some rows may have a detection."""
         return self.columns.may_have_any(rows.table)
 
-    def of(self, rows: Rows) -> Detected:
+    def read(self, rows: Rows) -> Detected:
         """Returns the detections of rows, without messages that cannot be decoded."""
         parts = of_columns(self._view, rows, self._read_columns)
         detected = self._read_messages(rows) if parts is None else joined_detected(parts)

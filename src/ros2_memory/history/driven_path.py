@@ -232,7 +232,7 @@ class PoseSlice:
         return joined_poses([block.poses.between(start, stop) for block in self.blocks])
 
     def key(self, settings: str) -> FragmentKey | None:
-        """Returns the key of what is made of the poses; None if they are not of whole parts."""
+        """Returns the key for a fragment made of the poses; None if they are not of whole parts."""
         span = self.start - self.beside, self.stop + self.beside
         parts: list[int] = []
         for block in self.blocks:
@@ -470,7 +470,7 @@ def newest_of_body(
     `recording` count, if it has any.
     """
     parent, topics, sessions = frame_id or body.parent, view.moving_topics, view.sessions
-    own_session = None if recording is None else sessions.of(recording)
+    own_session = None if recording is None else sessions.session_of(recording)
     if own_session and not sessions.recordings_of(own_session, topics):
         own_session = None
     for stored in view.stream.messages(topics, window, newest_first=True):
@@ -530,7 +530,7 @@ def _hours_of(view: View, topic: str, window: TimeWindow) -> set[int]:
 def _poses_of_body(view: View, window: TimeWindow, body: Body) -> Poses:
     """Returns the poses of the body in a window, by the transforms of all sessions."""
     bags = view.stream.overlapping_bags(view.moving_topics, window)
-    sessions = dict.fromkeys(view.sessions.of(span.bag.recording) for span in bags)
+    sessions = dict.fromkeys(view.sessions.session_of(span.bag.recording) for span in bags)
     poses = joined_poses([poses_by_session(view, window, session, body) for session in sessions])
     return poses.rows(_positions_apart(poses.times))
 

@@ -178,7 +178,7 @@ class MergedStream:
         return Counter(compress(keys, copies_among(Identities(*columns))))
 
     def find_first_copy(self, stored: StoredMessage) -> None:
-        """Reads where a message may have been received before, for the notes on what is damaged."""
+        """Reads bags that may have a message earlier, for the notes on what is damaged there."""
         topic, window = stored.topic, _since_published(stored)
         if stored.record.may_be_repeated and self.may_be_repeated([topic]):
             for copy in self.merged(self.overlapping_bags([topic], window), [topic], window):

@@ -136,9 +136,9 @@ def resolve_pose_topic(
 
 
 def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None:
-    """Returns a clause on other topics with positions or velocities, or on what is like them.
+    """Returns a clause on other topics with positions or velocities, or on the nearest substitute.
 
-    None if the bags have nothing like them.
+    None if there is no substitute either.
     """
     those = {"position": "poses", "velocity": "velocities"}[what]
     topics = topics_with(view, what)
@@ -461,7 +461,7 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
 
 
 def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataError:
-    """Returns the error with all notes, including those on what was not read of the window."""
+    """Returns the error with all notes, and with notes on unread data of the window."""
     note_unread(view, window, nothing=True)
     return NoDataError(error.reason, error.detail, view.notes.sentences())
 

@@ -595,7 +595,7 @@ class ReverseSearch:
             self.newest(until)
 
     def _refusal(self, topic: str) -> str | None:
-        """Returns why no message of a topic can match, of whichever type."""
+        """Returns why no message of a topic can match; None if one may."""
         types = self._view.timeline.types_of(topic)
         if len(types) == 1:
             return self._refusal_of_type(topic, MAX_NS, types[0])

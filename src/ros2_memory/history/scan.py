@@ -161,7 +161,7 @@ def joined_back(
 def _joined(
     kind: FragmentKind[T], made: Iterable[tuple[Ns, T]], results: list[tuple[Ns, T]]
 ) -> Joined[T]:
-    """Joins what was made, the newest first; adds it to `results` one by one, in case it ends."""
+    """Joins results, the newest first. Adds each to `results`, in case that time runs out."""
     results.extend(made)
     return Joined(kind.join([result for _, result in results[::-1]]) if results else [])
 

@@ -161,13 +161,13 @@ class Sessions:
         """Whether messages of a recording may be of a session."""
         return self.holds_carried(recording) or self.folder(recording) in session
 
-    def of(self, recording: Path) -> Session:
+    def session_of(self, recording: Path) -> Session:
         """Returns the session of a recording."""
-        return self._session_of(self.folder(recording))
+        return self._session_of_folder(self.folder(recording))
 
     def are_joined(self, first: Path, other: Path) -> bool:
         """Whether two recordings are of one session."""
-        if self.of(first) == self.of(other):
+        if self.session_of(first) == self.session_of(other):
             return True
         joined_with = self._view.memory.index.joined_with
         return other.name in joined_with(first) or first.name in joined_with(other)
@@ -179,7 +179,7 @@ class Sessions:
         """
         folder = self.folder(recording)
         if (folder, at) not in self._lending:
-            self._lending[folder, at] = self._with_lender(self._session_of(folder), at)
+            self._lending[folder, at] = self._with_lender(self._session_of_folder(folder), at)
         return self._lending[folder, at]
 
     def recorded_at(self, moment: Ns) -> list[list[Session]] | None:
@@ -219,7 +219,7 @@ class Sessions:
             for by_folder in self._spans.kinds
             for folder, span in by_folder.items()
         )
-        return [*dict.fromkeys(self._session_of(folder) for _, folder in near)]
+        return [*dict.fromkeys(self._session_of_folder(folder) for _, folder in near)]
 
     def _with_lender(self, session: Session, at: Ns) -> Session:
         """Returns a session joined with its only lender, if it has one.
@@ -250,7 +250,7 @@ class Sessions:
         ]
         for (folder, (first, last)), (other, (begin, end)) in combinations(near, 2):
             overlap = max(first, begin) <= min(last, end)
-            if overlap and self._session_of(folder) != self._session_of(other):
+            if overlap and self._session_of_folder(folder) != self._session_of_folder(other):
                 return True
         return False
 
@@ -274,7 +274,7 @@ class Sessions:
         """Returns the sessions that were recorded around a moment, with the span of their bags."""
         around: dict[Session, Span] = {}
         for folder, span in sorted(self._folders_around(moment).items()):
-            session = self._session_of(folder)
+            session = self._session_of_folder(folder)
             around[session] = wider(around.get(session), span)
         return around
 
@@ -290,7 +290,7 @@ class Sessions:
         spans.pop(self._carried, None)
         return spans
 
-    def _session_of(self, folder: str) -> Session:
+    def _session_of_folder(self, folder: str) -> Session:
         if folder == self._carried:
             return frozenset({folder})
         return self._spans.joined.get(folder) or frozenset({folder, self._carried})
@@ -333,7 +333,7 @@ class Sessions:
 
         From any session, if that one has no message of the topic at all.
         """
-        newest, session = self._view.stream.newest(topic, window), self.of(recording)
+        newest, session = self._view.stream.newest(topic, window), self.session_of(recording)
         if not self.recordings_of(session, (topic,)):
             return newest
         extents = self.bags_of(session, (topic,), window)
@@ -396,9 +396,9 @@ class Sessions:
             return {}
         received: dict[Session, list[StampedTransform]] = defaultdict(list)
         for statics in self.static_back(TimeWindow.everything()):
-            received[self.of(view.bag_dir / statics.recording)] += statics.transforms
+            received[self.session_of(view.bag_dir / statics.recording)] += statics.transforms
         for recording in {bag.recording for bag in coverage.missing}:
-            received.pop(self.of(recording), None)
+            received.pop(self.session_of(recording), None)
         return {session: _without_repeats(statics) for session, statics in received.items()}
 
     def static_back(self, window: TimeWindow) -> Iterator[Statics]:

@@ -158,7 +158,7 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
     only the latter leads from one frame to the other.
     """
     sessions = view.sessions
-    joined, own = sessions.lending_to(recording, at), sessions.of(recording)
+    joined, own = sessions.lending_to(recording, at), sessions.session_of(recording)
     if not joined or joined == own:
         return joined
     key = (joined, own, frames)

@@ -318,7 +318,7 @@ class Snapshot:
 
     @cached_property
     def unread_bounds(self) -> Mapping[SetAside, TimeWindow | None]:
-        """By file that does not answer, bounds outside of which it has no message; None: anywhere.
+        """For each file that does not answer, the bounds of its messages; None if unknown.
 
         Wider than `unread_spans`: nothing is estimated.
         """
@@ -383,7 +383,7 @@ def unreadable_span(
 def unreadable_bounds(
     recording: str, near: Neighbours, written: Ns | None, now: Ns
 ) -> TimeWindow | None:
-    """Returns the log times outside of which a closed file has no message; None: anywhere.
+    """Returns bounds (log time) of all messages in a closed file; None if unknown.
 
     Does not estimate how much a file holds, as `unreadable_span` does. Splits between which the
     clock was set back bound nothing.

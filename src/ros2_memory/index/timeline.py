@@ -254,7 +254,7 @@ class Timeline:
         return all(map(is_log, self.types_of(topic)))
 
     def pace(self, topic: str, recording: Path) -> Pace:
-        """Returns how often a recording, which must hold the topic, has messages of it."""
+        """Returns the pace of a topic in a recording, which must hold the topic."""
         folder = str(recording)
         totals, spans = NO_TOTALS, list[Span]()
         for segment in self.segments:

@@ -339,13 +339,13 @@ class RowMaker:
 
         Only then it shows which of the messages of this log time is undecodable.
         """
-        detected = self._detections.of(rows)
+        detected = self._detections.read(rows)
         lost = len(rows) - len(detected.log_times)
         if lost and len(rows) > 1 and rows.ranks.any():
             tied = np.isin(rows.times, rows.times[rows.ranks > 0])
             parts = [np.flatnonzero(~tied), *np.flatnonzero(tied)[:, np.newaxis]]
             for part in map(rows.some, parts):
-                yield part, self._detections.of(part)
+                yield part, self._detections.read(part)
         else:
             yield rows, detected
 

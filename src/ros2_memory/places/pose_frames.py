@@ -331,7 +331,7 @@ def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
     seen: set[Session] = set()
     reach = MIN_NS
     for first, last, recording in spans:
-        session = view.sessions.of(recording)
+        session = view.sessions.session_of(recording)
         if seen and session not in seen:
             overlap = TimeWindow(first, max(min(reach, last) + 1, first))
             bags = view.stream.overlapping_bags([topic], overlap)

@@ -261,14 +261,14 @@ class TrackReader:
         numbers: dict[Session, int] = {}
         placed_by: list[object] = []
         for recording in recordings:
-            session = sessions.of(recording)
+            session = sessions.session_of(recording)
             # A session that lacks a kind borrows transforms of another one, perhaps of a later one.
             if not sessions.has_all_kinds(session):
                 return None
             if session not in numbers:
                 placed_by.append(static_in(sessions.static(session), span))
             placed_by.append(numbers.setdefault(session, len(numbers)))
-        placed_by += [numbers.get(sessions.of(recording)) for recording in moving]
+        placed_by += [numbers.get(sessions.session_of(recording)) for recording in moving]
         return self._settings_hash(placed_by)
 
     def _moving_parts(self, moving: Sequence[Scan], span: TimeWindow) -> dict[int, Path] | None:
@@ -348,7 +348,7 @@ class TrackReader:
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns the sessions whose transforms place the poses of rows, each with its begin."""
         sessions, recording = self._view.sessions, rows.recording
-        session = sessions.of(recording)
+        session = sessions.session_of(recording)
         if sessions.has_all_kinds(session):
             return [(MIN_NS, session)]
         first, last = (self._lender_at(recording, at) for at in (rows.first, rows.last))

@@ -170,7 +170,7 @@ class Placer:
         messages_of_topics: dict[str, Detected] = {}
         detectors: set[str] = set()
         for topic, units_of_topic in units_of_topics.items():
-            messages = joined_detected([self.rows.of(rows) for rows in units_of_topic])
+            messages = joined_detected([self.rows.read(rows) for rows in units_of_topic])
             messages = messages.new_since(since)
             if not messages.log_times.size:
                 continue
@@ -208,7 +208,7 @@ class Placer:
             self._view.pose_topic,
             window,
             failures,
-            among=lambda recording: self._sessions.of(recording) == session,
+            among=lambda recording: self._sessions.session_of(recording) == session,
         )
         try:
             return joined_poses([unit.poses for unit in units])
@@ -281,7 +281,7 @@ class Placer:
             if LOCALISER not in timeline.types_of(topic):
                 continue
             for rows in scan(self._view, topic, window):
-                if self._sessions.of(rows.recording) == session:
+                if self._sessions.session_of(rows.recording) == session:
                     firsts = run_starts(rows.times // _SAID_NS)
                     yield from messages_of(self._view, rows.some(firsts))
 

@@ -315,7 +315,7 @@ class SightReader:
             units_by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
             for rows in self._rows(window):
                 for bag, positions in rows.bag_rows(files):
-                    session = self._sessions.of(bag.recording)
+                    session = self._sessions.session_of(bag.recording)
                     lender = self._lender_to(session, bag, window)
                     units_of_bags = units_by_lender.setdefault((session, lender), {})
                     units_of_bags.setdefault(bag, []).append(rows.some(positions))
@@ -333,7 +333,7 @@ class SightReader:
         folders = set[str]()
         for row in self._bags[reaching[np.sort(firsts)]].tolist():
             bag = self._view.timeline.bags[row]
-            first_bags.setdefault(self._sessions.of(bag.recording), bag)
+            first_bags.setdefault(self._sessions.session_of(bag.recording), bag)
             folders.add(self._sessions.folder(bag.recording))
         is_alone = len(first_bags) == 1
         sessions = [
@@ -476,7 +476,7 @@ class SightReader:
         units_by_session: dict[Session, list[Rows]] = defaultdict(list)
         start = around.window.start
         for rows in self._rows(TimeWindow(max(start - AROUND_NS, MIN_NS), around.window.stop)):
-            units_by_session[self._sessions.of(rows.recording)].append(rows)
+            units_by_session[self._sessions.session_of(rows.recording)].append(rows)
         stretches: list[SeenStretch[int]] = []
         for number, (session, lender, slices) in enumerate(around.sessions):
             units = units_by_session[session]

@@ -260,7 +260,7 @@ def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Pat
     driven_world.fill()
     for memory in (driven_world.unstored().memory, driven_world.memory, World.of(tmp_path).memory):
         view = View(memory, Call())
-        assert view.sessions.static(view.sessions.of(tmp_path / "rec"))
+        assert view.sessions.static(view.sessions.session_of(tmp_path / "rec"))
         assert not view.notes.complete
         [said] = [one for one in view.notes.sentences() if "could not be decoded" in one]
         assert said.startswith("messages of /tf_static could not be decoded: ")

@@ -93,7 +93,9 @@ def test_static_transforms_of_many_recordings_are_read_together_beside_one_being
     view = View(memory_of(tmp_path, recalls=True), Call(used_active=True))
     scanned = Mock(wraps=scan)
     monkeypatch.setattr(sessions, "scan", scanned)
-    of_each = [view.sessions.static(view.sessions.of(path)) for path in tmp_path.glob("rec_*")]
+    of_each = [
+        view.sessions.static(view.sessions.session_of(path)) for path in tmp_path.glob("rec_*")
+    ]
     assert sorted(one.transform.translation[0] for [one] in of_each) == places
     assert scanned.call_count < 6
 
