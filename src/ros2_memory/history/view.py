@@ -96,8 +96,7 @@ class View:
     @cached_property
     def moving_topics(self) -> tuple[str, ...]:
         """The recorded topics of transforms that move (`data.tf_topics`)."""
-        recorded = self.timeline.types
-        return tuple(topic for topic in self.limits.tf_topics if topic in recorded)
+        return tuple(topic for topic in self.limits.tf_topics if topic in self.timeline.types)
 
     @cached_property
     def static_topics(self) -> tuple[str, ...]:

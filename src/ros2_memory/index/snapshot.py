@@ -138,9 +138,7 @@ class Snapshot:
     @property
     def whole_segments(self) -> Iterator[Segment]:
         """The correctly dated bags that have every message that was recorded."""
-        for segment in self._dated_segments:
-            if segment.unthinned is not None:
-                yield segment.unthinned
+        return filter(None, (segment.unthinned for segment in self._dated_segments))
 
     @cached_property
     def _periods(self) -> dict[str, Ns]:

@@ -178,8 +178,7 @@ class Timeline:
 
         That bag does not show when there was a recording: it holds what is left of deleted bags.
         """
-        recorded = (segment.recorded for segment in self.segments)
-        return tuple(segment for segment in recorded if segment is not None) or self.segments
+        return tuple(filter(None, (segment.recorded for segment in self.segments))) or self.segments
 
     @cached_property
     def recorded(self) -> Bags:
