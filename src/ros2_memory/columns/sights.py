@@ -11,50 +11,69 @@ sees a room takes some 400 bytes.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.sights import TABLES, Fix, Hit, Look, Sights, Spot, Unplaced
+from ros2_memory.analysis.sights import (
+    TABLES,
+    Beside,
+    Fix,
+    Hit,
+    Look,
+    Score,
+    Sights,
+    Spot,
+    Unplaced,
+)
 from ros2_memory.columns.pack import byte_planes, compressed, decompressed, from_planes, signed
 from ros2_memory.core.arrays import Columns, Ints, begins_of, distinct_rows, in_ranges, narrowed
 from ros2_memory.core.timebase import NS_PER_US
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-Names: TypeAlias = "tuple[dict[str, int], dict[str, int]]"
-"""The numbers of topics and of labels."""
+_Kind: TypeAlias = type[IntEnum]
+"""The columns of a table, one of `TABLES`."""
 
 _SIGN: Final = 63
 _AT_ONCE: Final = 16
 """So many parts are unpacked together."""
-_SPOTS, _LOOKS, _HITS, _SCORES, _BESIDE, _UNPLACED, _FIXES = range(len(TABLES))
-_NAMED: Final = (
-    ((_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)),
-    ((_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)),
-)
-"""Which columns of which tables are topics, and labels."""
-_TIMES: Final[dict[int, list[int]]] = {
-    _SPOTS: [Spot.FIRST, Spot.LAST],
-    _LOOKS: [Look.FIRST, Look.LAST],
-    _UNPLACED: [Unplaced.FIRST, Unplaced.LAST],
-    _FIXES: [Fix.TIME],
+_TOPICS: Final[dict[_Kind, int]] = {
+    Spot: Spot.TOPIC,
+    Look: Look.TOPIC,
+    Unplaced: Unplaced.TOPIC,
 }
-"""Which columns are times, in the tables whose column 0 is a slice."""
+"""The column of each table that has numbers of topics."""
+_LABELS: Final[dict[_Kind, int]] = {
+    Spot: Spot.LABEL,
+    Unplaced: Unplaced.LABEL,
+    Beside: Beside.LABEL,
+}
+"""The column of each table that has numbers of labels."""
+_TIMES: Final[dict[_Kind, list[int]]] = {
+    Spot: [Spot.FIRST, Spot.LAST],
+    Look: [Look.FIRST, Look.LAST],
+    Unplaced: [Unplaced.FIRST, Unplaced.LAST],
+    Fix: [Fix.TIME],
+}
+"""The columns with times, of each table whose column 0 is a slice."""
 
 
 def packed(sights: Sights, rows: Ints | None = None) -> bytes:
     """Returns the sights of some slices of the clock as bytes.
 
-    `rows` has how many each section has in each table; without, there is one section.
+    Args:
+        sights: the tables.
+        rows: how many rows each section has in each table; None for a single section.
     """
     in_tables = [[*map(len, sights.tables)]] if rows is None else rows.tolist()
     widths, planes = [], []
-    for at, table in enumerate(sights.tables):
+    for kind, table in zip(TABLES, sights.tables, strict=True):
         columns = table.T.copy()
-        columns[_TIMES.get(at, [])] //= NS_PER_US
+        columns[_TIMES.get(kind, [])] //= NS_PER_US
         steps = np.diff(columns, axis=1, prepend=0)
         coded = (steps << 1) ^ (steps >> _SIGN)
         widths.append((int(coded.max(initial=0)).bit_length() + 7) // 8)
@@ -86,47 +105,82 @@ class JoinedSights:
     fixes: Columns
 
 
-def joined(
-    parts: Sequence[bytes],
-    epochs: Sequence[int],
-    sessions: Sequence[int],
-) -> JoinedSights:
-    """Returns the sights of packed parts, whose sections are of some epochs and sessions.
+@dataclass(slots=True)
+class _Names:
+    """The numbers of topics and of labels, in the order in which they were first met."""
+
+    topics: dict[str, int] = field(default_factory=dict)
+    labels: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Table:
+    """One table of many packed parts, column by column.
+
+    Attributes:
+        columns: as its kind names them.
+        section: the section that each row is of.
+    """
+
+    columns: list[Ints]
+    section: Ints
+
+    def sort(self, order: Ints) -> None:
+        """Puts the rows into an order."""
+        self.columns = [column[order] for column in self.columns]
+
+
+def joined(parts: Sequence[bytes], epochs: Sequence[int], sessions: Sequence[int]) -> JoinedSights:
+    """Returns the sights of packed parts as one.
 
     Fixes are in order of time for each session: at one time there may be several robots.
+
+    Args:
+        parts: as `packed` returns them.
+        epochs: the epoch of each of their sections.
+        sessions: the session of each section.
     """
-    epoch, session = np.array(epochs, np.int64), np.array(sessions, np.int64)
-    names: Names = {}, {}
-    # Of each table and column, those of the parts that are unpacked together, in few bytes.
-    pieces: list[list[list[Ints]]] = [[[] for _ in range(len(kind) + 1)] for kind in TABLES]
+    names = _Names()
+    tables, sections = _read_tables(parts, names)
+    _refer_across_sections(tables, sections)
+    topics = _rank_names(tables, _TOPICS, names.topics)
+    labels = _rank_names(tables, _LABELS, names.labels)
+    epoch_of_slice = _number_slices(tables, np.array(epochs, np.int64))
+    _sort_tables(tables, np.array(sessions, np.int64))
+    columns = (Columns(tables[kind].columns) for kind in TABLES)
+    return JoinedSights(topics, labels, epoch_of_slice, *columns)
+
+
+def united(parts: Sequence[bytes]) -> bytes:
+    """Returns packed parts as one, with the sections of all."""
+    names = _Names()
+    tables, rows = _unpack(parts, names)
+    return packed(Sights((*names.topics,), (*names.labels,), *(table.T for table in tables)), rows)
+
+
+def _read_tables(parts: Sequence[bytes], names: _Names) -> tuple[dict[_Kind, _Table], int]:
+    """Returns the tables of all parts, and how many sections they have.
+
+    A few parts at a time are unpacked; their numbers are kept in as few bytes as they need.
+    """
+    # For each column the pieces of it; those of the section come last.
+    pieces: dict[_Kind, list[list[Ints]]] = {
+        kind: [[] for _ in range(len(kind) + 1)] for kind in TABLES
+    }
     sections = 0
     for begin in range(0, max(len(parts), 1), _AT_ONCE):
-        tables, rows = _unpacked(parts[begin : begin + _AT_ONCE], names)
-        section_of = _sections_of(rows)
-        for of_table, table, numbers in zip(pieces, tables, section_of, strict=True):
-            for of_column, column in zip(of_table, (*table, numbers + sections), strict=True):
+        batch, rows = _unpack(parts[begin : begin + _AT_ONCE], names)
+        numbers = np.arange(sections, sections + len(rows))
+        for kind, table, in_table in zip(TABLES, batch, rows.T, strict=True):
+            section = np.repeat(numbers, in_table)
+            for of_column, column in zip(pieces[kind], (*table, section), strict=True):
                 of_column.append(narrowed(column))
         sections += len(rows)
-    columns = [[*map(_concatenated, of_table)] for of_table in pieces]
-    section = [table.pop() for table in columns]
-    _number_rows(columns, section, sections)
-    for kind, places in enumerate(_NAMED):
-        rank = np.argsort([names[kind][name] for name in sorted(names[kind])]).astype(np.int64)
-        for at, column in places:
-            columns[at][column] = narrowed(rank[columns[at][column]])
-    epoch_of_slice = _number_slices(columns, section, epoch)
-    keys = {_SPOTS: 3, _LOOKS: 2, _UNPLACED: 3}
-    orders = {at: _order(columns[at][:size]) for at, size in keys.items()}
-    orders[_FIXES] = _distinct_fixes(columns[_FIXES], session[section[_FIXES]])
-    spots, looks = (_places(orders[at]) for at in (_SPOTS, _LOOKS))
-    columns[_HITS][Hit.LOOK] = looks[columns[_HITS][Hit.LOOK]]
-    for at in (_HITS, _SCORES, _BESIDE):
-        columns[at][0] = spots[columns[at][0]]
-        orders[at] = _order(columns[at][:1])
-    for at, order in orders.items():
-        columns[at] = [column[order] for column in columns[at]]
-    topics, labels = (tuple(sorted(names_of_kind)) for names_of_kind in names)
-    return JoinedSights(topics, labels, epoch_of_slice, *map(Columns, columns))
+    tables: dict[_Kind, _Table] = {}
+    for kind, of_kind in pieces.items():
+        *columns, section = map(_concatenated, of_kind)
+        tables[kind] = _Table(columns, section)
+    return tables, sections
 
 
 def _concatenated(pieces: list[Ints]) -> Ints:
@@ -136,28 +190,109 @@ def _concatenated(pieces: list[Ints]) -> Ints:
     return column
 
 
-def _number_rows(columns: Sequence[list[Ints]], section: Sequence[Ints], sections: int) -> None:
-    """Numbers the spots and looks that tables name through all sections, no more for each."""
-    spots, looks = (begins_of(section[at], sections) for at in (_SPOTS, _LOOKS))
-    for at in (_HITS, _SCORES, _BESIDE):
-        columns[at][0] = columns[at][0] + spots[section[at]]
-    look = columns[_HITS][Hit.LOOK]
-    columns[_HITS][Hit.LOOK] = np.where(look < 0, -1, look + looks[section[_HITS]])
+def _unpack(parts: Sequence[bytes], names: _Names) -> tuple[list[Ints], Ints]:
+    """Returns the tables of all parts, and how many rows each section has in each table.
+
+    Each table has its columns one after the other.
+
+    Args:
+        parts: as `packed` returns them.
+        names: gets the names that it does not have yet; the tables have its numbers.
+    """
+    tables = [[np.empty((len(kind), 0), np.int64)] for kind in TABLES]
+    rows = [np.empty((0, len(TABLES)), np.int64)]
+    for part in parts:
+        head, data = decompressed(part).split(b"\n", 1)
+        topics, labels, in_tables, widths = json.loads(head)
+        topic_numbers = _numbers_of(topics, names.topics)
+        label_numbers = _numbers_of(labels, names.labels)
+        rows.append(np.array(in_tables, np.int64).reshape(-1, len(TABLES)))
+        counts = rows[-1].sum(axis=0).tolist()
+        begin = 0
+        for kind, of_kind, count, width in zip(TABLES, tables, counts, widths, strict=True):
+            steps = signed(from_planes(data, begin, len(kind) * count, width))
+            begin += len(kind) * count * width
+            table = np.cumsum(steps.reshape(len(kind), count), axis=1, dtype=np.int64)
+            table[_TIMES.get(kind, [])] *= NS_PER_US
+            if kind in _TOPICS:
+                table[_TOPICS[kind]] = topic_numbers[table[_TOPICS[kind]]]
+            if kind in _LABELS:
+                table[_LABELS[kind]] = label_numbers[table[_LABELS[kind]]]
+            of_kind.append(table)
+    return [np.concatenate(of_kind, axis=1) for of_kind in tables], np.concatenate(rows)
 
 
-def _number_slices(columns: list[list[Ints]], section: Sequence[Ints], epoch: Ints) -> Ints:
-    """Numbers the slices in tables, which are of some sections; returns the epoch of each."""
-    begins = {at: _begins(columns[at][0], section[at]) for at in _TIMES}
-    of_runs = [(columns[at][0][rows], epoch[section[at][rows]]) for at, rows in begins.items()]
-    slices, number = distinct_rows([*map(np.concatenate, zip(*of_runs, strict=True))])
-    number = narrowed(number)
-    for at, rows in begins.items():
-        columns[at][0] = np.repeat(number[: len(rows)], np.diff(rows, append=len(section[at])))
-        number = number[len(rows) :]
-    return slices[:, 1]
+def _numbers_of(names: Sequence[str], number_of: dict[str, int]) -> Ints:
+    """Returns the number of each name; new names get the next ones."""
+    return np.array([number_of.setdefault(name, len(number_of)) for name in names], np.int64)
 
 
-def _begins(*columns: Ints) -> Ints:
+# Each of these changes the tables in place.
+
+
+def _refer_across_sections(tables: Mapping[_Kind, _Table], sections: int) -> None:
+    """Numbers the spots and looks that tables refer to through all sections.
+
+    In a section they are numbered from 0.
+    """
+    spot_begins = begins_of(tables[Spot].section, sections)
+    look_begins = begins_of(tables[Look].section, sections)
+    for kind in (Hit, Score, Beside):
+        table = tables[kind]
+        table.columns[0] = table.columns[0] + spot_begins[table.section]
+    hits = tables[Hit]
+    look = hits.columns[Hit.LOOK]
+    hits.columns[Hit.LOOK] = np.where(look < 0, -1, look + look_begins[hits.section])
+
+
+def _rank_names(
+    tables: Mapping[_Kind, _Table], column_of: Mapping[_Kind, int], number_of: Mapping[str, int]
+) -> tuple[str, ...]:
+    """Puts the places of names in alphabetical order in place of their numbers; returns that."""
+    ordered = sorted(number_of)
+    rank = np.argsort([number_of[name] for name in ordered]).astype(np.int64)
+    for kind, column in column_of.items():
+        columns = tables[kind].columns
+        columns[column] = narrowed(rank[columns[column]])
+    return tuple(ordered)
+
+
+def _number_slices(tables: Mapping[_Kind, _Table], epoch_of_section: Ints) -> Ints:
+    """Numbers the slices in order of time; returns the epoch of each."""
+    timed = [tables[kind] for kind in _TIMES]
+    # Many rows of one slice follow each other: one of each run is compared.
+    runs = [_run_begins(table.columns[0], table.section) for table in timed]
+    slices, epochs = [], []
+    for table, begins in zip(timed, runs, strict=True):
+        slices.append(table.columns[0][begins])
+        epochs.append(epoch_of_section[table.section[begins]])
+    distinct, numbers = distinct_rows([np.concatenate(slices), np.concatenate(epochs)])
+    numbers = narrowed(numbers)
+    for table, begins in zip(timed, runs, strict=True):
+        sizes = np.diff(begins, append=len(table.section))
+        table.columns[0] = np.repeat(numbers[: len(begins)], sizes)
+        numbers = numbers[len(begins) :]
+    return distinct[:, 1]
+
+
+def _sort_tables(tables: Mapping[_Kind, _Table], session_of_section: Ints) -> None:
+    """Sorts the tables, and renews what refers to rows of others."""
+    spots, looks, hits, fixes = (tables[kind] for kind in (Spot, Look, Hit, Fix))
+    spot_order = _order(spots.columns[: Spot.LABEL + 1])
+    look_order = _order(looks.columns[: Look.TOPIC + 1])
+    spots.sort(spot_order)
+    looks.sort(look_order)
+    tables[Unplaced].sort(_order(tables[Unplaced].columns[: Unplaced.LABEL + 1]))
+    fixes.sort(_distinct_fixes(fixes.columns, session_of_section[fixes.section]))
+    hits.columns[Hit.LOOK] = _places(look_order)[hits.columns[Hit.LOOK]]
+    spot_places = _places(spot_order)
+    for kind in (Hit, Score, Beside):
+        table = tables[kind]
+        table.columns[0] = spot_places[table.columns[0]]
+        table.sort(_order(table.columns[:1]))
+
+
+def _run_begins(*columns: Ints) -> Ints:
     """Returns the rows that differ from the one before, and the first."""
     is_other = np.ones(len(columns[0]), np.bool_)
     is_other[1:] = np.any([np.diff(column) != 0 for column in columns], axis=0)
@@ -166,62 +301,22 @@ def _begins(*columns: Ints) -> Ints:
 
 def _order(keys: Sequence[Ints]) -> Ints:
     """Returns the rows in the order of some columns; equal ones stay in their order."""
-    begins = _begins(*keys)  # many rows that are alike follow each other
+    begins = _run_begins(*keys)  # many rows that are alike follow each other
     order = np.argsort(distinct_rows([key[begins] for key in keys])[1], kind="stable")
     return in_ranges(begins[order], np.diff(begins, append=len(keys[0]))[order])
 
 
 def _places(order: Ints) -> Ints:
-    """Returns where each row comes in an order, in few bytes; at the end, so for row -1, -1."""
+    """Returns the place of each row in an order; the last one, for row -1, is -1."""
     places = np.full(len(order) + 1, -1, np.int64)
     places[order] = np.arange(len(order))
     return narrowed(places)
 
 
-def united(parts: Sequence[bytes]) -> bytes:
-    """Returns packed parts as one, with the sections of all."""
-    topics, labels = names = dict[str, int](), dict[str, int]()
-    tables, rows = _unpacked(parts, names)
-    return packed(Sights((*topics,), (*labels,), *(table.T for table in tables)), rows)
-
-
 def _distinct_fixes(columns: Sequence[Ints], session: Ints) -> Ints:
-    """Returns the fixes of each session in order of time, each once.
+    """Returns the rows of fixes, by session and time, each fix once.
 
-    Where a stretch of the clock ends, both that it parts have the fix.
+    Two stretches of the clock that meet have the fix at their common edge both.
     """
-    order = np.lexsort((*columns[:0:-1], session))
-    return order[_begins(*(column[order] for column in (*columns, session)))]
-
-
-def _sections_of(rows: Ints) -> list[Ints]:
-    """Returns the section of each row of each table; `rows` has how many each has."""
-    return [np.repeat(np.arange(len(rows)), in_table) for in_table in rows.T]
-
-
-def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], Ints]:
-    """Returns the tables of all parts, and how many rows each section has in each.
-
-    Each table has its columns one after the other. `names` has the numbers of topics and labels,
-    and gets those of others.
-    """
-    tables = [[np.empty((len(kind), 0), np.int64)] for kind in TABLES]
-    rows = [np.empty((0, len(TABLES)), np.int64)]
-    for part in parts:
-        head, data = decompressed(part).split(b"\n", 1)
-        *own_names, in_tables, widths = json.loads(head)
-        rows.append(np.array(in_tables, np.int64).reshape(-1, len(TABLES)))
-        begin = 0
-        counts = rows[-1].sum(axis=0).tolist()
-        for of_table, count, width in zip(tables, counts, widths, strict=True):
-            columns = len(of_table[0])
-            steps = signed(from_planes(data, begin, columns * count, width))
-            begin += columns * count * width
-            of_table.append(np.cumsum(steps.reshape(columns, count), axis=1, dtype=np.int64))
-        for at, times in _TIMES.items():
-            tables[at][-1][times] *= NS_PER_US
-        for kind, (places, numbers_of) in enumerate(zip(_NAMED, names, strict=True)):
-            own = [numbers_of.setdefault(name, len(numbers_of)) for name in own_names[kind]]
-            for at, column in places:
-                tables[at][-1][column] = np.array(own, np.int64)[tables[at][-1][column]]
-    return [np.concatenate(of_table, axis=1) for of_table in tables], np.concatenate(rows)
+    order = np.lexsort((*reversed(columns[Fix.TIME :]), session))  # the last is the first key
+    return order[_run_begins(*(column[order] for column in (*columns, session)))]
