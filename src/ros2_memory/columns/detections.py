@@ -1,12 +1,12 @@
-"""Where the messages of a type may have detections, and those of a table from its columns alone.
+"""Reads detections from the columns of a table, without its messages.
 
-The same as `messages.detections.detections_of` finds in each extracted value: `sources_in` goes
-where that goes, as deep, by the same names. Where the columns do not settle it (a shape that
-differs from message to message) the messages have to be read.
+It finds what `messages.detections.detections_of` finds in each extracted value: `sources_in` visits
+the same fields, equally deep, by the same names. Where the shape of a value differs from message to
+message, the columns do not settle it, and the messages have to be read.
 
-`without_low` leaves of a value what `without_low_scores` leaves: null is in place of a detection of
-a low score, or of one of its hypotheses. Where an object has no name in some messages, and so is no
-detection there, the limits say that they do not know.
+`without_low` does to a value what `without_low_scores` does: it puts null in place of a detection,
+or of one of its hypotheses, with a low score. An object that has no name in some messages is no
+detection there; then the limits say that they do not know.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ros2_memory.columns.values import (
     TruthValues,
     UnknownShapeError,
     Values,
+    unknown,
     zone_of,
 )
 from ros2_memory.columns.walk import entries_of_codes
@@ -51,7 +52,13 @@ if TYPE_CHECKING:
 
 
 class NamedScores(NamedTuple):
-    """The name (blank: none) and the score (NaN: none) of each object, and the error of scores."""
+    """The names and scores of objects.
+
+    Attributes:
+        name: of each object; blank if it has none.
+        score: of each object; NaN if it has none.
+        error: the greatest error of any score.
+    """
 
     name: Texts
     score: Floats
@@ -63,18 +70,18 @@ class NamedScores(NamedTuple):
         return np.array([bool(word.strip()) for word in self.name.words], np.bool_)[self.name.codes]
 
     def at(self, positions: IntArray) -> NamedScores:
-        """Returns some of them."""
+        """Returns the names and scores of the objects at some positions."""
         name, score, error = self
         return NamedScores(Texts(name.codes[positions], name.words), score[positions], error)
 
 
 class Scored(NamedTuple):
-    """An object that may be a detection: what names it, in order, and what its score is.
+    """Where the name and the score of objects are that may be detections.
 
     Attributes:
-        level: where it lies.
-        labels: texts and then whole numbers, the first of which that is not blank names it.
-        scores: numbers, of which the first that is known is its score.
+        level: where the objects lie.
+        labels: texts, then whole numbers: the first that is not blank is the name.
+        scores: numbers: the first that is not NaN is the score.
     """
 
     level: Level
@@ -82,10 +89,14 @@ class Scored(NamedTuple):
     scores: tuple[Leaf, ...]
 
     def read(self, values: Values) -> NamedScores:
-        """Returns the names and scores of all; raises `UnknownShapeError` without columns."""
-        name, *fallbacks = (_names(values, leaf) for leaf in self.labels)
-        for fallback in fallbacks:
-            name = or_else(name, fallback, blank=True)
+        """Returns the name and score of each object.
+
+        Raises:
+            UnknownShapeError: the table has no column for one of them.
+        """
+        name = _names(values, self.labels[0])
+        for leaf in self.labels[1:]:
+            name = _texts_or(name, _names(values, leaf), replace_blank=True)
         score, error = np.full(len(name), np.nan), 0.0
         for leaf in self.scores:
             column, leaf_error = values.floats(leaf)
@@ -94,25 +105,31 @@ class Scored(NamedTuple):
 
 
 def _names(values: Values, leaf: Leaf) -> Texts:
-    """Returns the texts of a leaf, or its whole numbers as such."""
+    """Returns the texts of a leaf, or its whole numbers as texts."""
     if leaf.kind is Kind.TEXT:
         return values.texts(leaf)
     return Texts.of([*map(str, values.numbers(leaf).values.tolist())])
 
 
-def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
-    """Returns each of some texts, or another where it is empty (or `blank`)."""
-    is_none = [not (word.strip() if blank else word) for word in texts.words]
-    if not any(is_none):
+def _texts_or(texts: Texts, fallback: Texts, *, replace_blank: bool = False) -> Texts:
+    """Returns the texts, and the fallback of each row whose text is empty.
+
+    With `replace_blank` also of rows whose text has nothing but spaces.
+    """
+    is_empty = [not (word.strip() if replace_blank else word) for word in texts.words]
+    if not any(is_empty):
         return texts
-    codes = np.where(np.array(is_none)[texts.codes], fallback.codes + len(texts.words), texts.codes)
+    use_fallback = np.array(is_empty)[texts.codes]
+    codes = np.where(use_fallback, fallback.codes + len(texts.words), texts.codes)
     return Texts(codes.astype(np.uint32), (*texts.words, *fallback.words))
 
 
 class Point(NamedTuple):
-    """Numbers that may be the place of an object: x, y and z (m).
+    """Where the place of an object may be.
 
-    `frames` are the texts beside it that may name its frame, the outermost first.
+    Attributes:
+        axes: x, y and z (m).
+        frames: texts beside them that may name the frame, the outermost first.
     """
 
     axes: tuple[Leaf, ...]
@@ -120,26 +137,25 @@ class Point(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """Objects that may be detections: what names them, and what else there is where nothing does.
+    """Objects that may be detections.
 
     Attributes:
-        scored: names and scores; of the hypotheses with `is_best`.
-        otherwise: where detections are where the object is none.
-        frames: that name the frame, outermost first.
-        points: where they may have their place, first choice first; None where that depends on the
-            message.
-        is_best: they are named by the best of several hypotheses, which is what is scored.
+        scored: their names and scores; with `is_best` those of their hypotheses.
+        inner: where detections may be inside an object that has no name.
+        frames: texts that may name the frame, the outermost first.
+        points: where their place may be, the first choice first; None if it depends on the message.
+        is_best: whether the best of several hypotheses names an object.
     """
 
     scored: Scored
-    otherwise: tuple[Source, ...]
+    inner: tuple[Source, ...]
     frames: tuple[Leaf, ...]
     points: tuple[Point, ...] | None
     is_best: bool = False
 
     @property
     def leaf(self) -> Leaf:
-        """What names them first."""
+        """The first choice for the name."""
         return self.scored.labels[0]
 
     @property
@@ -149,31 +165,58 @@ class Labels(NamedTuple):
         return level.parent if self.is_best and level.parent else level
 
     def read(self, values: Values) -> tuple[IntArray, NamedScores]:
-        """Returns what names the objects, and its positions in the level of `scored`.
+        """Returns the name and score of each object, behind their positions in `scored.level`.
 
         Raises:
-            UnknownShapeError: columns lack it, or rounding may make another hypothesis the best.
+            UnknownShapeError: the table has no column for one of them, or scores were rounded so
+                that another hypothesis may be the best.
         """
         named = self.scored.read(values)
         if not self.is_best:
             return np.arange(len(named.name)), named
-        owners = values.elements(self.scored.level).owners
-        # Without a score last; of those of one score the first.
-        order = np.lexsort((-np.where(np.isnan(named.score), -np.inf, named.score), owners))
-        begins = np.diff(owners[order], prepend=-1) != 0
-        best = order[begins]
-        if named.error:
-            follows = np.flatnonzero(begins[:-1] & ~begins[1:])
-            score, codes = named.score[order], named.name.codes[order]
-            with np.errstate(invalid="ignore"):  # infinity less infinity
-                is_close = score[follows] - score[follows + 1] <= 2 * named.error
-            if (is_close & (codes[follows] != codes[follows + 1])).any():
-                raise UnknownShapeError("another hypothesis may be the best")
+        best = _best_hypotheses(named, values.elements(self.scored.level).owners)
         return best, named.at(best)
 
     def objects(self, values: Values, positions: IntArray) -> IntArray:
-        """Returns the objects that are named at some positions in the level of `scored`."""
+        """Returns the objects that are named at some positions in `scored.level`."""
         return values.elements(self.scored.level).owners[positions] if self.is_best else positions
+
+    def not_below(self, values: Values, least: float) -> TruthValues:
+        """Returns which objects are no detection with a score below `least`.
+
+        Raises:
+            UnknownShapeError: as for `read`.
+        """
+        positions, named = self.read(values)
+        owners = self.objects(values, positions)
+        surely, perhaps = unknown(values.size(self.level))
+        surely[owners] = named.is_named & ~(named.score < least + named.error)
+        perhaps[owners] = ~(named.is_named & (named.score < least - named.error))
+        return TruthValues(surely, perhaps)
+
+
+def _best_hypotheses(named: NamedScores, owners: IntArray) -> IntArray:
+    """Returns the position of the best hypothesis of each object; the first of equal ones.
+
+    Args:
+        named: the names and scores of all hypotheses.
+        owners: the object of each hypothesis, ascending.
+
+    Raises:
+        UnknownShapeError: scores were rounded, so that another one may be the best.
+    """
+    # A hypothesis without a score comes last.
+    order = np.lexsort((-np.where(np.isnan(named.score), -np.inf, named.score), owners))
+    is_best: Mask = np.diff(owners[order], prepend=-1) != 0
+    if named.error:
+        best = np.flatnonzero(is_best[:-1] & ~is_best[1:])  # those that have a second
+        score, codes = named.score[order], named.name.codes[order]
+        with np.errstate(invalid="ignore"):  # infinity less infinity
+            is_close = score[best] - score[best + 1] <= 2 * named.error
+        if (is_close & (codes[best] != codes[best + 1])).any():
+            raise UnknownShapeError("another hypothesis may be the best")
+    best_of_all: IntArray = order[is_best]
+    return best_of_all
 
 
 class Words(NamedTuple):
@@ -183,7 +226,13 @@ class Words(NamedTuple):
 
 
 class Json(NamedTuple):
-    """A text that may be JSON, and how deep detections are looked for in it."""
+    """A text that may be JSON with detections.
+
+    Attributes:
+        leaf: the text.
+        depth: how many lists, objects and texts deep detections are looked for in it.
+        frames: texts that may name the frame, the outermost first.
+    """
 
     leaf: Leaf
     depth: int
@@ -199,105 +248,111 @@ def sources_in(value: Node) -> list[Source]:
     Raises:
         UnknownShapeError: that depends on the message.
     """
-    sources: list[Source] = []
-    _walked(value, MAX_DEPTH, (), None, sources)
+    sources = _walk(value, MAX_DEPTH, (), None).sources
     if any(source.leaf.limits for source in sources):
         raise UnknownShapeError("an element of a list stands alone")
-    return sources
+    return [*sources]
 
 
 def without_low(value: Node, least: float) -> Node:
-    """Returns a value without the detections whose score is below a limit; raises likewise."""
-    return _walked(value, MAX_DEPTH, (), least, [])
+    """Returns a value without the detections whose score is below `least`.
+
+    Raises:
+        UnknownShapeError: that depends on the message.
+    """
+    return _walk(value, MAX_DEPTH, (), least).node
 
 
-def _walked(
-    node: Node, depth: int, frames: tuple[Leaf, ...], least: float | None, sources: list[Source]
-) -> Node:
-    """Adds where detections may be in a node; returns it without those of a score below `least`.
+class _Walked(NamedTuple):
+    """A node after a walk.
 
-    `frames` name the frame, outermost first.
+    Attributes:
+        node: without the detections that have a low score.
+        sources: where it may have detections.
+    """
+
+    node: Node
+    sources: tuple[Source, ...] = ()
+
+
+def _walk(node: Node, depth: int, frames: tuple[Leaf, ...], least: float | None) -> _Walked:
+    """Looks for detections in a node.
+
+    Args:
+        node: part of a value.
+        depth: how many lists, objects and texts deep to look.
+        frames: texts around it that may name the frame, the outermost first.
+        least: detections with a lower score are left out; None to keep all.
     """
     if node is UNKNOWN:
         raise UnknownShapeError("a part depends on the message")
     if depth == 0:
-        return node
+        return _Walked(node)
     if isinstance(node, Leaf) and node.kind is Kind.TEXT:
-        sources.append(Json(node, depth, frames))
-        return node._replace(json_depth=depth)
+        return _Walked(node._replace(json_depth=depth), (Json(node, depth, frames),))
     if isinstance(node, Listing) and isinstance(node.element, dict):
-        return Listing(node.level, _walked(node.element, depth - 1, frames, least, sources))
+        walked = _walk(node.element, depth - 1, frames, least)
+        return _Walked(Listing(node.level, walked.node), walked.sources)
     if not isinstance(node, dict):  # lists are looked at for objects alone
-        return node
-    frames = (*frames, *_frame_leaves(node))
+        return _Walked(node)
+    frames += _frame_leaves(node)
     inner: list[Source] = []
     fields: dict[str, Node] = {}
     for name, part in node.items():
         element = part.element if isinstance(part, Listing) else None
         if name in LISTS_OF_LABELS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
             inner.append(Words(element))
-        fields[name] = _walked(part, depth - 1, frames, least, inner)
+        fields[name], sources = _walk(part, depth - 1, frames, least)
+        inner += sources
     labels = _labels(node, tuple(inner), frames)
     if labels is None:
-        sources += inner
-        return type(node)(fields)
-    sources.append(labels)
-    return node if least is None else _limited(node, labels, least)
+        return _Walked(type(node)(fields), tuple(inner))
+    return _Walked(node if least is None else _without_low_object(node, labels, least), (labels,))
 
 
 def _labels(
     fields: dict[str, Node], inner: tuple[Source, ...], frames: tuple[Leaf, ...]
 ) -> Labels | None:
-    """Returns how an object may be a detection; None if none like it is one."""
-    named, results = _scored(fields), fields.get("results")
-    if named is not None:
-        return Labels(named, inner, frames, _points(fields))
+    """Returns how an object with these fields may be a detection; None if it never is."""
+    scored, results = _scored(fields), fields.get("results")
+    if scored is not None:
+        return Labels(scored, inner, frames, _points(fields))
     if not isinstance(results, Listing) or not isinstance(results.element, dict):
         return None
     # The hypotheses of a detection (vision_msgs).
     hypothesis = results.element.get("hypothesis")
-    named = _scored(hypothesis if isinstance(hypothesis, dict) else results.element)
-    if named is None:
+    scored = _scored(hypothesis if isinstance(hypothesis, dict) else results.element)
+    if scored is None:
         return None
     of_best, own = _points(results.element), _points(fields)
-    points = None if of_best is None or own is None else (*of_best, *own)
-    return Labels(named, inner, frames, points, is_best=True)
+    points = None if of_best is None or own is None else of_best + own
+    return Labels(scored, inner, frames, points, is_best=True)
 
 
-def _limited(node: dict[str, Node], labels: Labels, least: float) -> Node:
-    """Returns an object that may be a detection, where its score is not low."""
+def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> Node:
+    """Returns an object without the rows in which it is a detection with a score below `least`."""
 
-    def of_objects(values: Values) -> TruthValues:
-        positions, named = labels.read(values)
-        size = values.size(labels.level)
-        surely, perhaps = np.zeros(size, np.bool_), np.ones(size, np.bool_)
-        owners = labels.objects(values, positions)
-        surely[owners] = named.is_named & ~(named.score < least + named.error)
-        perhaps[owners] = ~(named.is_named & (named.score < least - named.error))
-        return TruthValues(surely, perhaps)
-
-    def find(values: Values, positions: IntArray) -> TruthValues:
-        surely, perhaps = values.once(limit, of_objects)
+    def find_objects(values: Values, positions: IntArray) -> TruthValues:
+        surely, perhaps = values.once(limit, lambda values: labels.not_below(values, least))
         return TruthValues(surely[positions], perhaps[positions])
 
-    limit = Limit(labels.level, find)
-    results = node.get("results")
-    if not labels.is_best or not isinstance(results, Listing):
-        return narrowed(node, limit)
-
-    def of_hypotheses(values: Values, positions: IntArray) -> TruthValues:
+    def find_hypotheses(values: Values, positions: IntArray) -> TruthValues:
         named, owners = labels.scored.read(values), labels.objects(values, positions)
+        score = named.score[positions]
+        surely, perhaps = ~(score < least + named.error), ~(score < least - named.error)
         # Where it is not sure that the detection is one, neither is what stays of it.
-        is_detection, score = limit.kept(values, owners).surely, named.score[positions]
-        surely, perhaps = (~(score < least + off) for off in (named.error, -named.error))
+        is_detection = limit.kept(values, owners).surely
         return TruthValues(surely & is_detection, perhaps | ~is_detection)
 
-    kept = narrowed(results, Limit(labels.scored.level, of_hypotheses))
-    return narrowed({**node, "results": kept}, limit)
+    limit = Limit(labels.level, find_objects)
+    if labels.is_best:
+        results = narrowed(node["results"], Limit(labels.scored.level, find_hypotheses))
+        node = {**node, "results": results}
+    return narrowed(node, limit)
 
 
 def _scored(fields: Mapping[str, Node]) -> Scored | None:
-    """Returns how an object is named and scored; None if none like it is a detection."""
+    """Returns where an object with these fields has its name and score; None if it has no name."""
     names = tuple(naming_fields(fields.keys()))
     labels = _leaves(fields, names, Kind.TEXT) + _leaves(fields, names, Kind.INTEGER)
     scores = _leaves(fields, SCORES, Kind.INTEGER, Kind.REAL)
@@ -305,43 +360,55 @@ def _scored(fields: Mapping[str, Node]) -> Scored | None:
 
 
 def _leaves(fields: Mapping[str, Node], names: tuple[str, ...], *kinds: Kind) -> tuple[Leaf, ...]:
+    """Returns the fields with these names that are leaves of one of these kinds."""
     nodes = [fields[name] for name in names if name in fields]
     return tuple(node for node in nodes if isinstance(node, Leaf) and node.kind in kinds)
 
 
-def _frame_leaves(fields: Mapping[str, Node]) -> Iterator[Leaf]:
+def _frame_leaves(fields: Mapping[str, Node]) -> tuple[Leaf, ...]:
+    """Returns the text with which an object names its frame, if it has one."""
     header = fields.get("header")
-    leaf = (header if isinstance(header, dict) else fields).get("frame_id")
-    if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT:
-        yield leaf
+    named = header if isinstance(header, dict) else fields
+    return _leaves(named, ("frame_id",), Kind.TEXT)
 
 
 def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
-    """Returns where an object may have its place, first choice first; None: it depends."""
+    """Returns where an object may have its place, the first choice first.
+
+    Returns None if that depends on the message.
+    """
     points: list[Point] = []
     for path in POSITIONS:
-        node: Node | None = fields
-        frames: list[Leaf] = []
-        for name in path:
-            node = node.get(name) if isinstance(node, dict) else None
-            if isinstance(node, dict):
-                frames += _frame_leaves(node)
+        node, frames = _position_at(fields, path)
         if isinstance(node, dict):
             axes = [node[axis] for axis in "xyz" if axis in node]
         elif isinstance(node, list):
             axes = [*node]
         else:
             continue
-        leaves = [axis for axis in axes if isinstance(axis, Leaf)]
+        leaves = tuple(axis for axis in axes if isinstance(axis, Leaf))
         if len(leaves) < len(axes) or isinstance(node, Listing):
             return None
         if len(leaves) == 3 and all(leaf.is_number for leaf in leaves):
-            points.append(Point(tuple(leaves), tuple(frames)))
+            points.append(Point(leaves, frames))
     return tuple(points)
 
 
+def _position_at(
+    fields: dict[str, Node], path: tuple[str, ...]
+) -> tuple[Node | None, tuple[Leaf, ...]]:
+    """Returns what is at a path, and the texts on the way that may name its frame."""
+    node: Node | None = fields
+    frames: tuple[Leaf, ...] = ()
+    for name in path:
+        node = node.get(name) if isinstance(node, dict) else None
+        if isinstance(node, dict):
+            frames += _frame_leaves(node)
+    return node, frames
+
+
 def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
-    """Returns whether one of these texts looks like JSON, or is not in the columns."""
+    """Returns whether one of these texts looks like JSON, or has no column."""
     zones = ((leaf, values.zone(leaf)) for leaf in texts)
     possible = [leaf for leaf, zone in zones if zone is None or zone.may_be_json]
     try:
@@ -354,14 +421,14 @@ Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
 
 class Detections(NamedTuple):
-    """Detections by message, in a message in its order.
+    """Detections in the order of their messages, those of one message in its order.
 
     Attributes:
-        rows: the message of each, ascending.
-        labels: their names.
-        scores: their detector's own, in its own unit; NaN where it gives none.
-        places: N x 3 (m), in the frame; NaN where the message has no place.
-        frames: the frame of each, empty where the message names none.
+        rows: the message of each detection, ascending.
+        labels: the names.
+        scores: in the detector's own unit; NaN without one.
+        places: N x 3 (m), in `frames`; NaN without one.
+        frames: the frame of each place; empty if the message names none.
     """
 
     rows: IntArray
@@ -371,12 +438,16 @@ class Detections(NamedTuple):
     frames: Texts
 
     def at(self, rows: IntArray) -> Detections:
-        """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
-        message, is_among = places_among(self.rows, rows)
-        return self._replace(rows=message).taken(is_among)
+        """Returns the detections of some messages, which become the messages 0, 1, 2, ...
 
-    def taken(self, which: IntArray | Mask) -> Detections:
-        """Returns some of them."""
+        Args:
+            rows: the messages, ascending.
+        """
+        message, is_among = places_among(self.rows, rows)
+        return self._replace(rows=message).select(is_among)
+
+    def select(self, which: IntArray | Mask) -> Detections:
+        """Returns the detections at some positions, or those that a mask picks."""
         rows, labels, scores, places, frames = self
         return Detections(
             rows[which],
@@ -388,12 +459,12 @@ class Detections(NamedTuple):
 
 
 class StampedDetections(NamedTuple):
-    """The detections of some messages.
+    """The detections of the messages of a table, and what the headers of the messages say.
 
     Attributes:
-        detections: by the place of their message among these.
-        stamps: of the messages' headers (ns); None where they have none.
-        frames: of the messages' headers, empty where they have none.
+        detections: their `rows` are those of the table.
+        stamps: of each message (ns); None if the type has no stamps.
+        frames: of each message; empty if it names none.
     """
 
     detections: Detections
@@ -402,20 +473,32 @@ class StampedDetections(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """Where a type has detections, and the frame and stamp (ns) of its header, one each at most."""
+    """Where a type has detections, and what its header says.
+
+    Attributes:
+        sources: where detections may be.
+        frames: the frame of the header, if it has one.
+        stamp: of the header (ns).
+    """
 
     sources: Sequence[Source]
     frames: Sequence[Leaf]
-    stamps: Sequence[Leaf]
+    stamp: Leaf | None
 
     @classmethod
     def of(cls, shape: Shape) -> _Plan:
-        """Returns that of a type; raises `UnknownShapeError` where it depends on the message."""
-        frame, stamp = (shape.at(("header", name)) for name in ("frame_id", "stamp"))
-        frames = [frame] if isinstance(frame, Leaf) and frame.kind is Kind.TEXT else []
+        """Returns the plan of a type.
+
+        Raises:
+            UnknownShapeError: it depends on the message.
+        """
+        frame, stamp = shape.at(("header", "frame_id")), shape.at(("header", "stamp"))
         is_time = isinstance(stamp, Leaf) and stamp.conversion is Conversion.SECONDS
-        stamps = [Leaf(ROWS, ("header.stamp",), Kind.INTEGER)] if is_time else []
-        return cls(sources_in(shape.value), frames, stamps)
+        return cls(
+            sources_in(shape.value),
+            [frame] if isinstance(frame, Leaf) and frame.kind is Kind.TEXT else [],
+            Leaf(ROWS, ("header.stamp",), Kind.INTEGER) if is_time else None,
+        )
 
 
 class DetectionColumns:
@@ -429,23 +512,12 @@ class DetectionColumns:
         self._plans = ByType(extractor, _Plan.of)
 
     def of(self, table: Table) -> StampedDetections | None:
-        """Returns the detections of a table's messages; None where they have to be read."""
-        plan, values = self._plans.of(table), Values(table)
+        """Returns the detections of a table; None if its messages have to be read."""
+        plan = self._plans.of(table)
         if plan is None:
             return None
-
-        def read() -> StampedDetections:
-            found = joined_detections(
-                [part for source in plan.sources for part in found_in(values, source, places=True)]
-            )
-            frames = _frames_at(values, ROWS, np.arange(values.rows), plan.frames)
-            own = Texts(frames.codes[found.rows], frames.words)
-            found = found._replace(frames=or_else(found.frames, own))
-            stamps = [values.numbers(leaf).values.astype(np.int64) for leaf in plan.stamps]
-            return StampedDetections(found, stamps[0] if stamps else None, frames)
-
         try:
-            return table.remember("detections", read, _bytes_of)
+            return table.remember("detections", lambda: _read_stamped(table, plan), _bytes_of)
         except UnknownShapeError:
             return None
 
@@ -455,7 +527,7 @@ class DetectionColumns:
         return plan is None or any(not isinstance(source, Json) for source in plan.sources)
 
     def may_match(self, parts: PartZones) -> bool | Mask:
-        """Returns in which parts a message may hold a detection, by their zones; or of all."""
+        """Returns which parts may have a detection, by their zones; True if all may."""
         texts = self._only_texts(parts)
         if texts is None:
             return True
@@ -466,12 +538,12 @@ class DetectionColumns:
         return possible
 
     def may_have_any(self, table: Table) -> bool:
-        """Returns whether a message of a table may hold a detection."""
+        """Returns whether a message of a table may have a detection."""
         texts = self._only_texts(table)
         return texts is None or may_be_json(Values(table), texts)
 
     def _only_texts(self, table_or_parts: Table | PartZones) -> list[Leaf] | None:
-        """Returns the texts of a type if it has detections in them alone; None if not so."""
+        """Returns the texts that may be JSON; None if a type has detections elsewhere, too."""
         plan = self._plans.of(table_or_parts)
         if plan is None:
             return None
@@ -479,27 +551,40 @@ class DetectionColumns:
         return texts if len(texts) == len(plan.sources) else None
 
 
+def _read_stamped(table: Table, plan: _Plan) -> StampedDetections:
+    """Returns the detections of a table; raises as `detections_in`."""
+    values = Values(table)
+    detections = joined_detections(
+        [part for source in plan.sources for part in detections_in(values, source, places=True)]
+    )
+    frames = _frames_at(values, ROWS, np.arange(values.rows), plan.frames)
+    header_frames = Texts(frames.codes[detections.rows], frames.words)
+    return StampedDetections(
+        detections._replace(frames=_texts_or(detections.frames, header_frames)),
+        None if plan.stamp is None else values.numbers(plan.stamp).values.astype(np.int64),
+        frames,
+    )
+
+
 def _bytes_of(stamped: StampedDetections) -> int:
     return 1000 + 60 * len(stamped.detections.rows) + 12 * len(stamped.frames)
 
 
 def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:
-    """Returns the detections of messages that were read one by one."""
-    numbered = [(row, found) for row, several in enumerate(by_message) for found in several]
-    nowhere, none = (math.nan,) * 3, math.nan
-    places = [nowhere if found.place is None else found.place for _, found in numbered]
-    scores = [none if found.score is None else found.score for _, found in numbered]
+    """Returns the detections of messages as columns; each message has a list of its own."""
+    detections = [detection for of_message in by_message for detection in of_message]
+    nowhere = (math.nan, math.nan, math.nan)
     return Detections(
-        np.array([row for row, _ in numbered], np.int64),
-        Texts.of([found.label for _, found in numbered]),
-        np.array(scores, np.float64),
-        np.array(places, np.float64).reshape(-1, 3),
-        Texts.of([found.frame_id for _, found in numbered]),
+        np.repeat(np.arange(len(by_message)), [*map(len, by_message)]),
+        Texts.of([detection.label for detection in detections]),
+        np.array([detection.score for detection in detections], np.float64),  # of None: NaN
+        np.array([detection.place or nowhere for detection in detections]).reshape(-1, 3),
+        Texts.of([detection.frame_id for detection in detections]),
     )
 
 
 def joined_detections(parts: Sequence[Detections]) -> Detections:
-    """Returns the detections of all parts, by their messages."""
+    """Returns the detections of several parts of the same messages as one."""
     if len(parts) == 1:
         return parts[0]
     if not parts:
@@ -515,10 +600,13 @@ def joined_detections(parts: Sequence[Detections]) -> Detections:
     )
 
 
-def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detections]:
-    """Yields the detections at one place of the messages of a table.
+def detections_in(values: Values, source: Source, *, places: bool) -> Iterator[Detections]:
+    """Yields the detections that one source has in the messages of a table.
 
-    Without `places` neither places nor frames are read.
+    Args:
+        values: of the table.
+        source: where to look.
+        places: whether places and frames are read, too.
 
     Raises:
         UnknownShapeError: the messages have to be read.
@@ -532,7 +620,7 @@ def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detect
 
 
 def _in_labels(values: Values, leaf: Leaf) -> Detections:
-    """Returns the labels of lists that are not empty, without a score."""
+    """Returns the texts of lists of labels, but for empty ones, without a score."""
     texts = values.texts(leaf)
     is_label = np.array([bool(word) for word in texts.words], np.bool_)
     positions = np.flatnonzero(is_label[texts.codes])
@@ -541,24 +629,23 @@ def _in_labels(values: Values, leaf: Leaf) -> Detections:
 
 
 def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
-    """Returns the objects that have a name, with their scores; raises as `found_in`."""
+    """Returns the objects that have a name, with their scores; raises as `detections_in`."""
     positions, named = source.read(values)
-    which = np.flatnonzero(named.is_named)
-    if which.size < values.size(source.level) and any(
-        detections.rows.size
-        for inner in source.otherwise
-        for detections in found_in(values, inner, places=False)
-    ):
-        raise UnknownShapeError("some objects are detections, and some have such in them")
-    positions = positions[which]
-    detections = _detections_at(values, source.scored.level, positions, named.at(which))
-    return _placed(values, source, positions, detections) if places else detections
+    is_named = np.flatnonzero(named.is_named)
+    if is_named.size < values.size(source.level):
+        for inner in source.inner:
+            for detections in detections_in(values, inner, places=False):
+                if detections.rows.size:
+                    raise UnknownShapeError("some objects are detections, others have some inside")
+    positions = positions[is_named]
+    detections = _detections_at(values, source.scored.level, positions, named.at(is_named))
+    return _with_places(values, source, positions, detections) if places else detections
 
 
 def _detections_at(
     values: Values, level: Level, positions: IntArray, named: NamedScores
 ) -> Detections:
-    """Returns the detections at some positions of a level, by their rows, without a place."""
+    """Returns the objects at some positions of a level as detections without a place."""
     return Detections(
         _owners_at(values, level, positions, ROWS),
         named.name,
@@ -573,7 +660,7 @@ def _no_frames(count: int) -> Texts:
 
 
 def _in_json(values: Values, source: Json) -> Iterator[Detections]:
-    """Yields the detections in texts that are JSON, each of which is parsed once."""
+    """Yields the detections in texts that are JSON; each distinct text is parsed once."""
     if not may_be_json(values, [source.leaf]):
         return
     texts = values.texts(source.leaf)
@@ -587,15 +674,15 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     counts, nth = entries_of_codes(parsed.rows, texts.codes.astype(np.int64))
     positions = np.repeat(np.arange(len(texts)), counts)
     rows = _owners_at(values, source.leaf.level, positions, ROWS)
-    found = parsed.taken(nth)._replace(rows=rows)
+    detections = parsed.select(nth)
     frames = _frames_at(values, source.leaf.level, positions, source.frames)
-    yield found._replace(frames=or_else(found.frames, frames))
+    yield detections._replace(rows=rows, frames=_texts_or(detections.frames, frames))
 
 
-def _placed(
+def _with_places(
     values: Values, source: Labels, positions: IntArray, detections: Detections
 ) -> Detections:
-    """Returns detections at the first valid point of each; NaN where it has none."""
+    """Returns detections with their place: the first point of each that is valid."""
     if source.points is None:
         raise UnknownShapeError("points are of another shape in each message")
     level, places = source.scored.level, detections.places
@@ -610,22 +697,22 @@ def _placed(
         places = np.where(is_given[:, None], place, places)
         own = _frames_at(values, level, positions, point.frames)
         codes = np.where(is_given, own.codes + 1, 0).astype(np.uint32)
-        frames = or_else(Texts(codes, ("", *own.words)), frames)
+        frames = _texts_or(Texts(codes, ("", *own.words)), frames)
     return detections._replace(places=places, frames=frames)
 
 
 def _frames_at(values: Values, level: Level, positions: IntArray, leaves: Sequence[Leaf]) -> Texts:
-    """Returns the frame of each detection: what the innermost object around it names."""
+    """Returns the frame at some positions of a level: the one that the innermost object names."""
     frames = _no_frames(positions.size)
     for leaf in leaves:
         texts = values.texts(leaf)
         codes = texts.codes[_owners_at(values, level, positions, leaf.level)]
-        frames = or_else(Texts(codes, texts.words), frames)
+        frames = _texts_or(Texts(codes, texts.words), frames)
     return frames
 
 
 def _owners_at(values: Values, level: Level, positions: IntArray, outer: Level) -> IntArray:
-    """Returns, of some elements of a level, the elements or rows around them."""
+    """Returns the elements or rows of an outer level that some elements of a level lie in."""
     while level != outer and level.parent is not None:
         positions, level = values.elements(level).owners[positions], level.parent
     return positions

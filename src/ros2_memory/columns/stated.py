@@ -1,8 +1,8 @@
-"""What the messages of a table state, from its columns alone.
+"""Reads what messages state from the columns of a table, without the messages.
 
-The same as `state_of(extractor.exact(message))` for each message. Where the columns do not settle
-it (a shape that differs from message to message, a number that was rounded across a limit, the id
-of a goal, which has no columns) the messages are named that have to be read.
+It returns what `state_of(extractor.exact(message))` returns for each message. Columns do not settle
+it where the shape of the value differs from message to message, where a number was rounded across a
+limit, and for the ids of goals, which have no columns. Those messages have to be read.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from ros2_memory.analysis.facts import (
     joined_facts,
     state_of,
 )
-from ros2_memory.columns.detections import Source, found_in, sources_in
+from ros2_memory.columns.detections import Source, detections_in, sources_in
 from ros2_memory.columns.shown import UNKNOWN, ByType, Node, Shape, at_field, leaves_of
 from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, placed
 from ros2_memory.columns.walk import entries_of_codes
@@ -55,23 +55,27 @@ _NO_ROWS: Final = np.empty(0, np.int64)
 
 
 class FromColumns(NamedTuple):
-    """What the rows of a table state, without their log times, and but for some messages.
+    """What the messages of a table state.
 
     Attributes:
-        stated: what is known.
-        unsure: the rows of the messages that have to be read besides, ascending.
+        stated: what the columns say.
+        unsure: the rows, ascending, of which only the messages say the rest.
     """
 
     stated: Stated
     unsure: IntArray
 
     def to_read(self, index: IntArray | None) -> IntArray:
-        """Returns the positions, among some rows (None: all), of the messages to be read."""
+        """Returns the places in `index` of the messages that have to be read.
+
+        Args:
+            index: rows of the table; None for all of them.
+        """
         return self.unsure if index is None else np.flatnonzero(np.isin(index, self.unsure))
 
 
 class StatedColumns:
-    """Reads what messages state from tables; remembers what it looks for in each type.
+    """Reads what messages state from tables; remembers which columns of a type say it.
 
     Args:
         extractor: has the schema map.
@@ -81,7 +85,7 @@ class StatedColumns:
         self._readers = ByType(extractor, _reader_of)
 
     def of(self, table: Table) -> FromColumns | None:
-        """Returns what the messages of a table state; None where they all have to be read."""
+        """Returns what the messages of a table state; None if all of them have to be read."""
         read = self._readers.of(table)
         try:
             return None if read is None else read(Values(table))
@@ -90,7 +94,7 @@ class StatedColumns:
 
 
 class _Entry(NamedTuple):
-    """Where log entries, or the entries of diagnostics, have what they state."""
+    """Where a log entry, or an entry of diagnostics, has its level, name and text."""
 
     level: Leaf
     name: Leaf
@@ -98,16 +102,16 @@ class _Entry(NamedTuple):
 
 
 def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
-    """Returns what reads from tables what messages of a type state.
+    """Returns the function that reads what messages of a type state.
 
     Raises:
-        UnknownShapeError: that depends on the message.
+        UnknownShapeError: the columns that say it depend on the message.
     """
     value, type_name = shape.value, shape.type
     if type_name == GOALS:
-        return _goals
+        return _read_goals
     if has_errors(type_name):
-        return partial(_entries, _entry_leaves(value, type_name), type_name)
+        return partial(_read_entries, _entry_leaves(value, type_name), type_name)
     numbers: Callable[[Values], tuple[Facts, IntArray]] | None = None
     commands = [*_command_leaves(value)] if type_name in VELOCITIES else []
     charges = _leaves_at(value, "percentage") if type_name == BATTERY else []
@@ -119,14 +123,14 @@ def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
     if len(flags) > MOST[FLAG]:
         raise UnknownShapeError("more booleans than are tracked")
     sources = sources_in(value) if has_events(type_name) else []
-    return partial(_states, sources, flags, numbers)
+    return partial(_read_states, sources, flags, numbers)
 
 
-# What a type has
+# Where a type has what it states
 
 
 def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
-    """Yields the booleans of objects; none of lists."""
+    """Yields the booleans in an object, with their paths; none in lists."""
     if node is UNKNOWN or (isinstance(node, Leaf) and node.limits):
         raise UnknownShapeError("it depends on the message")
     if isinstance(node, Leaf) and node.kind is Kind.BOOLEAN:
@@ -137,7 +141,7 @@ def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
 
 
 def _entry_leaves(value: Node, type_name: str) -> _Entry:
-    """Returns level, name and text of a log entry, or of the elements of a list of diagnostics."""
+    """Returns where the entries are: the message itself, or the elements of diagnostics."""
     paths = ["level", "name", "msg"]
     if type_name == DIAGNOSTICS:
         paths = ["status.level", "status.name", "status.message"]
@@ -152,7 +156,7 @@ def _leaves_at(value: Node, path: str) -> list[Leaf]:
 
 
 def _command_leaves(value: Node) -> Iterator[Leaf]:
-    """Yields the floats of a command."""
+    """Yields the floats of a commanded velocity."""
     for leaf in leaves_of(value):
         if leaf.limits or leaf.level != ROWS:
             raise UnknownShapeError("a command has a list")
@@ -160,44 +164,38 @@ def _command_leaves(value: Node) -> Iterator[Leaf]:
             yield leaf
 
 
-# What a table holds
+# What a table states
 
 
-def _goals(values: Values) -> FromColumns:
-    """Returns that all messages are to be read: the ids of goals are no columns."""
+def _read_goals(values: Values) -> FromColumns:
+    # All messages have to be read: the ids of goals have no columns.
     return FromColumns(Stated(values.table.log_times), np.arange(values.rows))
 
 
-def _entries(entry: _Entry, type_name: str, values: Values) -> FromColumns:
-    return FromColumns(
-        Stated(values.table.log_times, _entry_facts(values, entry, type_name)), _NO_ROWS
-    )
+def _read_entries(entry: _Entry, type_name: str, values: Values) -> FromColumns:
+    facts = _entry_facts(values, entry, type_name)
+    return FromColumns(Stated(values.table.log_times, facts), _NO_ROWS)
 
 
-def _states(
+def _read_states(
     sources: Sequence[Source],
     flags: Sequence[tuple[str, Leaf]],
     numbers: Callable[[Values], tuple[Facts, IntArray]] | None,
     values: Values,
 ) -> FromColumns:
-    """Returns what messages state by labels with their scores, booleans and numbers."""
-    found = [part for source in sources for part in found_in(values, source, places=False)]
-    labels = joined_facts(
-        [
-            Facts(
-                part.rows,
-                part.labels.codes.astype(np.int64),
-                part.scores,
-                [Word(LABEL, label) for label in part.labels.words],
-            )
-            for part in found
-        ]
-    )
-    if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
+    """Returns what messages state by their labels, booleans and numbers."""
+    labels: list[Facts] = []
+    for source in sources:
+        for detections in detections_in(values, source, places=False):
+            codes = detections.labels.codes.astype(np.int64)
+            words = [Word(LABEL, label) for label in detections.labels.words]
+            labels.append(Facts(detections.rows, codes, detections.scores, words))
+    label_facts = joined_facts(labels)
+    if label_facts.rows.size and np.bincount(label_facts.rows).max() > MOST[LABEL]:
         raise UnknownShapeError("more labels than are tracked")
-    of_numbers, unsure = numbers(values) if numbers else (NOTHING, _NO_ROWS)
-    of_flags = [_flag_facts(values, path, leaf) for path, leaf in flags]
-    facts = joined_facts([labels, *of_flags, of_numbers])
+    flag_facts = [_flag_facts(values, path, leaf) for path, leaf in flags]
+    number_facts, unsure = numbers(values) if numbers else (NOTHING, _NO_ROWS)
+    facts = joined_facts([label_facts, *flag_facts, number_facts])
     return FromColumns(Stated(values.table.log_times, facts), unsure)
 
 
@@ -211,7 +209,7 @@ def _flag_facts(values: Values, path: str, leaf: Leaf) -> Facts:
 
 
 def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
-    """Returns what log entries or diagnostics state: each that is alike is looked at once."""
+    """Returns what log entries or diagnostics state; each distinct entry is read once."""
     zone = values.zone(entry.level)
     if zone is not None and (
         zone.greatest is None or not _facts_of_entry(int(zone.greatest), type_name)
@@ -248,7 +246,8 @@ def _facts_of_entry(level: int, type_name: str, name: str = "", text: str = "") 
 def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, IntArray]:
     """Returns how low a battery is, and the rows in which rounding may have changed that."""
     charges, error = values.floats(leaf)
-    low, levels, high = (charge_levels(charges + off) for off in (-error, 0, error))
+    levels = charge_levels(charges)
+    low, high = charge_levels(charges - error), charge_levels(charges + error)
     settled = np.flatnonzero((levels >= 0) & (low == high))
     charge = _facts_of(CHARGE, settled, levels[settled])
     return charge, np.flatnonzero(low != high)
@@ -256,18 +255,19 @@ def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, IntArray]:
 
 def _command_facts(leaves: Sequence[Leaf], values: Values) -> tuple[Facts, IntArray]:
     """Returns whether a velocity is commanded, and the rows in which rounding may hide that."""
-    surely, perhaps = np.ones(values.rows, np.bool_), np.ones(values.rows, np.bool_)
+    surely_still, maybe_still = np.ones(values.rows, np.bool_), np.ones(values.rows, np.bool_)
     for leaf in leaves:
         numbers, error = values.floats(leaf)
-        surely &= is_still(numbers, error)
-        perhaps &= is_still(numbers, -error)
-    settled = np.flatnonzero(surely == perhaps)
-    return _facts_of(COMMAND, settled, ~surely[settled]), np.flatnonzero(surely != perhaps)
+        surely_still &= is_still(numbers, error)
+        maybe_still &= is_still(numbers, -error)
+    settled = np.flatnonzero(surely_still == maybe_still)
+    facts = _facts_of(COMMAND, settled, ~surely_still[settled])
+    return facts, np.flatnonzero(surely_still != maybe_still)
 
 
 def _facts_of(
     kind: str, rows: IntArray, numbers: IntArray | Mask | Floats, name: str = ""
 ) -> Facts:
-    """Returns a number of each row as a fact, under one word."""
-    words = [Word(kind, name) if name else Word(kind)]
-    return Facts(rows, np.zeros(rows.size, np.int64), numbers.astype(np.float64), words)
+    """Returns one fact of a kind for each row."""
+    codes = np.zeros(rows.size, np.int64)
+    return Facts(rows, codes, numbers.astype(np.float64), [Word(kind, name)])
