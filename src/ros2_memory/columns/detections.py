@@ -341,7 +341,7 @@ def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> 
         score = named.score[positions]
         surely, perhaps = ~(score < least + named.error), ~(score < least - named.error)
         # Where it is not sure that the detection is one, neither is what stays of it.
-        is_detection = limit.kept(values, owners).surely
+        is_detection = limit.truth(values, owners).surely
         return TruthValues(surely & is_detection, perhaps | ~is_detection)
 
     limit = Limit(labels.level, find_objects)

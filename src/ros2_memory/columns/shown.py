@@ -1,14 +1,14 @@
-"""The extracted value of a type's messages as a tree over its columns, without any message.
+"""The extracted value of a type's messages as a tree over its columns.
 
-`SchemaExtractor.exact` turns one decoded message into a value; here the same is said of all
-messages of a type at once, from the definition and the schema map alone: which leaves the value
-has, under which names, and the column that each is read or computed from. What is stored is not
-looked at, so one tree serves all tables of a type.
+`SchemaExtractor.exact` turns one decoded message into a value. A `Shape` describes the values of
+all messages of a type, from the definition and the schema map alone: which leaves a value has,
+under which names, and which column each is read or computed from. One tree serves all tables of a
+type.
 
-A tree is built as the value is: of dicts, and of lists (`Listing` where its elements are those of a
-level, a plain list for a short array of fixed length), so that the same functions go through both.
-In place of a number, boolean or text it has a `Leaf`, whose limits say for which rows it stands
-there; and `NOTHING` for null. `numbers` and `words_of` say what a field is in all rows of a table.
+A tree is built of dicts and lists, as the value is, so that the same functions go through both. A
+`Listing` stands for a list with any number of elements, a plain list for a short array of fixed
+length. In place of a number, boolean or text a tree has a `Leaf`, whose limits say which rows have
+it, and `NOTHING` in place of null. `numbers` and `words_of` read a field in all rows of a table.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 from enum import Enum, auto
 from functools import cached_property, lru_cache
-from itertools import chain
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -35,8 +34,8 @@ from ros2_memory.columns.values import (
     Values,
     at_name,
     at_place,
-    placed,
     where_longer,
+    within_limits,
 )
 from ros2_memory.core.text import dotted
 from ros2_memory.extract import POINTS, SchemaExtractor
@@ -72,7 +71,7 @@ _TURNS: Final = (Conversion.ROLL, Conversion.PITCH, Conversion.YAW)
 
 
 class Constant(Enum):
-    """What is no leaf, and no list or object of such."""
+    """A node that no column is read for."""
 
     NOTHING = auto()  # null
     UNKNOWN = auto()  # depends on the message: the messages decide
@@ -101,7 +100,15 @@ class Listing(list["Node"]):
 
 
 class Place(NamedTuple):
-    """A part of the message: a field, or the element of a list; `depth` of the value around it."""
+    """Where a part of the message lies: a field, or the elements of a list.
+
+    Attributes:
+        level: the rows or elements that have it.
+        path: its dot-path in the level.
+        kind: its type, or that of its elements.
+        length: of an array or sequence, as of a `Field`; None if it is neither.
+        depth: how many objects and lists are around it.
+    """
 
     level: Level
     path: str
@@ -124,7 +131,7 @@ class Place(NamedTuple):
 
 
 class Shape:
-    """The value that `extractor` shows of messages of a type.
+    """The value that an extractor returns for messages of a type.
 
     Args:
         definition: the type's fields.
@@ -158,41 +165,41 @@ class Shape:
         }
 
     def find(self, path: str) -> Node | None:
-        """Returns what `SchemaExtractor.exact_at` returns for a path; None where nothing is.
+        """Returns what `SchemaExtractor.exact_at` returns for a path; None if no field is there.
 
         Raises:
             UnknownShapeError: it depends on the message.
         """
-        name, *inner = path.split(".")
+        name, *inner = segments = path.split(".")
         node: Node | None = None
         if name in self._fields:
-            whole = self.at(self._fields[name])
-            node = None if whole is None else _descend(_converted(name, whole), inner)
+            mapped = self.at(self._fields[name])
+            node = None if mapped is None else _descend(_converted(name, mapped), inner)
         elif not self._fields:
-            node = _descend(self._whole, [name, *inner])
+            node = _descend(self._whole, segments)
         if node is not None:
             return node
-        node = self.at([name, *inner])
-        if node is None and names_beside(self.value, path):
-            return at_field(self.value, path)
-        if node is not None and any(leaf.conversion in _TURNS for leaf in leaves_of(node)):
+        node = self.at(segments)
+        if node is None:
+            return at_field(self.value, path) if names_beside(self.value, path) else None
+        if any(leaf.conversion in _TURNS for leaf in leaves_of(node)):
             raise UnknownShapeError(f"{path} is a rotation, or has one")  # shown as x, y, z, w
         return node
 
     @cached_property
     def _whole(self) -> Node:
-        return self._shown(Place(ROWS, "", self._definition, None, 0))
+        return self._node(Place(ROWS, "", self._definition, None, 0))
 
     def at(self, path: Sequence[str]) -> Node | None:
-        """Returns what is at a path in the message, as the value shows it; None where nothing is.
+        """Returns what the value has for a path in the message; None if no field is there.
 
         Raises:
             UnknownShapeError: it depends on the message.
         """
         return _descend(self._whole, path, parts=True)
 
-    def _shown(self, place: Place) -> Node:
-        """Returns a part of the message as the value shows it."""
+    def _node(self, place: Place) -> Node:
+        """Returns what the value has for a part of the message."""
         level, path, kind, length, depth = place
         self._parts += 1
         if self._parts > _MAX_PARTS:
@@ -202,10 +209,10 @@ class Shape:
         if depth >= MAX_DEPTH:
             return UNKNOWN
         if length is not None or isinstance(kind, str):
-            return self._array(place)
-        return self._message(place, kind)
+            return self._array_node(place)
+        return self._message_node(place, kind)
 
-    def _message(self, place: Place, definition: Definition) -> Node:
+    def _message_node(self, place: Place, definition: Definition) -> Node:
         level, path, *_ = place
         kind = kind_of_type(definition.type, [field.name for field in definition.fields])
         if kind is ValueKind.TIME:
@@ -220,24 +227,23 @@ class Shape:
             return _vector(level, sources)
         if kind is ValueKind.QUATERNION:
             return _angles_of(level, sources) if are_numbers else NOTHING
-        shown = {name: self._shown(field) for name, field in fields.items()}
+        nodes = {name: self._node(field) for name, field in fields.items()}
         summarized = SUMMARIZED.get(definition.type)
         if summarized in fields:
-            shown[summarized] = _summary(definition.type, shown, fields[summarized])
-        return shown
+            nodes[summarized] = _summary(definition.type, nodes, fields[summarized])
+        return nodes
 
-    def _array(self, place: Place) -> Node:
+    def _array_node(self, place: Place) -> Node:
         level, path, kind, length, _ = place
         element = place.element()
-        leaf = self._shown(element)
+        leaf = self._node(element)
         if not isinstance(kind, str) or not isinstance(leaf, Leaf) or leaf.kind is Kind.TEXT:
             return Listing(element.level, leaf)
         most, key = (self._limit, "bytes") if kind in _BYTES else (MAX_EXACT_NUMBERS, "numbers")
         summary = Summary({key: _size(place)})
         if length == SEQUENCE:
-            longer, shorter = (
-                where_longer(level, path, most, is_longer=is_longer) for is_longer in (True, False)
-            )
+            longer = where_longer(level, path, most, is_longer=True)
+            shorter = where_longer(level, path, most, is_longer=False)
             return Listing(element.level, narrowed(leaf, shorter), narrowed(summary, longer))
         size = length or 0
         if size > most:
@@ -248,14 +254,14 @@ class Shape:
 
 
 def _size(place: Place) -> Node:
-    """Returns the length of a sequence in a summary: in a list, as what is not searched there."""
+    """Returns the length of a sequence for its summary: in a list, where conditions do not look."""
     return [Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)]
 
 
 def _summary(type_name: str, fields: dict[str, Node], place: Place) -> Node:
-    """Returns what the conversions make of the data of an image, a map or a magnet.
+    """Returns what conversions make of the data of a compressed image, a map or a magnet.
 
-    `UNKNOWN` where it is a plain image or a cloud, or the definition is not the standard one.
+    Returns `UNKNOWN` for other types, and if the definition is not the standard one.
     """
     kind = type_name.rpartition("/")[2]
     if kind == "MagneticField":
@@ -274,19 +280,23 @@ def _summary(type_name: str, fields: dict[str, Node], place: Place) -> Node:
 
 
 def _converted(name: str, node: Node) -> Node:
-    """Returns the value of a name of the schema map: an array as the point or turn it is."""
-    count = 3 if name in POINTS else 4 if name == "orientation" else 0
+    """Returns the value of a name of the schema map: an array becomes a point or a rotation."""
+    count = 0
+    if name in POINTS:
+        count = 3
+    elif name == "orientation":
+        count = 4
     if count and isinstance(node, Listing) and len(node) > 1:
         raise UnknownShapeError(f"{name} has another length in each message")
     if not isinstance(node, list) or isinstance(node, Listing) or len(node) != count:
         return node
     leaves = leaves_of(node)
+    level, sources = leaves[0].level, [leaf.sources[0] for leaf in leaves]
     is_numeric = all(leaf.is_number for leaf in leaves)
-    first, *others = (leaf.sources[0] for leaf in leaves)
     if name in POINTS:
-        return _vector(leaves[0].level, [first, *others]) if is_numeric else node
+        return _vector(level, sources) if is_numeric else node
     # PX4 writes w first.
-    return _angles_of(leaves[0].level, [*others, first]) if is_numeric else NOTHING
+    return _angles_of(level, [*sources[1:], sources[0]]) if is_numeric else NOTHING
 
 
 @lru_cache(maxsize=128)
@@ -295,18 +305,18 @@ def _shape(definition: Definition, type_name: str, extractor: SchemaExtractor) -
 
 
 def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
-    """Returns the shape of a table's type, or of some parts'; None where the messages decide."""
+    """Returns the shape of the type of a table or of parts; None if their messages decide."""
     if table_or_parts.definition is None or "" in table_or_parts.left_out:
         return None
     return _shape(table_or_parts.definition, table_or_parts.channel.type, extractor)
 
 
 class ByType(Generic[T]):
-    """What is made of the shape of each type, once.
+    """Remembers what is made of the shape of each type.
 
     Args:
         extractor: has the schema map.
-        make: returns it; raises `UnknownShapeError` where it depends on the message.
+        make: makes it; raises `UnknownShapeError` if it depends on the message.
     """
 
     def __init__(self, extractor: SchemaExtractor, make: Callable[[Shape], T]) -> None:
@@ -315,7 +325,7 @@ class ByType(Generic[T]):
         self._known: dict[Shape, T | None] = {}
 
     def of(self, table_or_parts: Table | PartZones) -> T | None:
-        """Returns that of a table's type, or of some parts'; None where the messages decide."""
+        """Returns what is made for the type of a table or of parts; None if messages decide."""
         shape = shape_of(table_or_parts, self._extractor)
         if shape is None:
             return None
@@ -328,39 +338,45 @@ class ByType(Generic[T]):
 
 
 def _descend(node: Node, path: Sequence[str], *, parts: bool = False) -> Node | None:
-    """Returns what is at a path of the schema map, as `messages.conversions.descend` finds it.
+    """Returns what is at a path, as `messages.conversions.descend` does; None if no field is there.
 
-    With `parts` also the numbers of a rotation. None where no field is.
+    Args:
+        node: where to begin.
+        path: of the schema map.
+        parts: whether the path may lead to x, y, z or w of a rotation, which is shown as angles.
 
     Raises:
         UnknownShapeError: it depends on the message.
     """
     for nth, segment in enumerate(path):
-        if isinstance(node, Listing) and len(node) > 1:  # a long array is looked at here
-            node = Listing(
-                node.level, _changed(node.element, lambda leaf: leaf._replace(limits=()))
-            )
+        if isinstance(node, Listing) and len(node) > 1:
+            # A path leads into a long array, too, though the value only has a summary of it.
+            leaf = _changed(node.element, lambda leaf: leaf._replace(limits=()))
+            node = Listing(node.level, leaf)
         if node is NOTHING:
             return node
         if isinstance(node, list) and segment.isascii() and segment.isdecimal():
-            node = next(iter(picked(node, int(segment[:10]))), NOTHING)
-        elif isinstance(node, Listing):
+            node = next(iter(element_at(node, int(segment[:10]))), NOTHING)
+            continue
+        if isinstance(node, Listing):
             inner = _descend(node.element, path[nth:], parts=parts)
             return None if inner is None else Listing(node.level, inner)
-        elif isinstance(node, dict) and segment in node:
-            node = node[segment]
-        elif (
-            node is UNKNOWN
-            or isinstance(node, Summary)
-            or (isinstance(node, Leaf) and node.conversion is Conversion.SECONDS)
-        ):
-            raise UnknownShapeError(f"{segment} is in a part that is not shown as it is")
-        else:
-            xyzw = xyzw_of(node) if parts and isinstance(node, dict) else []
-            if not xyzw or segment not in {*"xyzw"}:
-                return None
-            node = xyzw["xyzw".index(segment)]
+        field = _field(node, segment, parts=parts)
+        if field is None:
+            return None
+        node = field
     return node
+
+
+def _field(node: Node, name: str, *, parts: bool) -> Node | None:
+    """Returns a field of a node; see `_descend`."""
+    if isinstance(node, dict) and name in node:
+        return node[name]
+    is_time = isinstance(node, Leaf) and node.conversion is Conversion.SECONDS
+    if node is UNKNOWN or isinstance(node, Summary) or is_time:
+        raise UnknownShapeError(f"{name} is in a part that is not shown as it is")
+    xyzw = xyzw_of(node) if parts and isinstance(node, dict) else []
+    return dict(zip("xyzw", xyzw, strict=False)).get(name)
 
 
 def xyzw_of(angles: dict[str, Node]) -> list[Leaf]:
@@ -372,7 +388,7 @@ def xyzw_of(angles: dict[str, Node]) -> list[Leaf]:
 
 
 def at_field(root: Node, dot_path: str) -> list[Node]:
-    """Returns what is at a dot-path in the value, as `analysis.conditions.at_field` finds it.
+    """Returns what is at a dot-path in the value, as `analysis.conditions.at_field` does.
 
     Raises:
         UnknownShapeError: it depends on the message.
@@ -382,22 +398,26 @@ def at_field(root: Node, dot_path: str) -> list[Node]:
     array = root.get(head) if isinstance(root, dict) else None
     leaf = names.element if isinstance(names, Listing) else None
     if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT and isinstance(array, list):
-        if leaf.level.parent != ROWS or leaf.limits:
-            raise UnknownShapeError(f"{name} is looked for in several lists of names")
-        if not isinstance(array, Listing):
-            return [
-                narrowed(element, at_name(ROWS, leaf, name, nth))
-                for nth, element in enumerate(array)
-            ]
-        sizes = (part[name] for part in array if isinstance(part, Summary) and name in part)
-        return [narrowed(array.element, at_name(array.level, leaf, name)), *sizes]
-    found = conditions.along(root, dot_path.split("."), picked)
-    if any(node is UNKNOWN for node in chain.from_iterable(found)):
-        raise UnknownShapeError(f"{dot_path} leads to what is not known")
-    return found[-1]
+        return _named_elements(array, leaf, name)
+    by_segment = conditions.along(root, dot_path.split("."), element_at)
+    if any(UNKNOWN in nodes for nodes in by_segment):
+        raise UnknownShapeError(f"{dot_path} leads to a part that is not known")
+    return by_segment[-1]
 
 
-def picked(nodes: list[Node], index: int) -> list[Node]:
+def _named_elements(array: list[Node], names: Leaf, name: str) -> list[Node]:
+    """Returns the elements of an array that may have a name in the list of names beside it."""
+    if names.level.parent != ROWS or names.limits:
+        raise UnknownShapeError(f"{name} is looked for in several lists of names")
+    if not isinstance(array, Listing):
+        return [
+            narrowed(element, at_name(ROWS, names, name, nth)) for nth, element in enumerate(array)
+        ]
+    sizes = [part[name] for part in array if isinstance(part, Summary) and name in part]
+    return [narrowed(array.element, at_name(array.level, names, name)), *sizes]
+
+
+def element_at(nodes: list[Node], index: int) -> list[Node]:
     """Returns the element of a list at a place, if there may be one."""
     if not isinstance(nodes, Listing):
         return conditions.element_at(nodes, index)
@@ -405,24 +425,24 @@ def picked(nodes: list[Node], index: int) -> list[Node]:
 
 
 def leaves_of(node: Node, *, in_objects: bool = True) -> list[Leaf]:
-    """Returns the leaves of a node, those of `analysis.conditions.leaves`, in their order.
+    """Returns the leaves of a node, as `analysis.conditions.leaves`, in their order.
 
     Raises:
-        UnknownShapeError: it depends on the message.
+        UnknownShapeError: they depend on the message.
     """
-    found = [*conditions.leaves(node, in_objects=in_objects)]
-    if UNKNOWN in found:
+    nodes = [*conditions.leaves(node, in_objects=in_objects)]
+    if UNKNOWN in nodes:
         raise UnknownShapeError("it depends on the message")
-    return [leaf for leaf in found[::-1] if isinstance(leaf, Leaf)]
+    return [leaf for leaf in reversed(nodes) if isinstance(leaf, Leaf)]
 
 
 def narrowed(node: Node, limit: Limit) -> Node:
-    """Returns a node that only some rows or elements have."""
+    """Returns a node with a limit to the rows or elements that have it."""
     return _changed(node, lambda leaf: leaf._replace(limits=(*leaf.limits, limit)))
 
 
 def _changed(node: Node, change: Callable[[Leaf], Leaf]) -> Node:
-    """Returns a node with its leaves changed."""
+    """Returns a node in which each leaf is replaced by what `change` returns for it."""
     if isinstance(node, Leaf):
         return change(node)
     if isinstance(node, Listing):
@@ -458,12 +478,12 @@ class FieldNumbers(NamedTuple):
 
     Attributes:
         rows: the row of each number, ascending; a row may have none, or several.
-        numbers: finite; int64 where all are integers that it holds, else float64.
-        error: the most by which one of them is off; 0 where they are exact. Angles that are
-            computed of exact quaternions may differ by their last digits.
-        errors: the most by which each of them is off, where that differs.
-        exactly: returns the exact numbers at some positions, ascending; None where only the bag
-            has them, and of several numbers of a message.
+        numbers: finite; int64 if all are integers that fit, else float64.
+        error: the most by which one of them is off; 0 if they are exact. Angles of exact
+            quaternions may differ in their last digits.
+        errors: the most by which each of them is off; None if that is `error` for all.
+        exactly: returns the exact numbers at some ascending positions; None if only the bag has
+            them, and for a field with several numbers in a message.
     """
 
     rows: IntArray
@@ -474,17 +494,15 @@ class FieldNumbers(NamedTuple):
 
 
 def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumbers | None:
-    """Returns the numbers of a field: those in what `SchemaExtractor.exact_at` returns.
+    """Returns the numbers of a field; None if the table lacks some: then the bag has to be read.
 
-    Booleans are none, nor are the sizes in the summary of an array.
+    They are the numbers in what `SchemaExtractor.exact_at` returns, without the sizes in the
+    summary of an array. Booleans are no numbers.
 
     Args:
         table: the messages.
         field: dot-path in the extracted value, or else in the message.
         extractor: has the schema map.
-
-    Returns:
-        None where the columns do not hold them all: then the bag has to be read.
     """
     try:
         parts = [_numbers_of(Values(table), leaf) for leaf in _leaves(table, field, extractor)]
@@ -496,7 +514,7 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
 
 
 def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | None:
-    """Returns the path of the column that has all numbers of a field as they are; None: none."""
+    """Returns the path of the column that has all numbers of a field; None if there is none."""
     try:
         [leaf] = _leaves(table, field, extractor)
     except (UnknownShapeError, ValueError):  # none, or several
@@ -506,10 +524,10 @@ def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | Non
 
 
 def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Texts | None:
-    """Returns a field of each row as JSON text, as `history.held_values.HeldValues` has it.
+    """Returns a field of each row as JSON text; None if the messages have to be read for it.
 
-    None where the columns do not hold it as it is, or it is more than a text, a boolean or a whole
-    number: then the messages have to be read.
+    They have to be read if the field is more than one text, boolean or whole number, or if the
+    table has no column with its exact values.
     """
     try:
         node = _node(table, field, extractor)
@@ -536,18 +554,22 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     rows = np.concatenate([part.rows for part in parts])
     joined = np.concatenate([part.numbers for part in parts])
     order = np.argsort(rows, kind="stable")
-    errors = np.concatenate(
-        [
-            np.full(part.rows.size, part.error) if part.errors is None else part.errors
-            for part in parts
-        ]
-    )
     error = max(part.error for part in parts)
-    return FieldNumbers(rows[order], joined[order], error, errors[order] if error else None)
+    if not error:
+        return FieldNumbers(rows[order], joined[order], error)
+    errors = [
+        np.full(part.rows.size, part.error) if part.errors is None else part.errors
+        for part in parts
+    ]
+    return FieldNumbers(rows[order], joined[order], error, np.concatenate(errors)[order])
 
 
 def _node(table: Table, field: str | None, extractor: SchemaExtractor) -> Node | None:
-    """Returns a field of the value of a table's messages, or all of it; None where nothing is."""
+    """Returns a field of the value, or the whole value; None if there is no such field.
+
+    Raises:
+        UnknownShapeError: it depends on the message.
+    """
     shape = shape_of(table, extractor)
     if shape is None:
         raise UnknownShapeError("there are no columns")
@@ -555,7 +577,7 @@ def _node(table: Table, field: str | None, extractor: SchemaExtractor) -> Node |
 
 
 def _leaves(table: Table, field: str, extractor: SchemaExtractor) -> list[Leaf]:
-    """Returns the numbers of a field; not those of a summary."""
+    """Returns the numbers of a field, without those of a summary."""
     node = _node(table, field, extractor)
     return [] if node is None else [leaf for leaf in leaves_of(node) if leaf.is_number]
 
@@ -563,23 +585,22 @@ def _leaves(table: Table, field: str, extractor: SchemaExtractor) -> list[Leaf]:
 def _numbers_of(values: Values, leaf: Leaf) -> FieldNumbers:
     column, error, exactly = values.numbers(leaf)
     everything = np.arange(len(column))
-    kept, rows = placed(values, leaf.level, everything, leaf.limits, surely=True)
-    possible, _ = placed(values, leaf.level, everything, leaf.limits, surely=False)
-    if len(kept) < len(possible) or not values.holds_all(leaf):
-        raise UnknownShapeError("some numbers are not held, or may not stand there")
-    if len(kept) < len(column):
-        column = column[kept]
+    positions, rows = within_limits(values, leaf.level, everything, leaf.limits, surely=True)
+    possible, _ = within_limits(values, leaf.level, everything, leaf.limits, surely=False)
+    if len(positions) < len(possible) or not values.holds_all(leaf):
+        raise UnknownShapeError("some numbers have no column, or may not be in the value")
+    if len(positions) < len(column):
+        column = column[positions]
     is_finite = np.isfinite(column)
     if not is_finite.all():
-        column, rows, kept = column[is_finite], rows[is_finite], kept[is_finite]
+        column, rows, positions = column[is_finite], rows[is_finite], positions[is_finite]
     if column.dtype.kind != "u" or not (column > _LARGEST_INT64).any():
         is_whole = column.dtype.kind in "iu"
         column = column.astype(np.int64 if is_whole else np.float64, copy=False)
-
     return FieldNumbers(
         rows,
         column,
         float(np.max(error, initial=0.0)),
-        error[kept] if isinstance(error, np.ndarray) else None,
-        None if exactly is None else lambda positions: exactly(kept[positions]),
+        error[positions] if isinstance(error, np.ndarray) else None,
+        None if exactly is None else lambda at: exactly(positions[at]),
     )

@@ -37,7 +37,7 @@ from ros2_memory.analysis.facts import (
 )
 from ros2_memory.columns.detections import Source, detections_in, sources_in
 from ros2_memory.columns.shown import UNKNOWN, ByType, Node, Shape, at_field, leaves_of
-from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, placed
+from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, within_limits
 from ros2_memory.columns.walk import entries_of_codes
 from ros2_memory.core.text import dotted
 
@@ -219,7 +219,7 @@ def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
     name, text = values.texts(entry.name), values.texts(entry.text)
     telling = [level for level in np.unique(levels).tolist() if _facts_of_entry(level, type_name)]
     positions = np.flatnonzero(np.isin(levels, telling))
-    _, rows = placed(values, entry.level.level, positions, (), surely=True)
+    _, rows = within_limits(values, entry.level.level, positions, (), surely=True)
     if rows.size and np.bincount(rows).max() > MOST[STATUS]:
         raise UnknownShapeError("more levels than are tracked")
     keys = np.stack([levels[positions], name.codes[positions], text.codes[positions]])

@@ -1,10 +1,10 @@
-"""Which rows of a table meet a condition, from its columns alone.
+"""Finds the rows of a table that meet a condition, from its columns alone.
 
-The same as `Condition.matches(extractor.exact(message))` for each message. Where the columns do not
-settle it (an array that is not held, a float that was rounded, a shape that differs from message to
-message) a row is unsure, never wrong: then the bag decides.
+It returns what `Condition.matches(extractor.exact(message))` returns for each message. A row is
+unsure, never wrong, where the columns do not settle it: an array has no column, a float was
+rounded, or the shape of the value differs from message to message. Then the bag decides.
 
-What is known without unpacking a column (its zone) is looked at first.
+Zones are looked at first, since they rule out tests without a column being unpacked.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from ros2_memory.columns.values import (
     UnknownShapeError,
     Values,
     nowhere,
-    placed,
     unknown,
+    within_limits,
     zone_of,
 )
 from ros2_memory.core.text import looks_like_json
@@ -80,47 +80,49 @@ class ColumnCondition:
         self._plans = ByType(
             extractor, lambda shape: _Plan.of(condition.of_type(shape.type, extractor), shape)
         )
-        self._possible: dict[int, Sequence[_Test]] = {}
+        self._tests_of_part: dict[int, Sequence[_Test]] = {}
 
     def truth(self, table: Table) -> TruthValues:
         """Returns which rows of a table meet the condition."""
         plan, values = self._plans.of(table), Values(table)
         if plan is None:
             return unknown(values.rows)
-        known = self._possible.get(table.number) if isinstance(table, StoredTable) else None
-        whole = _possible(plan.whole, values) if known is None else known
-        if plan.counted is None or not whole:
-            return _any_of(whole, values)
-        texts = tuple(
-            t.leaf for t in plan.counted if isinstance(t, _LeafTest) and t.leaf.json_depth
-        )
+        tests: Sequence[_Test] | None = None
+        if isinstance(table, StoredTable):
+            tests = self._tests_of_part.get(table.number)
+        if tests is None:
+            tests = _possible(plan.whole, values)
+        if plan.counted is None or not tests:
+            return _any_of(tests, values)
         counted = _any_of(_possible(plan.counted, values), values)
-        if not may_be_json(values, texts):
+        leaves = [test.leaf for test in plan.counted if isinstance(test, _LeafTest)]
+        if not may_be_json(values, [leaf for leaf in leaves if leaf.json_depth]):
             return counted
         # A text in which detections were left out is another text: both have to pass.
-        met = _any_of(whole, values)
-        return TruthValues(counted.surely & met.surely, counted.perhaps & met.perhaps)
+        whole = _any_of(tests, values)
+        return TruthValues(counted.surely & whole.surely, counted.perhaps & whole.perhaps)
 
     def unstated(self, table: Table) -> Mask:
         """Returns which rows say nothing of the field; see `Condition.is_unstated`.
 
-        None of them where the columns do not show it.
+        Where the columns do not show it, a row counts as one that does.
         """
         plan, values = self._plans.of(table), Values(table)
         if plan is not None and plan.names is not None:
             with suppress(UnknownShapeError):
-                names, elements = values.texts(plan.names), values.elements(plan.names.level)
-                is_named = np.array([word == plan.element for word in names.words], np.bool_)
-                counts = np.bincount(elements.owners, minlength=values.rows)
-                own = np.bincount(elements.owners[is_named[names.codes]], minlength=values.rows)
-                is_other: Mask = (counts > 0) & (own == 0)
-                return is_other
+                names, owners = values.texts(plan.names), values.elements(plan.names.level).owners
+                is_asked = np.array([word == plan.element for word in names.words], np.bool_)
+                counts = np.bincount(owners, minlength=values.rows)
+                asked = np.bincount(owners[is_asked[names.codes]], minlength=values.rows)
+                has_others_alone: Mask = (counts > 0) & (asked == 0)
+                return has_others_alone
         return np.zeros(values.rows, np.bool_)
 
     def may_match(self, parts: PartZones) -> bool | Mask:
         """Returns which parts may have a row that meets the condition, by their zones.
 
-        By which of its tests is remembered: to look at the zones of one part takes as long.
+        Remembers the tests that rows of each part may pass, since `truth` would look at the zones
+        of the part again, which takes as long as all this.
         """
         plan = self._plans.of(parts)
         if plan is None:
@@ -133,19 +135,21 @@ class ColumnCondition:
             possible.append(np.broadcast_to(may_pass, parts.numbers.size))
         if not possible:
             return False
-        tests = ([*compress(plan.whole, passes)] for passes in np.transpose(possible).tolist())
-        self._possible.update(zip(parts.numbers.tolist(), tests, strict=True))
-        some: Mask = np.any(possible, axis=0)
-        return some
+        by_part = np.transpose(possible).tolist()
+        for part, may_pass_tests in zip(parts.numbers.tolist(), by_part, strict=True):
+            self._tests_of_part[part] = [*compress(plan.whole, may_pass_tests)]
+        may_pass_any: Mask = np.any(possible, axis=0)
+        return may_pass_any
 
 
 class _Plan(NamedTuple):
-    """What is tested on a value, and on the value without detections of a low score.
+    """What a condition tests on values of one type.
 
     Attributes:
-        whole: on the value.
-        counted: on the value without these; None where all detections count.
-        names: of the elements where the field asks for an `element` by its name.
+        whole: tests of the value.
+        counted: tests of the value without detections of a low score; None if all count.
+        names: the names of the elements, if the field asks for an `element` by its name.
+        element: that name.
     """
 
     whole: Sequence[_Test]
@@ -155,7 +159,7 @@ class _Plan(NamedTuple):
 
     @classmethod
     def of(cls, condition: Condition, shape: Shape) -> _Plan:
-        """Returns what a condition tests on the value of a type.
+        """Returns what a condition tests on values of a type.
 
         Raises:
             UnknownShapeError: it depends on the message.
@@ -170,7 +174,7 @@ class _Plan(NamedTuple):
 
 
 def _possible(tests: Sequence[_Test], values: Values) -> list[_Test]:
-    """Returns the tests that some row may pass, as known without reading a column."""
+    """Returns the tests that some row may pass, by the zones of the columns."""
     return [test for test in tests if test.may_match(values.zone)]
 
 
@@ -179,14 +183,10 @@ def _any_of(tests: Sequence[_Test], values: Values) -> TruthValues:
     surely, perhaps = nowhere(values.rows)
     for test in tests if values.rows else ():
         try:
-            for level, passing, limits in test.passing(values):
-                if level is ROWS and not limits:
-                    surely |= passing.surely
-                    perhaps |= passing.perhaps
-                    continue
-                certain, possible = map(np.flatnonzero, passing)
-                surely[placed(values, level, certain, limits, surely=True)[1]] = True
-                perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
+            for passing in test.passing(values):
+                rows = passing.rows(values)
+                surely |= rows.surely
+                perhaps |= rows.perhaps
         except UnknownShapeError:
             return TruthValues(surely, unknown(values.rows).perhaps)
         if surely.all():
@@ -194,7 +194,33 @@ def _any_of(tests: Sequence[_Test], values: Values) -> TruthValues:
     return TruthValues(surely, perhaps | surely)
 
 
+class _Passing(NamedTuple):
+    """Which elements of a level, or rows, pass a test.
+
+    Attributes:
+        level: of the elements.
+        truth: of each element, whether it passes.
+        limits: which elements are in the value at all.
+    """
+
+    level: Level
+    truth: TruthValues
+    limits: tuple[Limit, ...]
+
+    def rows(self, values: Values) -> TruthValues:
+        """Returns which rows have an element that passes."""
+        if self.level is ROWS and not self.limits:
+            return self.truth
+        rows = nowhere(values.rows)
+        for surely, has_passing, passes in zip((True, False), rows, self.truth, strict=True):
+            positions = np.flatnonzero(passes)
+            _, owners = within_limits(values, self.level, positions, self.limits, surely=surely)
+            has_passing[owners] = True
+        return rows
+
+
 def _tests(condition: Condition, value: Node) -> list[_Test]:
+    """Returns the tests of the leaves of a value, or of those at the condition's field."""
     test, field = condition.test, condition.field
     targets = [value] if field is None else at_field(value, field)
     tests: list[_Test] = []
@@ -205,10 +231,10 @@ def _tests(condition: Condition, value: Node) -> list[_Test]:
             continue
         # Elements of lists have no name of their own.
         elements = [] if field is None else leaves_of(target, in_objects=False)
-        leaf_tests = (
-            _LeafTest(test, leaf, leaf in elements, condition.least_score, {}) for leaf in leaves
-        )
-        tests += (leaf_test for leaf_test in leaf_tests if leaf_test.is_needed)
+        for leaf in leaves:
+            leaf_test = _LeafTest(test, leaf, leaf in elements, condition.least_score, {})
+            if leaf_test.is_needed:
+                tests.append(leaf_test)
     return tests
 
 
@@ -217,10 +243,10 @@ class _LeafTest(NamedTuple):
 
     Attributes:
         test: what is asked.
-        leaf: on which leaf.
-        is_element: whether it is what a field leads to, or an element of that.
-        least_score: for texts that are JSON.
-        decided: whether texts pass that many parts have.
+        leaf: what is tested.
+        is_element: whether the field leads to the leaf, or to the list that it is an element of.
+        least_score: detections in JSON with a lower score are left out.
+        decided: remembers which texts pass: many parts have the same ones.
     """
 
     test: Contains | Equals | Beyond
@@ -231,7 +257,7 @@ class _LeafTest(NamedTuple):
 
     @property
     def numbers(self) -> tuple[int | float, ...]:
-        """The numbers that are equal to a number of the leaf's kind."""
+        """The numbers to which a number of the leaf's kind has to be equal."""
         if isinstance(self.test, Contains):
             equal = self.test.equal if self.is_element else None
         else:
@@ -256,13 +282,13 @@ class _LeafTest(NamedTuple):
         return isinstance(self.test, Contains) and self.is_element and self.test.equal.passes(value)
 
     def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
-        """Returns whether some value may pass, as far as it is known without reading any."""
+        """Returns whether some value may pass, by the zone of the leaf."""
         zone = zone_of(self.leaf)
         if zone is None:
             return True
         if self.leaf.kind is Kind.TEXT:
-            has = zone.may_have(self._folded or "")
-            return has | zone.may_be_json if self.leaf.json_depth else has
+            may_have = zone.may_have(self._folded or "")
+            return may_have | zone.may_be_json if self.leaf.json_depth else may_have
         if self.leaf.kind is not Kind.BOOLEAN and isinstance(self.test, Beyond):
             return zone.reaches(self.test.limit, above=self.test.above)
         numbers: Sequence[float] = self.numbers
@@ -273,54 +299,55 @@ class _LeafTest(NamedTuple):
             possible = possible | zone.spans(number)
         return possible
 
-    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, tuple[Limit, ...]]]:
-        """Yields which rows or elements of a level pass.
+    def passing(self, values: Values) -> Iterator[_Passing]:
+        """Yields which rows or elements pass.
 
         Raises:
             UnknownShapeError: the table cannot say.
         """
         leaf, around = self.leaf, self.leaf.level.parent
         if leaf.kind is Kind.TEXT:
-            yield leaf.level, self._passing_texts(values), leaf.limits
-        elif not leaf.is_of_array or around is None:
-            yield leaf.level, self._passing_numbers(values.numbers(leaf)), leaf.limits
-        else:
-            is_held = values.numeric(leaf.level, "") is not None
-            if is_held:
-                yield leaf.level, self._passing_numbers(values.numbers(leaf)), leaf.limits
-            yield from self._in_long_arrays(values, around, is_part=is_held)
+            yield _Passing(leaf.level, self._passing_texts(values), leaf.limits)
+            return
+        is_of_array = leaf.is_of_array and around is not None
+        has_column = not is_of_array or values.numeric(leaf.level, "") is not None
+        if has_column:
+            truth = self._passing_numbers(values.numbers(leaf))
+            yield _Passing(leaf.level, truth, leaf.limits)
+        if is_of_array and around is not None:
+            yield from self._in_long_arrays(values, around, has_short=has_column)
 
     @property
     def _folded(self) -> str | None:
         return None if isinstance(self.test, Beyond) else self.test.folded
 
     def _passing_texts(self, values: Values) -> TruthValues:
-        may = values.letters(self.leaf, self._folded or "")
-        is_word = isinstance(self.test, Contains) and self.test.is_one_word
-        if may is not None and (not may.any() or (is_word and not self.leaf.json_depth)):
-            return TruthValues.known(may)
-        try:
-            codes, words = (texts := values.texts(self.leaf)).codes, texts.words
-        except UnknownShapeError:
-            if may is None:
-                raise
-            return TruthValues(np.zeros_like(may), may)
-        if may is None:
-            flags = [*map(self.decided.get, words)]
+        may_pass = values.letters(self.leaf, self._folded or "")
+        if may_pass is None:
+            texts = values.texts(self.leaf)
+            flags = [*map(self.decided.get, texts.words)]
             if None in flags:  # else no call is needed for each
-                flags = [*map(self._passes_text, words)]
-        else:
-            used = np.bincount(codes[may], minlength=len(words)) > 0
-            flags = [
-                is_used and self._passes_text(word)
-                for word, is_used in zip(words, used.tolist(), strict=True)
-            ]
-        return TruthValues.known(np.array(flags, np.bool_)[codes])
+                flags = [*map(self._passes_text, texts.words)]
+            return TruthValues.known(np.array(flags, np.bool_)[texts.codes])
+        is_one_word = isinstance(self.test, Contains) and self.test.is_one_word
+        if not may_pass.any() or (is_one_word and not self.leaf.json_depth):
+            return TruthValues.known(may_pass)
+        try:
+            texts = values.texts(self.leaf)
+        except UnknownShapeError:
+            return TruthValues(np.zeros_like(may_pass), may_pass)
+        passes = np.zeros(len(texts.words), np.bool_)
+        for code in np.unique(texts.codes[may_pass]).tolist():
+            passes[code] = self._passes_text(texts.words[code])
+        return TruthValues.known(passes[texts.codes])
 
     def _passes_text(self, word: str) -> bool:
         passes = self.decided.get(word)
         if passes is None:
-            passes = self.passes(_without_low(word, self.least_score, self.leaf.json_depth))
+            depth = self.leaf.json_depth
+            is_json = depth and looks_like_json(word)
+            counted = str(without_low_scores(word, self.least_score, depth)) if is_json else word
+            passes = self.passes(counted)
             if len(word) <= _SHORT and len(self.decided) < _MOST_DECIDED:
                 self.decided[word] = passes
         return passes
@@ -345,7 +372,7 @@ class _LeafTest(NamedTuple):
 
     @property
     def _bounds(self) -> tuple[int | float, ...]:
-        """The numbers next to which the test comes out differently."""
+        """The numbers at which the outcome of the test changes."""
         if not isinstance(self.test, Beyond):
             return self.numbers
         return (self.test.limit, self.test.stored)
@@ -359,66 +386,76 @@ class _LeafTest(NamedTuple):
         return passed
 
     def _in_long_arrays(
-        self, values: Values, level: Level, *, is_part: bool
-    ) -> Iterator[tuple[Level, TruthValues, tuple[Limit, ...]]]:
-        """Yields the rows or elements whose arrays are too long to be held, by what is known."""
+        self, values: Values, level: Level, *, has_short: bool
+    ) -> Iterator[_Passing]:
+        """Yields which arrays have a number that passes, of those too long to have a column.
+
+        Args:
+            values: of the table.
+            level: of the arrays.
+            has_short: whether short arrays have a column; else all count as long.
+        """
         path = self.leaf.level.name
         lengths = values.numeric(level, f"{path}.length")
         if lengths is None:
-            if is_part:
+            if has_short:
                 return
-            raise UnknownShapeError(f"{path} is not held")
-        is_long = lengths > (MAX_NUMBERS if is_part else 0)
+            raise UnknownShapeError(f"{path} has no column")
+        is_long = lengths > (MAX_NUMBERS if has_short else 0)
         if not is_long.any():
             return
         least, greatest = (values.numeric(level, f"{path}.{end}") for end in ("least", "greatest"))
-        kept = unknown(len(lengths))
+        truth = unknown(len(lengths))
         if least is not None and greatest is not None and self.leaf.kind is not Kind.BOOLEAN:
             ends = [level.full(f"{path}.{end}") for end in ("least", "greatest")]
             error = max(values.table.error(end) for end in ends)
-            kept = self._between(least, greatest, error)
-        leaf = self.leaf
-        limits = tuple(limit for limit in leaf.limits if limit.level != leaf.level)
-        # Of one that is picked from an array, what is known of all says only what it may be.
-        surely = is_long & kept.surely & (len(limits) == len(leaf.limits))
-        yield level, TruthValues(surely, is_long & kept.perhaps), limits
+            truth = self._passing_between(least, greatest, error)
+        limits = tuple(limit for limit in self.leaf.limits if limit.level != self.leaf.level)
+        is_picked = len(limits) < len(self.leaf.limits)
+        # Of one element that is picked from an array, the others only say what it may be.
+        surely = np.zeros_like(is_long) if is_picked else is_long & truth.surely
+        yield _Passing(level, TruthValues(surely, is_long & truth.perhaps), limits)
 
-    def _between(self, least: Numeric, greatest: Numeric, error: float) -> TruthValues:
-        """Returns in which arrays a number passes, by their least and greatest finite ones.
+    def _passing_between(self, least: Numeric, greatest: Numeric, error: float) -> TruthValues:
+        """Returns which arrays have a number that passes.
 
-        NaN where those are not known. Integers of more than 53 bits were rounded.
+        Args:
+            least: the least finite number of each array; NaN if that is not known.
+            greatest: the greatest finite number of each array.
+            error: the most by which these are off.
         """
-        is_real = self.leaf.kind is Kind.REAL
-        surely, perhaps = np.zeros(len(least), np.bool_), np.isnan(least)
-        is_rounded = np.maximum(np.abs(least), np.abs(greatest)) >= _EXACT_BELOW
-        if not is_real:
-            perhaps |= is_rounded
         if isinstance(self.test, Beyond):
-            limit, above = self.test.limit, self.test.above
-            surely = np.logical_and.reduce(
-                [
-                    beyond(greatest - error if above else least + error, bound, above=above)
-                    for bound in (self._bounds if is_real else (limit,))
-                ]
-            )
-            perhaps |= beyond(greatest + error if above else least - error, limit, above=above)
-            perhaps |= is_real  # infinities are not among the finite ones
-        for number in self.numbers:
-            at = as_float(number)
-            if error == 0.0:
-                surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
-            perhaps |= (least - error <= at) & (at <= greatest + error)
-            perhaps |= is_real and math.isinf(at)
-        if not is_real:
+            surely, perhaps = self._beyond_between(self.test, least, greatest, error)
+        else:
+            surely, perhaps = nowhere(len(least))
+            for number in self.numbers:
+                at = as_float(number)
+                if error == 0.0:
+                    surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
+                # Infinities are not among the finite numbers.
+                perhaps |= math.isinf(at) | ((least - error <= at) & (at <= greatest + error))
+        perhaps |= np.isnan(least)
+        if self.leaf.kind is not Kind.REAL:
+            # Integers of more than 53 bits were rounded to floats.
+            is_rounded = np.maximum(np.abs(least), np.abs(greatest)) >= _EXACT_BELOW
+            perhaps |= is_rounded
             surely &= ~is_rounded
         return TruthValues(surely, perhaps | surely)
 
-
-def _without_low(word: str, least: float, depth: int) -> str:
-    """Returns a text without detections of a low score, which are looked for so deep in it."""
-    if not depth or not looks_like_json(word):
-        return word
-    return str(without_low_scores(word, least, depth))
+    def _beyond_between(
+        self, test: Beyond, least: Numeric, greatest: Numeric, error: float
+    ) -> TruthValues:
+        """Returns which arrays have a number beyond a limit; as `_passing_between`."""
+        if test.above:
+            certain, possible = greatest - error, greatest + error
+        else:
+            certain, possible = least + error, least - error
+        surely = beyond(certain, test.limit, above=test.above)
+        if self.leaf.kind is not Kind.REAL:
+            return TruthValues(surely, beyond(possible, test.limit, above=test.above))
+        surely &= beyond(certain, test.stored, above=test.above)
+        # Infinities are not among the finite numbers.
+        return TruthValues(surely, np.ones(len(least), np.bool_))
 
 
 def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
@@ -448,13 +485,18 @@ def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
 
 
 class _PlaceTest(NamedTuple):
-    """`near_position`, on one position of a value: the leaves of its x, y and perhaps z."""
+    """`near_position`, on one position of a value.
+
+    Attributes:
+        test: what is asked.
+        leaves: x, y and perhaps z of the position.
+    """
 
     test: NearPosition
     leaves: Sequence[Leaf]
 
     def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
-        """Returns whether some position may be near, as far as known without reading any."""
+        """Returns whether some position may be near, by the zones of its leaves."""
         reach = self.test.tolerance_m * (1 + _ROUNDING) + _TINY_M
         possible: bool | Mask = True
         for leaf, center in zip(self.leaves, self._center, strict=False):
@@ -462,10 +504,11 @@ class _PlaceTest(NamedTuple):
             possible = possible if zone is None else possible & zone.may_be_near(center, reach)
         return possible
 
-    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, tuple[Limit, ...]]]:
-        """Yields which rows or elements of a level are near; raises as that of `_LeafTest`."""
+    def passing(self, values: Values) -> Iterator[_Passing]:
+        """Yields which rows or elements are near; raises as `_LeafTest.passing`."""
         columns = [values.numbers(leaf) for leaf in self.leaves[: len(self._center)]]
-        yield self.leaves[0].level, self._near(columns), self.leaves[0].limits
+        first = self.leaves[0]
+        yield _Passing(first.level, self._near(columns), first.limits)
 
     @property
     def _center(self) -> tuple[float, ...]:
@@ -477,19 +520,19 @@ class _PlaceTest(NamedTuple):
         axes = [column.values.astype(np.float64, copy=False) for column in columns]
         error = sum(column.error for column in columns)
         with np.errstate(all="ignore"):
-            squared = [(axis - at) ** 2 for axis, at in zip(axes, self._center, strict=True)]
-            apart = np.sqrt(np.add.reduce(squared))
-            is_near = apart <= tolerance
+            squares = [(axis - at) ** 2 for axis, at in zip(axes, self._center, strict=True)]
+            distance = np.sqrt(np.add.reduce(squares))
+            is_near = distance <= tolerance
             if not np.any(error):
                 return TruthValues.known(is_near)
-            # Their sum, which is no less than the root of their squares: of 1e-200 that is 0.
-            is_doubtful = np.abs(apart - tolerance) <= error + tolerance * _ROUNDING
-            is_doubtful |= apart < _TINY_M
+            # The sum of the errors, not the root of their squares: that of 1e-200 is 0.
+            is_doubtful = np.abs(distance - tolerance) <= error + tolerance * _ROUNDING
+            is_doubtful |= distance < _TINY_M
         return TruthValues(is_near & ~is_doubtful, is_near | is_doubtful)
 
 
 def _place_tests(test: NearPosition, target: Node) -> Iterator[_PlaceTest]:
-    """Yields a test of each position in a part of a value."""
+    """Yields a test for each position in a part of a value."""
 
     def is_axis(node: Node) -> bool:
         return node is NOTHING or (isinstance(node, Leaf) and node.kind is not Kind.TEXT)

@@ -1,8 +1,8 @@
 """Reads the leaves of extracted values from the columns of a table.
 
-A `Leaf` says where a number, boolean or text of a value comes from; `Values` reads it for all rows
-(or elements) of one table at once, with the same numbers as the conversions of `messages/` give
-for each message. Where the table does not hold them `UnknownShapeError` is raised: then the bag has
+A `Leaf` says where a number, boolean or text of a value comes from. `Values` reads it for all rows
+or elements of one table at once, with the numbers that the conversions of `messages/` return for
+each message. Where the table has no column for it, `UnknownShapeError` is raised: then the bag has
 to be read.
 """
 
@@ -29,12 +29,13 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray, Mask
 
     Numeric: TypeAlias = Floats
+    """Numbers or booleans of any dtype."""
 
 
 T = TypeVar("T")
 
 ZoneOf: TypeAlias = "Callable[[T], Zone | Zones | None]"
-"""Returns what is known of a column or leaf without reading it, of one part or of several."""
+"""Returns the zone of a column or leaf: that of one part, or those of several; None if unknown."""
 
 _EXACT_BELOW: Final = 2**53
 """Whole numbers below this are floats."""
@@ -49,7 +50,7 @@ _LEAST_COSINE: Final = 1e-3
 
 
 class UnknownShapeError(Exception):
-    """Columns do not settle it, or the value differs in shape by message: the messages decide."""
+    """Columns do not settle it: the messages have to be read."""
 
 
 class Kind(Enum):
@@ -65,7 +66,7 @@ NUMBERS: Final = frozenset({Kind.INTEGER, Kind.REAL})
 
 
 class Conversion(Enum):
-    """How a leaf comes out of its sources."""
+    """How the value of a leaf is computed from its sources."""
 
     STORED = auto()  # the column itself
     SECONDS = auto()  # of nanoseconds
@@ -103,11 +104,11 @@ class Leaf(NamedTuple):
 
     Attributes:
         level: where it lies.
-        sources: dot-paths in that level of what it is made of.
+        sources: dot-paths, in that level, of the columns that it is computed from.
         kind: what it is.
-        conversion: how its value comes out of the sources.
-        json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
-            it; 0 for not at all.
+        conversion: how it is computed from the sources.
+        json_depth: how deep detections of a low score are looked for in a text that may be JSON; 0
+            for not at all.
         limits: which rows or elements have it in the extracted value.
     """
 
@@ -125,7 +126,7 @@ class Leaf(NamedTuple):
 
     @property
     def is_of_array(self) -> bool:
-        """Whether it is an element of an array of numbers, which a table may hold in part."""
+        """Whether it is an element of an array of numbers; long arrays have no column."""
         return (
             self.sources == ("",)
             and self.conversion is Conversion.STORED
@@ -137,10 +138,10 @@ class LeafNumbers(NamedTuple):
     """The numbers or booleans of a leaf; null is NaN.
 
     Attributes:
-        values: one for each row or element; of angles, as numpy computes them.
-        error: the most by which they are off, of all or of each; 0 where they are exact.
-        exactly: returns some of them as the conversions compute them, where those may differ from
-            `values` by `error`; None where only the bag can say.
+        values: one for each row or element; angles as numpy computes them.
+        error: the most by which all of them, or each of them, is off; 0 if they are exact.
+        exactly: returns the values at some positions as the conversions compute them; None if only
+            the bag can say, or `values` are exact.
     """
 
     values: Numeric
@@ -156,29 +157,29 @@ class Values:
 
     Attributes:
         table: the table.
-        rows: how many it has.
+        rows: how many rows it has.
     """
 
     def __init__(self, table: Table) -> None:
         self.table = table
         self.rows = len(table.log_times)
-        self._kept: dict[object, object] = {}
+        self._computed: dict[object, object] = {}
 
-    def once(self, key: object, make: Callable[[Values], T]) -> T:
-        """Returns what is made of the table under a key; it is made once."""
-        if key not in self._kept:
-            self._kept[key] = make(self)
-        return cast("T", self._kept[key])  # by key: each has one type
+    def once(self, key: object, compute: Callable[[Values], T]) -> T:
+        """Returns what is computed from the table under a key; it is computed once."""
+        if key not in self._computed:
+            self._computed[key] = compute(self)
+        return cast("T", self._computed[key])  # by key: each has one type
 
     def elements(self, level: Level) -> Elements:
         """Returns the elements of a sequence.
 
         Raises:
-            UnknownShapeError: the table does not hold them.
+            UnknownShapeError: the table has no columns for them.
         """
         elements = self._rows(level)
         if not isinstance(elements, Elements):
-            raise UnknownShapeError(f"{level.name} is not held")
+            raise UnknownShapeError(f"{level.name} has no columns")
         return elements
 
     def size(self, level: Level) -> int:
@@ -205,17 +206,18 @@ class Values:
         """Returns the texts of a leaf.
 
         Raises:
-            UnknownShapeError: the table does not hold them.
+            UnknownShapeError: the table has no column for them.
         """
         column = self._column(leaf.level, leaf.sources[0])
         if not isinstance(column, Texts):
-            raise UnknownShapeError(f"{leaf.sources[0]} is not held")
+            raise UnknownShapeError(f"{leaf.sources[0]} has no column")
         return column
 
     def letters(self, leaf: Leaf, text: str) -> Mask | None:
-        """Returns which texts of a leaf may have a casefolded text; None where that is not known.
+        """Returns which texts of a leaf may contain a casefolded text, by the part's outline.
 
-        They surely have it if it is one row of letters.
+        They surely contain it if it is one run of letters. Returns None if the outline does not
+        say it.
         """
         if leaf.level is not ROWS or not isinstance(self.table, StoredTable):
             return None
@@ -227,7 +229,7 @@ class Values:
         return None if letters is None else letters.may_have(text)
 
     def numeric(self, level: Level, path: str) -> Numeric | None:
-        """Returns a column of numbers or booleans; None where the table does not hold it."""
+        """Returns a column of numbers or booleans; None if the table does not have it."""
         column = self._column(level, path)
         return None if isinstance(column, Texts) else cast("Numeric | None", column)
 
@@ -235,25 +237,28 @@ class Values:
         """Returns the numbers or booleans of a leaf.
 
         Raises:
-            UnknownShapeError: the table does not hold them.
+            UnknownShapeError: the table has no column for them.
         """
-        columns = [self.numeric(leaf.level, path) for path in leaf.sources]
-        held = [column for column in columns if column is not None]
-        if len(held) < len(columns):
-            raise UnknownShapeError(f"{leaf.sources} are not held")
+        columns: list[Numeric] = []
+        for path in leaf.sources:
+            source = self.numeric(leaf.level, path)
+            if source is None:
+                raise UnknownShapeError(f"{path} has no column")
+            columns.append(source)
         if leaf.conversion in _ANGLES:
-            return self._angle(leaf, held)
-        column, error = held[0], self.error(leaf)
+            return self._angle(leaf, columns)
+        column, error = columns[0], self.error(leaf)
         if leaf.conversion is Conversion.SECONDS:
             return LeafNumbers(seconds(column), error / NS_PER_S)
         is_real = leaf.kind is Kind.REAL and column.dtype.kind in "iu"
         return LeafNumbers(column.astype(np.float64) if is_real else column, error)
 
     def floats(self, leaf: Leaf) -> tuple[Floats, float]:
-        """Returns the numbers of a leaf, and the most by which any is off.
+        """Returns the numbers of a leaf, and the most by which any of them is off.
 
         Raises:
-            UnknownShapeError: the table does not hold them, or each is off by another number.
+            UnknownShapeError: the table has no column for them, or they are angles, which have
+                errors of their own.
         """
         numbers, error, _ = self.numbers(leaf)
         if not isinstance(error, float):
@@ -261,7 +266,7 @@ class Values:
         return numbers.astype(np.float64, copy=False), error
 
     def holds_all(self, leaf: Leaf) -> bool:
-        """Returns whether no array that a leaf is an element of is too long to be held."""
+        """Returns whether each array that a leaf is an element of is short enough for a column."""
         if not leaf.is_of_array or leaf.level.parent is None:
             return True
         lengths = self.numeric(leaf.level.parent, f"{leaf.level.name}.length")
@@ -269,45 +274,52 @@ class Values:
 
     def error(self, leaf: Leaf) -> float:
         """Returns the greatest error of the columns of a leaf, in their own unit."""
-        return max((self.table.error(leaf.level.full(path)) for path in leaf.sources), default=0.0)
+        return max(self.table.error(leaf.level.full(path)) for path in leaf.sources)
 
     def zone(self, leaf: Leaf) -> Zone | None:
-        """Returns what is known of a leaf without reading it."""
+        """Returns the zone of a leaf; None if it is not known."""
         zone = zone_of(leaf, self.table.zone)
         return zone if isinstance(zone, Zone) else None
 
     def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> LeafNumbers:
         """Returns one of the angles (degrees) of quaternions."""
-        key = (leaf.level, leaf.sources)
-        floats = [part.astype(np.float64, copy=False) for part in parts]
-        turn = self.once(key, lambda _: _euler(floats))
+        quaternions = [part.astype(np.float64, copy=False) for part in parts]
+        euler = self.once((leaf.level, leaf.sources), lambda _: _euler(quaternions))
         which = _ANGLES[leaf.conversion]
-        angles, error = turn.degrees[which], self.error(leaf)
+        angles, error = euler.degrees[which], self.error(leaf)
         if error:
-            return LeafNumbers(angles, _angle_error(error, turn.length, turn.cosine, angles))
-
-        def exactly(positions: IntArray) -> Floats:
-            angle_of: dict[tuple[float, float, float, float], float] = {}
-            exact = np.empty(len(positions))
-            rows = zip(*(part[positions].tolist() for part in floats), strict=True)
-            for nth, numbers in enumerate(rows):
-                if numbers not in angle_of:
-                    euler = euler_of(numbers)
-                    angle_of[numbers] = math.nan if euler is None else euler[ANGLES[which]]
-                exact[nth] = angle_of[numbers]
-            return exact
-
+            return LeafNumbers(angles, _angle_error(error, euler.length, euler.cosine, angles))
         # Zero is zero everywhere, and a robot in the plane has nothing else.
-        off = np.where(angles == 0.0, 0.0, _ROUNDING_DEG)
-        return LeafNumbers(angles, off, exactly)
+        errors = np.where(angles == 0.0, 0.0, _ROUNDING_DEG)
+        name = ANGLES[which]
+        return LeafNumbers(angles, errors, lambda at: _exact_angles(quaternions, at, name))
+
+
+def _exact_angles(quaternions: Sequence[Floats], positions: IntArray, name: str) -> Floats:
+    """Returns an angle (degrees) of the quaternions at some positions, as conversions compute it.
+
+    Args:
+        quaternions: x, y, z and w, a column each.
+        positions: in these columns.
+        name: of the angle, one of `ANGLES`.
+    """
+    angle_of: dict[tuple[float, float, float, float], float] = {}
+    angles = np.empty(len(positions))
+    rows = zip(*(part[positions].tolist() for part in quaternions), strict=True)
+    for nth, quaternion in enumerate(rows):
+        if quaternion not in angle_of:
+            euler = euler_of(quaternion)
+            angle_of[quaternion] = math.nan if euler is None else euler[name]
+        angles[nth] = angle_of[quaternion]
+    return angles
 
 
 def zone_of(leaf: Leaf, zone: ZoneOf[str]) -> Zone | Zones | None:
-    """Returns what is known of a leaf by the zones of its sources.
+    """Returns the zone of a leaf by the zones of its sources; None if it is not known.
 
     Args:
         leaf: the leaf.
-        zone: returns the zone of a column of a table, or its zones in some parts, by its path.
+        zone: returns the zone of a column by its path, or its zones in several parts.
     """
     if leaf.conversion in _ANGLES:
         most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
@@ -324,7 +336,12 @@ def zone_of(leaf: Leaf, zone: ZoneOf[str]) -> Zone | Zones | None:
 
 
 def _with_long_arrays(numbers: Zone | Zones, lengths: Zone | Zones) -> Zone | Zones | None:
-    """Returns the zone of all arrays: without bounds where some are too long to be held."""
+    """Returns the zone of arrays of all lengths: without bounds where some have no column.
+
+    Args:
+        numbers: the zone of the arrays that are short enough for a column.
+        lengths: the zone of the lengths of all arrays.
+    """
     are_long = lengths.reaches(MAX_NUMBERS, above=True)
     if isinstance(numbers, Zones):
         low = np.where(are_long, -math.inf, numbers.low)
@@ -342,13 +359,13 @@ def seconds(times: Numeric) -> Floats:
     return np.where(np.abs(times) < _EXACT_BELOW, times / NS_PER_S, parts)
 
 
-class _Turns(NamedTuple):
+class _Euler(NamedTuple):
     """Quaternions as angles.
 
     Attributes:
         degrees: roll, pitch and yaw.
-        length: of the quaternions.
-        cosine: of pitch.
+        length: the length of each quaternion.
+        cosine: the cosine of each pitch.
     """
 
     degrees: tuple[Floats, Floats, Floats]
@@ -356,10 +373,10 @@ class _Turns(NamedTuple):
     cosine: Floats
 
 
-def _euler(parts: Sequence[Floats]) -> _Turns:
+def _euler(parts: Sequence[Floats]) -> _Euler:
     """Returns quaternions as angles, as `conversions.unit` and `geometry.rpy` compute them."""
-    turns = np.stack(parts, axis=1)
-    x, y, z, w = unit_quaternions(turns).T
+    quaternions = np.stack(parts, axis=1)
+    x, y, z, w = unit_quaternions(quaternions).T
     with np.errstate(all="ignore"):
         sine = np.clip(2 * (w * y - z * x), -1.0, 1.0)
         is_locked = np.abs(sine) > GIMBAL_LOCK_SINE
@@ -370,11 +387,19 @@ def _euler(parts: Sequence[Floats]) -> _Turns:
         roll = np.where(is_locked, 0.0, roll)
         yaw = np.where(is_locked, at_lock, yaw)
         degrees = np.degrees(roll), np.degrees(np.arcsin(sine)), np.degrees(yaw)
-        return _Turns(degrees, np.sqrt(row_sums(turns * turns)), np.sqrt(1 - sine * sine))
+        lengths = np.sqrt(row_sums(quaternions * quaternions))
+        return _Euler(degrees, lengths, np.sqrt(1 - sine * sine))
 
 
 def _angle_error(error: float, length: Floats, cosine: Floats, angles: Floats) -> Floats:
-    """Returns by how much (degrees) angles may be off, given that of the quaternion's parts."""
+    """Returns the most by which each angle is off (degrees).
+
+    Args:
+        error: the most by which a part of the quaternions is off.
+        length: of each quaternion.
+        cosine: of each pitch.
+        angles: the angles (degrees).
+    """
     with np.errstate(all="ignore"):
         # Relative to the length: a quaternion need not be a unit one.
         off = np.degrees(_TURN_ERRORS * error / (length * cosine)) + _ROUNDING_DEG
@@ -384,34 +409,39 @@ def _angle_error(error: float, length: Floats, cosine: Floats, angles: Floats) -
 
 
 class TruthValues(NamedTuple):
-    """Of some rows or elements: which surely have a field, and which may have it."""
+    """Which rows or elements meet something.
+
+    Attributes:
+        surely: those that meet it.
+        perhaps: those that meet it or may meet it.
+    """
 
     surely: Mask
     perhaps: Mask
 
     @classmethod
-    def known(cls, stands: Mask) -> TruthValues:
-        """Returns that these have it and no others."""
-        return cls(stands, stands)
+    def known(cls, mask: Mask) -> TruthValues:
+        """Returns that the rows of a mask meet it, and no others."""
+        return cls(mask, mask)
 
     @property
     def unsure(self) -> Mask:
-        """Which may have it or not."""
+        """The rows of which it is not known."""
         return self.perhaps & ~self.surely
 
     @property
     def is_settled(self) -> bool:
-        """Whether it is known everywhere."""
+        """Whether it is known of all rows."""
         return not self.unsure.any()
 
     @property
     def is_none(self) -> bool:
-        """Whether none has it."""
+        """Whether surely no row meets it."""
         return not self.perhaps.any()
 
 
 def nowhere(size: int) -> TruthValues:
-    """Returns that so many rows or elements do not have a value."""
+    """Returns that none of so many rows or elements meets it."""
     return TruthValues(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
 
 
@@ -424,16 +454,16 @@ class Limit(NamedTuple):
     """Which rows or elements of a level have a field in the extracted value.
 
     Attributes:
-        level: the level that it is about.
-        find: returns which of some rows or elements of the level have it; may raise
+        level: of the elements.
+        find: returns which of the elements at some positions have it; may raise
             `UnknownShapeError`.
     """
 
     level: Level
     find: Callable[[Values, IntArray], TruthValues]
 
-    def kept(self, values: Values, positions: IntArray) -> TruthValues:
-        """Returns which of some rows or elements of the level have it."""
+    def truth(self, values: Values, positions: IntArray) -> TruthValues:
+        """Returns which of the elements at some positions have the field."""
         try:
             return self.find(values, positions)
         except UnknownShapeError:
@@ -441,7 +471,7 @@ class Limit(NamedTuple):
 
 
 def at_place(level: Level, place: int) -> Limit:
-    """Returns the limit to the element at this place of each list; negative from the end."""
+    """Returns the limit to the element at a place of each list; -1 is the last element."""
 
     def find(values: Values, positions: IntArray) -> TruthValues:
         return TruthValues.known(values.places(level, positions, from_end=place < 0) == place)
@@ -450,27 +480,32 @@ def at_place(level: Level, place: int) -> Limit:
 
 
 def at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Limit:
-    """Returns the limit to the element that has this name in the list of names beside it.
+    """Returns the limit to the element of an array that has a name in the list of names beside it.
 
-    Of an array of fixed length, whose elements are columns of their own: to rows where it is `nth`.
+    Args:
+        level: of the elements; of the rows, if each element of the array has a column of its own.
+        names: the names in the list.
+        name: the one that is asked for.
+        nth: the place of the element in an array whose elements have columns of their own.
     """
 
     def find(values: Values, positions: IntArray) -> TruthValues:
         texts, owners = values.texts(names), values.elements(names.level).owners
         has_name = np.array([word == name for word in texts.words], np.bool_)[texts.codes]
-        found = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
-        places = np.full(values.rows, -1)
-        places[owners[found]] = values.places(names.level, found, from_end=False)
+        named = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
+        place_in_row = np.full(values.rows, -1)
+        place_in_row[owners[named]] = values.places(names.level, named, from_end=False)
         if nth is not None:
-            return TruthValues.known(places[positions] == nth)
-        at = values.places(level, positions, from_end=False)
-        return TruthValues.known(at == places[values.elements(level).owners[positions]])
+            return TruthValues.known(place_in_row[positions] == nth)
+        rows = values.elements(level).owners[positions]
+        places = values.places(level, positions, from_end=False)
+        return TruthValues.known(places == place_in_row[rows])
 
     return Limit(level, find)
 
 
 def where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) -> Limit:
-    """Returns the limit to sequences of more numbers than this, or else of no more."""
+    """Returns the limit to sequences of more than `count` numbers, or of no more if not longer."""
 
     def find(values: Values, positions: IntArray) -> TruthValues:
         lengths = values.numeric(level, f"{sequence}.length")
@@ -481,24 +516,25 @@ def where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) ->
     return Limit(level, find)
 
 
-def placed(
+def within_limits(
     values: Values, level: Level, positions: IntArray, limits: Sequence[Limit], *, surely: bool
 ) -> tuple[IntArray, IntArray]:
-    """Returns which of some rows or elements have a field, and the row of each.
+    """Returns the positions of the elements that meet all limits, and the row of each.
 
     Args:
         values: of the table.
-        level: of the rows or elements.
-        positions: their positions.
-        limits: on which have it.
-        surely: whether those that may have it or not are left out.
+        level: of the elements; a limit may be on it, or on a level around it.
+        positions: of the elements that are asked about.
+        limits: to meet.
+        surely: whether to leave out the elements that may meet them or not.
     """
-    current, kept, owners = level, positions, positions
+    current, owners = level, positions
     while True:
         for limit in limits:
-            if limit.level == current and len(kept):
-                mask = limit.kept(values, owners)[0 if surely else 1]
-                kept, owners = kept[mask], owners[mask]
+            if limit.level == current and len(positions):
+                truth = limit.truth(values, owners)
+                mask = truth.surely if surely else truth.perhaps
+                positions, owners = positions[mask], owners[mask]
         if current.parent is None:
-            return kept, owners
+            return positions, owners
         owners, current = values.elements(current).owners[owners], current.parent
