@@ -17,10 +17,10 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.index.bag_rows import Bags
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.store import ColumnStore, State
+    from ros2_memory.columns.store import ColumnStore, State, StoredBags
     from ros2_memory.core.arrays import Flags
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.segment import Segment, TopicExtent
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 
 class CoveredSegment(NamedTuple):
-    """The bags of a segment, each with its number in the store.
+    """The bags of a segment, and how they are stored.
 
     Attributes:
         segment: of the timeline.
-        numbers: of its bags; -1 of those that are not stored.
-        hashed: of which bags copies can be recognised.
-        to_store: which bags are not stored and can be: they are closed, or cut short by a crash.
+        numbers: the number of each bag in the store; -1 if it is not stored.
+        hashed: whether copies of a bag's messages can be recognised.
+        to_store: whether a bag is not stored but can be: it is closed, or cut short by a crash.
     """
 
     segment: Segment
@@ -45,15 +45,16 @@ class CoveredSegment(NamedTuple):
 
     @property
     def is_missing(self) -> Mask:
-        """Which bags are not stored."""
+        """Whether a bag is not stored."""
         return self.numbers < 0
 
 
 class Coverage:
-    """The bags of one timeline, by their numbers in the store. Immutable.
+    """The stored and missing bags of one timeline. Immutable.
 
     Attributes:
-        state: of the store.
+        state: the state of the store.
+        segments: the segments of the timeline.
     """
 
     def __init__(self, state: State, segments: Sequence[CoveredSegment]) -> None:
@@ -75,72 +76,80 @@ class Coverage:
     @cached_property
     def missing(self) -> Sequence[BagFile]:
         """The bags that are not stored, in order of time."""
-        return [bag for each in self.segments for bag in each.segment.bags.at(each.is_missing)]
+        return self._bags_where(lambda covered: covered.is_missing)
 
     @cached_property
     def to_store(self) -> Sequence[BagFile]:
-        """Those of them that can be stored."""
-        return [bag for each in self.segments for bag in each.segment.bags.at(each.to_store)]
+        """The bags that are not stored but can be, in order of time."""
+        return self._bags_where(lambda covered: covered.to_store)
+
+    def unhashed(self) -> list[BagFile]:
+        """Returns the stored bags whose copied messages cannot be recognised."""
+        return self._bags_where(lambda covered: ~covered.is_missing & ~covered.hashed)
+
+    def _bags_where(self, mask_of: Callable[[CoveredSegment], Mask]) -> list[BagFile]:
+        return [
+            bag for covered in self.segments for bag in covered.segment.bags.at(mask_of(covered))
+        ]
 
     def starts_to_store(self) -> list[Ns]:
-        """Returns the log times (ns) of the first messages of the bags that can be stored."""
+        """Returns the log time (ns) of the first message of each bag in `to_store`."""
         return [
-            start for each in self.segments for start in each.segment.bags.starts[each.to_store]
+            start
+            for covered in self.segments
+            for start in covered.segment.bags.starts[covered.to_store]
         ]
 
     def missing_extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
-        """Yields the bags that are not stored as `Timeline.extents` yields all."""
+        """Yields what `Timeline.extents` yields, of the bags that are not stored."""
         for covered in self.segments:
             bags, is_missing = covered.segment.bags, covered.is_missing
             is_missing &= (bags.starts < window.stop) & (bags.ends >= window.start)
             if is_missing.any():
                 yield from covered.segment.extents(topic, window, is_missing)
 
-    def _are_there(self, numbers: IntArray) -> Flags:
-        """Returns which of some numbers are of bags of the timeline."""
+    def _has_bags(self, numbers: IntArray) -> Flags:
+        """Returns for each number whether the timeline has its bag."""
         return places_among(numbers, self._numbers)[1]
 
     def of_part(self, part: int, numbers: IntArray) -> IntArray:
-        """Returns those of the numbers of a part whose bags are bags of the timeline."""
+        """Returns the bags of a part that the timeline has.
+
+        Args:
+            part: the number of the part.
+            numbers: the numbers of its bags.
+        """
         if part not in self._of_parts:
-            are_there = self._are_there(numbers)
-            self._of_parts[part] = numbers if are_there.all() else numbers[are_there]
+            has_bags = self._has_bags(numbers)
+            self._of_parts[part] = numbers if has_bags.all() else numbers[has_bags]
         return self._of_parts[part]
 
     def counts(self, groups: Sequence[IntArray]) -> IntArray:
-        """Returns of how many bags of each group, which has one at least, rows count."""
+        """Returns how many bags of each group the timeline has; no group may be empty."""
         if not groups:
             return np.zeros(0, np.int64)
         begins = np.cumsum([0, *map(len, groups)])[:-1]
-        are_there = self._are_there(np.concatenate(groups)).astype(np.int64)
-        return np.asarray(np.add.reduceat(are_there, begins))
+        has_bags = self._has_bags(np.concatenate(groups)).astype(np.int64)
+        return np.asarray(np.add.reduceat(has_bags, begins))
 
     def bag(self, number: int) -> BagFile | None:
-        """Returns the bag of a number; None where it is none of the timeline."""
+        """Returns the bag with a number; None if the timeline does not have it."""
         at = self._position(number)
         return None if at is None else self._bags[at]
 
     def recording(self, number: int) -> Path | None:
-        """Returns the recording of the bag of a number, as `bag`."""
+        """Returns the recording of the bag with a number; None if the timeline does not have it."""
         at = self._position(number)
         return None if at is None else self._bags.recording(at)
 
     def _position(self, number: int) -> int | None:
         at = int(self._numbers.searchsorted(number))
-        is_there = at < self._numbers.size and self._numbers[at] == number
-        return int(self._order[at]) if is_there else None
-
-    def unhashed(self) -> list[BagFile]:
-        """Returns the stored bags of which copies cannot be recognised."""
-        return [
-            bag
-            for covered in self.segments
-            for bag in covered.segment.bags.at((covered.numbers >= 0) & ~covered.hashed)
-        ]
+        has_bag = at < self._numbers.size and self._numbers[at] == number
+        return int(self._order[at]) if has_bag else None
 
 
 class Covering:
-    """Finds out which bags are stored. Thread-safe.
+    """Returns which bags of a timeline are stored; remembers its segments. Thread-safe.
 
     Args:
         store: the store.
@@ -179,29 +188,32 @@ class Covering:
             return coverage
 
     def _covered_segments(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
-        is_same = self._latest is not None and self._latest[1].state == state
-        remembered = {
-            id(segment): covered
-            for segment in timeline.segments
-            if (covered := self._by_id.get(id(segment))) is not None
-            and covered.segment is segment
-            and (is_same or not covered.to_store.any())
-        }
-        unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
-        rows = self.store.rows_of([segment.bags for segment in unknown], self._root, state.deletion)
-        for segment, of_segment in zip(unknown, rows, strict=True):
-            remembered[id(segment)] = self._covered_segment(segment, of_segment)
-        return [remembered[id(segment)] for segment in timeline.segments]
+        is_same_state = self._latest is not None and self._latest[1].state == state
+        covered_of: dict[int, CoveredSegment] = {}
+        unknown: list[Segment] = []
+        for segment in timeline.segments:
+            covered = self._by_id.get(id(segment))
+            if (
+                covered is not None
+                and covered.segment is segment
+                and (is_same_state or not covered.to_store.any())
+            ):
+                covered_of[id(segment)] = covered
+            else:
+                unknown.append(segment)
+        groups = [segment.bags for segment in unknown]
+        stored_bags = self.store.stored_bags(groups, self._root, state.deletion)
+        for segment, stored in zip(unknown, stored_bags, strict=True):
+            covered_of[id(segment)] = _covered_segment(segment, stored)
+        return [covered_of[id(segment)] for segment in timeline.segments]
 
-    def _covered_segment(self, segment: Segment, rows: IntArray) -> CoveredSegment:
-        """Returns what is known of a segment, of whose bags `rows_of` returns these rows."""
-        bags = segment.bags
-        can_be_stored = bags.in_state(BagState.CLOSED)
-        left_open = np.flatnonzero(bags.in_state(BagState.INCOMPLETE))
-        # A database goes on in its journal, which may change while its own file does not.
-        can_be_stored[left_open] = [file.endswith(".mcap") for file in bags.files(left_open)]
-        is_stored: Mask = can_be_stored & (rows >= 0)
-        numbers = np.where(is_stored, (rows >> 1) + self.store.offset, -1)
-        return CoveredSegment(
-            segment, numbers, is_stored & (rows & 1 > 0), can_be_stored & ~is_stored
-        )
+
+def _covered_segment(segment: Segment, stored: StoredBags) -> CoveredSegment:
+    bags = segment.bags
+    can_be_stored = bags.in_state(BagState.CLOSED)
+    left_open = np.flatnonzero(bags.in_state(BagState.INCOMPLETE))
+    # A database goes on in its journal, which may change while its own file does not.
+    can_be_stored[left_open] = [file.endswith(".mcap") for file in bags.files(left_open)]
+    is_stored: Mask = can_be_stored & (stored.numbers >= 0)
+    numbers = np.where(is_stored, stored.numbers, -1)
+    return CoveredSegment(segment, numbers, is_stored & stored.hashed, can_be_stored & ~is_stored)

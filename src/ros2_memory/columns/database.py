@@ -1,8 +1,8 @@
 """An SQLite file of derived data, which repairs itself.
 
 The file may be deleted, replaced, overwritten, locked or on a full disk at any moment. None of that
-raises here: a file that is damaged or of another version is renamed and created again, one that is
-busy or full is tried again later, and meanwhile nothing is known.
+raises an error here. A file that is damaged or of another version is renamed and created again. One
+that is busy or full is tried again later; until then nothing can be read from it.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ _SHORT_MS: Final = 20
 """How long SQLite waits in one attempt; queries wait as long."""
 _PAUSE_S: Final = 0.02
 ROW_ID_BITS: Final = 40
-"""The number of a row is its id in these low bits, and in the others which database it is of.
+"""Low bits of a row's number that have its id; the others tell which database the row is of.
 
-So the number of a row in a file that was lost never means a row of the file that replaced it.
+So the number of a row in a lost file never means a row of the file that replaced it.
 """
 _FEW_PAGES: Final = 256
 """Unused pages that stay in the file, for what is written next."""
@@ -105,17 +105,20 @@ log = get_logger(__name__)
 
 
 def row_id(number: int) -> int:
-    """Returns the id that the row of a number has in its file."""
+    """Returns the id, in its file, of the row with a number."""
     return number & (1 << ROW_ID_BITS) - 1
 
 
 @dataclass(frozen=True, slots=True)
 class OpenDatabase:
-    """An open connection, and the path of its file; None in memory.
+    """An open database.
 
-    `files` are the names of the file, of its write-ahead log and of the log's index, `identities`
-    device and inode of each when it was opened: they distinguish these files from others of the
-    same names.
+    Attributes:
+        connection: to it.
+        path: of its file; None in memory.
+        files: the paths of the file, of its write-ahead log and of the log's index.
+        identities: device and inode of each of these when it was opened, which distinguish them
+            from other files at the same paths.
     """
 
     connection: sqlite3.Connection
@@ -130,7 +133,7 @@ class OpenDatabase:
         return cls(connection, path, files, _identities(files))
 
     def is_in_place(self) -> bool:
-        """Whether the names still lead to the files that are open; True where that is not known."""
+        """Whether the paths still lead to the open files; True if that cannot be found out."""
         try:
             return self.identities == _identities(self.files)
         except OSError:
@@ -146,14 +149,13 @@ class OpenDatabase:
 
 
 class Database:
-    """One SQLite database after the other, as files are lost and created again. Thread-safe.
+    """An SQLite database whose file may be lost and is then created again. Thread-safe.
 
     Args:
-        paths: where the file may lie, in order of preference; a database in memory serves where
-            none can be written. Where the candidates may change, a function that returns those
-            of the moment.
+        paths: where the file may lie, in order of preference, or a function that returns that. If
+            none of them can be written, the database is in memory.
         sources: other files that may be copied to a path that has none yet; only read.
-        waits_for: a directory; while it does not exist, nothing is opened or made.
+        waits_for: a directory; while it does not exist, nothing is opened or created.
     """
 
     def __init__(
@@ -176,30 +178,30 @@ class Database:
         self.is_failing = False
         """Whether it failed, and has not been written since."""
         self.failures = 0
-        """How often it could not be read: answers of meanwhile may lack something."""
+        """How often it could not be read; answers given meanwhile may lack something."""
         self.refusals = 0
-        """How often it did not store something; it is computed again for each answer."""
+        """How often SQLite could not represent what was to be written."""
         self.refused_for: str | None = None
-        """Why it did not store the last of those."""
+        """The error of the last refusal."""
 
     @property
     def path(self) -> Path | None:
         """Path of the file; None in memory, and before it is opened."""
         with self._lock:
-            opened = self._ready()
+            opened = self._open_if_needed()
         return None if opened is None else opened.path
 
     @property
     def offset(self) -> int:
-        """What is added to a row's id in the open database to give its number."""
+        """The difference between a row's number and its id in the open database."""
         return self._databases << ROW_ID_BITS
 
     def is_current(self, number: int) -> bool:
-        """Returns whether a row is of the open database, and of none that was lost."""
+        """Returns whether a row is of the open database, and not of a lost one."""
         return number >> ROW_ID_BITS == self._databases
 
     def close(self) -> None:
-        """Closes the connection for good; afterwards nothing is known."""
+        """Closes the connection for good; afterwards nothing can be read or written."""
         with self._lock:
             self._closed = True
             if self._opened is not None:
@@ -207,42 +209,38 @@ class Database:
                 self._opened = None
 
     def read(self, ask: Callable[[sqlite3.Connection], T], unknown: T) -> T:
-        """Returns what `ask` reads; `unknown` where the database cannot be read."""
+        """Returns what `ask` reads in one transaction; `unknown` if the database cannot be read."""
         with self._lock:
-            opened = self._ready()
+            opened = self._open_if_needed()
             if opened is None:
                 self.failures += 1
                 return unknown
             try:
-                # As one transaction: what is packed is read with the model that it was packed with.
-                opened.connection.execute("BEGIN")
-                try:
-                    answer = ask(opened.connection)
-                finally:
-                    if opened.connection.in_transaction:  # not after an error that ended it
-                        opened.connection.execute("COMMIT")
+                answer = _read_in_transaction(opened.connection, ask)
             # Rows of a damaged file can hold anything, so decoding them can raise any of these.
             except (sqlite3.Error, ValueError, TypeError, LookupError, MemoryError) as error:
                 self.failures += 1
-                self._failed(error)
+                self._handle(error)
                 return unknown
-            # After it: of a log that another program has replaced meanwhile pages are read that
-            # were never written.
-            return unknown if self._is_lost(opened) else answer
+            # Checked afterwards: if another program has replaced the log meanwhile, SQLite has read
+            # pages that were never written.
+            return unknown if self._close_if_lost(opened) else answer
 
     def write(self, write: Callable[[sqlite3.Connection], bool | None]) -> bool:
-        """Writes all or nothing; returns whether it was written, and `write` did not say False."""
+        """Writes all or nothing; returns False if nothing was written or `write` said False."""
         give_up_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:
-                opened = self._ready()
-                if opened is None or self._is_lost(opened):
+                opened = self._open_if_needed()
+                if opened is None or self._close_if_lost(opened):
                     return False
                 try:
-                    answer = _transact(opened.connection, write, is_probe=self.is_failing)
+                    answer = _write_in_transaction(
+                        opened.connection, write, is_probe=self.is_failing
+                    )
                 except (sqlite3.Error, MemoryError) as error:
                     if not is_busy(error) or time.monotonic() >= give_up_s:
-                        self._failed(error)
+                        self._handle(error)
                         return False
                 # A number or text that SQLite cannot store: the bags stay without an entry.
                 except (ValueError, OverflowError) as error:
@@ -254,32 +252,33 @@ class Database:
                     if self.is_failing:
                         self.trouble, self.is_failing = None, False
                         log.info("database_works_again", path=str(opened.path))
-                    return not self._is_lost(opened) and answer is not False
+                    return not self._close_if_lost(opened) and answer is not False
             # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
 
     def give_up(self, error: Exception) -> None:
-        """Sets the database aside, as what was read of it turned out to be damaged."""
+        """Sets the database aside, because data read from it turned out to be damaged."""
         with self._lock:
-            self._failed(error)
+            self._handle(error)
 
     def write_again(self) -> None:
-        """Finds out whether the disk works again, if it failed and nothing waits to be written.
+        """Writes nothing to a database that failed, to find out whether its disk works again.
 
-        Another program may have written what waited.
+        Another program may have written what was to be written.
         """
         if self.is_failing:
             self.write(lambda _: None)
 
-    def give_back(self) -> None:
-        """Returns unused pages to the disk where many are, a few at a time: nobody waits for long.
+    def release_pages(self) -> None:
+        """Returns unused pages to the disk if there are many.
 
-        The file must have been made with `auto_vacuum = INCREMENTAL`.
+        A few at a time, so that nobody waits for long. The file must have been created with
+        `auto_vacuum = INCREMENTAL`.
         """
         while True:
             with self._lock:
-                opened = self._ready()
-                if opened is None or opened.path is None or self._is_lost(opened):
+                opened = self._open_if_needed()
+                if opened is None or opened.path is None or self._close_if_lost(opened):
                     return
                 with suppress(sqlite3.Error):
                     [unused] = opened.connection.execute("PRAGMA freelist_count").fetchone()
@@ -290,17 +289,17 @@ class Database:
             return
 
     def look_after(self, *, thorough: bool = False) -> None:
-        """Reopens the file where it was deleted, replaced, or could not be opened before.
+        """Closes a file that was deleted, replaced or damaged; the next read or write reopens it.
 
-        Where a preferred path has become available since, the database moves there with all of
-        its content. This may take a while, so no question should wait for it.
+        If a preferred path can be written now, the database moves there with all of its content.
+        This may take a while, so no question should wait for it.
 
         Args:
             thorough: whether the whole file is read to check that it is intact.
         """
         with self._lock:
             opened = self._opened
-            if opened is None or not self._may_open() or self._is_lost(opened):
+            if opened is None or not self._may_open() or self._close_if_lost(opened):
                 return
         if time.monotonic() - self._tried_s >= RETRY_S:
             self._move_to_preferred_path(opened)
@@ -311,16 +310,16 @@ class Database:
         if fault is not None and not is_transient(fault):
             with self._lock:
                 if self._opened is opened:
-                    self._failed(fault)
+                    self._handle(fault)
 
     # The methods below run under the lock, except `_move_to_preferred_path`.
 
     def _may_open(self) -> bool:
-        is_there = self._waits_for is None or os.path.isdir(self._waits_for)
-        return not self._closed and is_there
+        exists = self._waits_for is None or os.path.isdir(self._waits_for)
+        return not self._closed and exists
 
-    def _ready(self) -> OpenDatabase | None:
-        """Returns the open database, opening one first if need be; None where it may not."""
+    def _open_if_needed(self) -> OpenDatabase | None:
+        """Returns the open database, opened first if need be; None if that is not allowed."""
         if self._opened is None and self._may_open():
             self._tried_s = time.monotonic()
             paths = self._candidate_paths()
@@ -332,9 +331,10 @@ class Database:
         return self._opened
 
     def _move_to_preferred_path(self, before: OpenDatabase) -> None:
-        """Opens the file at a path that is preferred to the present one, where one works now.
+        """Opens the file at a path that is preferred to the present one, if it can be written now.
 
-        The content of a file is copied there first; that of memory is made again.
+        The content of a file is copied there first. The content of memory is not: it is derived
+        again.
         """
         self._tried_s = time.monotonic()
         paths = tuple(self._candidate_paths())
@@ -357,17 +357,17 @@ class Database:
             else:
                 log.info("database_moved", path=str(opened.path))
 
-    def _is_lost(self, opened: OpenDatabase) -> bool:
-        """Returns whether other files are in its place; then it is closed."""
+    def _close_if_lost(self, opened: OpenDatabase) -> bool:
+        """Closes the database if other files, or none, are in its place; returns whether it did."""
         if opened.is_in_place() or not self._may_open():
             return False
-        self._lose("its file was deleted or replaced", aside=opened.is_mixed())
+        self._close_lost("its file was deleted or replaced", aside=opened.is_mixed())
         return True
 
-    def _failed(self, error: Exception) -> None:
-        """Sets a damaged database aside; one that is only busy or full is asked again."""
+    def _handle(self, error: Exception) -> None:
+        """Sets a damaged database aside; only notes that one is busy or full."""
         if not is_transient(error):
-            self._lose(f"it is damaged: {error}", aside=True)
+            self._close_lost(f"it is damaged: {error}", aside=True)
             return
         trouble = f"cannot be used: {error}"
         if trouble != self.trouble:
@@ -375,8 +375,13 @@ class Database:
             log.warning("database_failed", path=str(path), reason=str(error))
         self.trouble, self.is_failing = trouble, True
 
-    def _lose(self, reason: str, *, aside: bool) -> None:
-        """Closes the open database; the next read or write opens or creates another."""
+    def _close_lost(self, reason: str, *, aside: bool) -> None:
+        """Closes the open database; the next read or write opens or creates another one.
+
+        Args:
+            reason: for the log.
+            aside: whether the file is renamed.
+        """
         opened, self._opened = self._opened, None
         self.failures += 1
         self._databases += 1
@@ -393,15 +398,31 @@ class Database:
             log.warning("database_not_set_aside", path=str(opened.path), reason=str(error))
 
 
-def _transact(
+def _read_in_transaction(
+    connection: sqlite3.Connection, ask: Callable[[sqlite3.Connection], T]
+) -> T:
+    # One transaction: packed bytes must be read with the codec that they were packed with.
+    connection.execute("BEGIN")
+    try:
+        return ask(connection)
+    finally:
+        if connection.in_transaction:  # not after an error that ended it
+            connection.execute("COMMIT")
+
+
+def _write_in_transaction(
     connection: sqlite3.Connection,
     write: Callable[[sqlite3.Connection], bool | None],
     *,
     is_probe: bool,
 ) -> bool | None:
-    """Writes in one transaction; as a probe it writes a page at least.
+    """Returns what `write` returns; rolls back if it raises.
 
-    A transaction without a change touches no disk, and so does not show that the disk works.
+    Args:
+        connection: to write to.
+        write: writes.
+        is_probe: whether at least one page is written, to show that the disk works: a transaction
+            without a change touches no disk.
     """
     connection.execute("BEGIN IMMEDIATE")
     try:
@@ -423,14 +444,14 @@ def open_file(
     previous: Path | None = None,
     sources: Sequence[Path] = (),
 ) -> OpenDatabase | str:
-    """Opens the database at the first path that can be written; else returns the reason.
+    """Opens the database at the first path that can be written; returns the reason if none can.
 
     Args:
         paths: where it may lie, in order of preference.
-        again: whether this was tried before, so that what is logged already is logged at debug.
-        previous: its path until now. That file, or else the one at the next path, is copied
-            to a path that has none yet.
-        sources: other files that may be copied there; only read.
+        again: whether this was tried before: then failures are logged at debug level.
+        previous: its path until now. A path that has no file yet gets a copy of that file; without
+            it, of the first valid file among the later paths and `sources`.
+        sources: other files that may be copied; only read.
     """
     reason = ""
     for nth, path in enumerate(paths, start=1):
@@ -444,19 +465,19 @@ def open_file(
             return OpenDatabase.of_file(connection, path)
         except (OSError, sqlite3.Error) as error:
             if is_busy(error):
-                tell = log.debug if again else log.warning
-                tell("database_locked", path=str(path), instead="memory")
+                write_log = log.debug if again else log.warning
+                write_log("database_locked", path=str(path), instead="memory")
                 return "another program has locked its file"
-            tell = log.debug if again else log.info
-            tell("database_place_refused", path=str(path), reason=str(error))
+            write_log = log.debug if again else log.info
+            write_log("database_place_refused", path=str(path), reason=str(error))
             reason = str(error.strerror if isinstance(error, OSError) else error)
     return f"no file can be written for it ({reason})"
 
 
 def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
-    """Copies the first of these files that is a database of this version, if any.
+    """Copies to `path` the first of these files that is a database of this version.
 
-    The copy appears as a whole, by a hard link, and never replaces a file of another program.
+    The copy appears at once, by a hard link, and never replaces a file of another program.
     """
     for source in sources:
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -491,7 +512,7 @@ def _back_up(source: Path, temporary: Path) -> bool:
 
 
 def _refuse_links(path: Path) -> None:
-    """Refuses a link: the file that it leads to would be written, or set aside.
+    """Refuses symbolic links, whose targets would be written or renamed.
 
     Raises:
         OSError: the file, its write-ahead log or its folder is a symbolic link.
@@ -502,11 +523,11 @@ def _refuse_links(path: Path) -> None:
 
 
 def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
-    """Returns what is wrong with a file that is open here, as another program sees it.
+    """Returns what is wrong with a file, seen through a connection of its own; None: nothing.
 
     Args:
         path: the file.
-        thorough: whether all of it is read; else only where its tables begin.
+        thorough: whether all of it is read; else only the beginning of each table.
     """
     # rw and not rwc: a file that was just deleted is not created again.
     address = f"{path.absolute().as_uri()}?mode=rw"
@@ -529,11 +550,11 @@ def _in_memory() -> OpenDatabase:
 
 
 def is_transient(error: Exception) -> bool:
-    """Returns whether the database may work again as it is.
+    """Returns whether the database may work again as it is, without being created anew.
 
-    Operational errors are those of the machine or of the moment, such as a full disk. Faults of the
-    content are only a table that is missing (`SQLITE_ERROR`), text that is not UTF-8 (no code) and
-    pages that end too soon: those of a write-ahead log that something has overwritten.
+    Operational errors are faults of the machine or of the moment, such as a full disk. Three of
+    them are faults of the content: a missing table (`SQLITE_ERROR`), text that is not UTF-8 (no
+    code) and short pages (`SQLITE_IOERR_SHORT_READ`) of a write-ahead log that was overwritten.
     """
     if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_IOERR_SHORT_READ:
         return False
@@ -566,11 +587,11 @@ def _identities(files: Sequence[str]) -> tuple[tuple[int, int] | None, ...]:
 
 
 def _connect_and_check(path: Path) -> sqlite3.Connection:
-    """Connects to a file that can be written and has the tables of this version.
+    """Connects to a file; sets it aside first if it is damaged or of another version.
 
     Raises:
-        OSError: it cannot be set aside, or another version of this program uses it: each setting
-            the other's file aside, they would store all bags for ever.
+        OSError: it cannot be set aside, or another version of this program uses it. If both set the
+            other's file aside, they would store all bags for ever.
         sqlite3.Error: it is busy, or cannot be opened or written.
     """
     for _ in range(2):
@@ -609,9 +630,10 @@ def _connect(target: str) -> sqlite3.Connection:
 
 
 def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
-    """Creates the tables of a new database; returns how an old one is of another version.
+    """Creates the tables of a new database; returns in which version an old one is, if in another.
 
-    One that lacks a table turns out damaged where that is asked.
+    Raises:
+        sqlite3.DatabaseError: it lacks a table, or is damaged.
     """
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
@@ -630,7 +652,7 @@ def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
 
 
 def _is_used_elsewhere(connection: sqlite3.Connection) -> bool:
-    """Returns whether another connection is open to the file: only the last may leave WAL mode."""
+    """Returns whether another connection to the file is open: only the last can leave WAL mode."""
     try:
         mode = connection.execute("PRAGMA journal_mode = DELETE").fetchone()[0]
     except sqlite3.OperationalError:
@@ -639,7 +661,7 @@ def _is_used_elsewhere(connection: sqlite3.Connection) -> bool:
 
 
 def _set_aside(path: Path, reason: str) -> None:
-    """Renames a file so that a new one can be made; the old one stays for inspection."""
+    """Renames a file so that a new one can be created; the old one stays for inspection."""
     aside = path.with_name(f"{path.name}.aside")
     log.warning("database_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
     for file in files_of(path)[1:]:

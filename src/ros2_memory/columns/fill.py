@@ -233,7 +233,7 @@ class Filling:
         gone = [path for path in absent if not (self._bag_dir / path).exists()]
         if gone:
             self.store.delete(gone)
-        self.store.give_back()
+        self.store.release_pages()
 
     def trim(self) -> None:
         """Deletes the oldest bags where the store takes more than it may."""
@@ -253,7 +253,7 @@ class Filling:
             still = {key: at for key, at in self._trimmed.items() if self._is_refused(key)}
             self._trimmed = {**still, **dict.fromkeys(keys, self._clock.now())}
             log.info("oldest_columns_deleted", bags=len(keys))
-        self.store.give_back()
+        self.store.release_pages()
 
     def _renew(self, bag: BagFile) -> bool:
         """Keeps what is stored of a bag if a new `handover.json` beside it changes nothing in it.

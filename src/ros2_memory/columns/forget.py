@@ -1,9 +1,11 @@
 """Deletes bags from a store of columns, so that no byte of its file reveals their content.
 
-Deleting rows is not enough. A part has rows of bags that retention deleted before, until its last
-bag goes; its zones and words are of those, too. SQLite's `secure_delete` overwrites what is deleted
-where it lies, but not the copies that stay in a page when rows move to another one, so the whole
-file is written again. And the write-ahead log has everything that was written last.
+Deleting rows is not enough:
+
+- A part keeps the rows of a deleted bag, in its zones and words too, until its last bag is deleted.
+- SQLite's `secure_delete` overwrites deleted rows in place, but not the copies that stay in a page
+  when rows move to another one. So the whole file is written again.
+- The write-ahead log has everything that was written last. So it is emptied.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
 
 PATIENCE_S: Final = 10.0
-"""How long other programs may use the file before it is given up to empty its log."""
+"""How long to wait for other programs that use the file."""
 _PAUSE_S: Final = 0.05
 
 
@@ -34,18 +36,18 @@ def forget(
 ) -> None:
     """Deletes bags from a store, and deletes stores that were set aside.
 
-    Also those whose files are gone. The bags that have rows in one part with them go, too: they are
-    stored again.
+    It also deletes bags whose files are gone, and the bags that share a part with a deleted one,
+    which will be stored again.
 
     Args:
-        file: the store; nothing is done if it is absent.
+        file: the store; it may be absent.
         bag_dir: the bag directory.
         bags: their paths below it.
-        times: bags that have something of these go, too.
+        times: bags with messages in these windows are deleted, too.
 
     Raises:
-        BagError: it cannot be changed, is of another version, or another program uses it all the
-            time.
+        BagError: the file cannot be changed, is of another version, or another program uses it all
+            the time.
     """
     try:
         for leftover in leftovers(file):
@@ -63,12 +65,12 @@ def forget(
 
 
 def leftovers(file: Path) -> list[Path]:
-    """Returns what was set aside of a database, and copies that a program did not finish."""
+    """Returns the files of a database that were set aside, and unfinished copies of it."""
     return [*file.parent.glob(f"{file.name}.aside*"), *file.parent.glob(f".{file.name}.*.tmp*")]
 
 
 def rewrite(base: sqlite3.Connection) -> None:
-    """Writes a database again without what was deleted, and empties its write-ahead log.
+    """Writes a database again without deleted rows, and empties its write-ahead log.
 
     Raises:
         sqlite3.Error: there is no space for that, or other programs read it all the time.
@@ -96,15 +98,15 @@ def _delete_bags_and_unused(
         if any(time.overlaps(first, last) for time in times) or not (bag_dir / path).exists()
     ]
     delete_bags(base, [*bags, *gone])
-    # Without those beside them another part of the same ten minutes may lack a bag.
-    while beside := _beside_deleted(base):
-        delete_bags(base, beside)
+    # Deleting these may leave another part that lacks a bag of its ten minutes.
+    while sharing := _bags_sharing_parts(base):
+        delete_bags(base, sharing)
     _delete_unused(base)
     base.execute("COMMIT")
 
 
-def _beside_deleted(base: sqlite3.Connection) -> list[str]:
-    """Returns the bags that have rows in one part with bags that are deleted."""
+def _bags_sharing_parts(base: sqlite3.Connection) -> list[str]:
+    """Returns the bags that have rows in a part which also has rows of deleted bags."""
     rows = base.execute(
         "SELECT DISTINCT bag.path FROM part, json_each(part.bags) JOIN bag ON bag.id = value"
         " WHERE EXISTS (SELECT 1 FROM json_each(part.bags) AS other"
@@ -114,11 +116,8 @@ def _beside_deleted(base: sqlite3.Connection) -> list[str]:
 
 
 def _delete_unused(base: sqlite3.Connection) -> None:
-    """Deletes what only deleted bags had: topics, definitions, and what their summaries say.
-
-    What `metadata.yaml` lists is read again: some of the files may be gone.
-    """
-    base.execute("DELETE FROM listing")
+    """Deletes the topics, definitions and summaries that only deleted bags had."""
+    base.execute("DELETE FROM listing")  # of `metadata.yaml`, which is read again
     base.execute("DELETE FROM topic WHERE id NOT IN (SELECT topic FROM part)")
     base.execute("DELETE FROM definition WHERE id NOT IN (SELECT definition FROM topic)")
     base.execute(UNUSED_SUMMARIES)

@@ -1,16 +1,18 @@
 """The columns of closed bags in one SQLite file that outlives the process.
 
-Everything here is derived: deleting the file changes no answer, only how long it takes. A bag is
-stored whole or not at all, as parts for each topic (`part`), column by column (`part_column`). Once
-the ten minutes that it begins in are over, and then the hour, larger parts take their place: they
-have the rows of all bags of its recording that begin there. What is known of a column without
-unpacking it lies apart from the parts (`zone`), next to that of the same column in the other parts:
-a search reads it at once. A part names the bags that it has rows of: rows of a bag that is not in
-`bag` any more do not count. What follows from whole parts, as the path of the poses in them, is
-stored with them (`fragment`).
+Everything here is derived: deleting the file changes no answer, only how long it takes.
 
-A bag is known by its path below the bag directory, its size and mtime, and the mtime of the sidecar
-that says which of its messages count. Its number is never used twice.
+- A bag is stored whole or not at all, in parts for each topic (`part`), column by column
+  (`part_column`). Once the ten minutes that it begins in are over, and then the hour, larger parts
+  replace them. They have the rows of all bags of the recording that begin in that time.
+- A part names the bags that it has rows of. Rows of a bag that is no longer in `bag` do not count.
+- The zones of a column in all parts lie next to each other (`zone`), so that a search reads them
+  at once, without unpacking any column.
+- What is computed from whole parts, such as the path of the poses in them, is stored with them
+  (`fragment`).
+
+A bag is identified by its path below the bag directory, its size and mtime, and the mtime of the
+sidecar that says which of its messages count. Its number is never used twice.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 from functools import partial
-from itertools import accumulate, islice, pairwise
+from itertools import islice
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -45,7 +47,7 @@ from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.timeline import SEGMENT_BAGS
-from ros2_memory.storage.base import Channel, Definition, IntArray, Schema
+from ros2_memory.storage.base import Channel, Definition, IntArray, Mask, Schema
 
 if TYPE_CHECKING:
     import sqlite3
@@ -60,7 +62,7 @@ LONG_NS: Final[Ns] = 2 * Level.TEN_MINUTES.length
 """A bag that lasts longer becomes parts of an hour at once."""
 
 _FEW: Final = 2048
-"""Bags that are looked up one by one; for more of them all stored ones are read."""
+"""Bags that are looked up by their paths; for more of them all stored ones are read."""
 
 T = TypeVar("T")
 DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
@@ -69,9 +71,10 @@ Key: TypeAlias = "tuple[str, int, Ns, Ns, Ns, Ns]"
 
 
 class BagKey(NamedTuple):
-    """Identifies the bytes of a bag: a file below the bag directory, as `stat` showed it.
+    """Identifies the bytes of a bag.
 
-    And its first and last log time: another file may have been given the size and mtime of it.
+    The file is known by its path below the bag directory and by what `stat` says; the first and
+    last log time tell it from another file that was given the same size and mtime.
     """
 
     path: str
@@ -99,18 +102,30 @@ def relative(path: str, bag_dir: str) -> str:
 
 
 _KEY: Final = ", ".join(BagKey._fields)
-_ROW: Final = "2 * id + (hashed > 0)"
-"""A bag in one number, of which a week is read."""
+_CODE: Final = "2 * id + (hashed > 0)"
+"""A stored bag as one number, since the bags of a week are read; -1 stands for one not stored."""
+
+
+class StoredBags(NamedTuple):
+    """How some bags are stored.
+
+    Attributes:
+        numbers: of the bags; -1 for those that are not stored.
+        hashed: whether copies of a bag's messages can be recognised.
+    """
+
+    numbers: IntArray
+    hashed: Mask
 
 
 class State(NamedTuple):
-    """What changes with every change of the store.
+    """Tells whether the store has changed: then one of these numbers has.
 
     Attributes:
         part: the newest part.
-        deletion: the newest deletion: while it is the same, what was stored is stored.
-        change: the newest change, of this connection.
-        others: likewise, of other connections.
+        deletion: the newest deletion; while it is the same, no stored bag was deleted.
+        change: the newest change by this connection.
+        others: the newest change by other connections.
     """
 
     part: int
@@ -120,7 +135,12 @@ class State(NamedTuple):
 
 
 class Written(NamedTuple):
-    """How many bags are stored, and the numbers of the parts that were made of them."""
+    """What `ColumnStore.put` stored.
+
+    Attributes:
+        bags: how many bags are stored.
+        parts: the numbers of their new parts.
+    """
 
     bags: int
     parts: Sequence[int]
@@ -136,7 +156,7 @@ class PartHead(NamedTuple):
         last: the latest, inclusive.
         bags: the numbers of the bags that its rows are of, ascending.
         messages: how many rows it has.
-        dropped: the paths of its columns that were dropped, as the bags' share was used up.
+        dropped: the paths of its columns that were dropped, since the bags' share was used up.
         is_whole: whether it has all bags of its recording that begin in its slot of the clock.
     """
 
@@ -183,7 +203,7 @@ class ColumnStore(Database):
     # Reading
 
     def state(self) -> State:
-        """Returns what tells whether anything has changed."""
+        """Returns the state of now."""
 
         def ask(connection: sqlite3.Connection) -> State:
             [part] = connection.execute("SELECT max(id) FROM part").fetchone()
@@ -203,21 +223,22 @@ class ColumnStore(Database):
             }
             rows = connection.execute(
                 "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns,"
-                f" iif(definitions IN ('', ?), {_ROW}, -1) FROM bag WHERE size >= 0"
+                f" iif(definitions IN ('', ?), {_CODE}, -1) FROM bag WHERE size >= 0"
                 " ORDER BY first_ns, last_ns, path",
                 (self._definitions,),
             )
-            root, closed, summary_of = f"{bag_dir}{os.sep}", BagState.CLOSED, BagSummary.decoded
-            deletion, parts = self._deletion(connection), list[BagRows]()
-            while some := rows.fetchmany(SEGMENT_BAGS):
-                bags = (
-                    BagFile(
-                        root + path, size, mtime, closed, summary_of(schemas[schema], counts), *span
-                    )
-                    for path, size, mtime, schema, counts, *span, _ in some
-                )
-                parts.append(BagRows(bags, (deletion, np.array([row[-1] for row in some]))))
-            return parts
+            root, deletion = f"{bag_dir}{os.sep}", self._deletion(connection)
+            groups: list[BagRows] = []
+            while chunk := rows.fetchmany(SEGMENT_BAGS):
+                bags: list[BagFile] = []
+                codes: list[int] = []
+                for path, size, mtime, schema, counts, first, last, sidecar, code in chunk:
+                    summary = BagSummary.decoded(schemas[schema], counts)
+                    span = (first, last, sidecar)
+                    bags.append(BagFile(root + path, size, mtime, BagState.CLOSED, summary, *span))
+                    codes.append(code)
+                groups.append(BagRows(bags, (deletion, np.array(codes))))
+            return groups
 
         return self.read(ask, [])
 
@@ -225,75 +246,85 @@ class ColumnStore(Database):
         [number] = connection.execute("SELECT max(id) FROM deletion").fetchone()
         return self.offset + int(number or 0)
 
-    def rows_of(self, parts: Sequence[BagRows], bag_dir: str, deletion: int) -> Iterator[IntArray]:
-        """Yields twice the number less the `offset` of each bag; -1 where it is not stored.
+    def stored_bags(
+        self, groups: Sequence[BagRows], bag_dir: str, deletion: int
+    ) -> Iterator[StoredBags]:
+        """Yields how the bags of each group are stored.
 
-        One more where copies of its messages can be recognised. `deletion` is that of the `state`
-        of the moment: what was loaded with it is taken over once.
+        Args:
+            groups: the bags.
+            bag_dir: the bag directory.
+            deletion: that of the present `state`; what was loaded at it is still true.
         """
-        loaded = [bags.take_store_rows(deletion) for bags in parts]
+        loaded = [group.take_store_rows(deletion) for group in groups]
         keys = [
             (relative(file, bag_dir), *stamps)
-            for bags, rows in zip(parts, loaded, strict=True)
-            if rows is None
-            for file, stamps in zip(bags.files(), bags.stamps.tolist(), strict=True)
+            for group, codes in zip(groups, loaded, strict=True)
+            if codes is None
+            for file, stamps in zip(group.files(), group.stamps.tolist(), strict=True)
         ]
-        stored: dict[Key, int] = {}
-        if keys:
-            query = f"SELECT {_ROW}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
-            given = [self._definitions]
-            if len(keys) <= _FEW:
-                query += " AND path IN (SELECT value FROM json_each(?))"
-                given.append(json.dumps([path for path, *_ in keys]))
-            stored = self._asked(
-                lambda read: {row[1:]: row[0] for row in read}, stored, query, *given
-            )
-        asked = iter([stored.get(key, -1) for key in keys])
-        for bags, rows in zip(parts, loaded, strict=True):
-            yield np.fromiter(islice(asked, len(bags)), np.int64) if rows is None else rows
+        code_of = self._codes_of(keys) if keys else {}
+        queried = iter([code_of.get(key, -1) for key in keys])
+        for group, known in zip(groups, loaded, strict=True):
+            codes = known
+            if codes is None:
+                codes = np.fromiter(islice(queried, len(group)), np.int64)
+            is_stored = codes >= 0
+            numbers = np.where(is_stored, (codes >> 1) + self.offset, -1)
+            yield StoredBags(numbers, is_stored & (codes & 1 > 0))
+
+    def _codes_of(self, keys: Sequence[Key]) -> dict[Key, int]:
+        """Returns the codes of the bags that are stored; of others too if many are asked for."""
+        query = f"SELECT {_CODE}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
+        given = [self._definitions]
+        if len(keys) <= _FEW:
+            query += " AND path IN (SELECT value FROM json_each(?))"
+            given.append(json.dumps([path for path, *_ in keys]))
+        none: dict[Key, int] = {}
+        return self._select(
+            lambda rows: {tuple(key): code for code, *key in rows}, none, query, *given
+        )
 
     def numbers(self) -> IntArray:
-        """Returns the numbers of all bags that are stored, or were in part."""
+        """Returns the numbers of all bags, unfinished ones included."""
         none: list[int] = []
-        ids = self._asked(lambda rows: [row for (row,) in rows], none, "SELECT id FROM bag")
+        ids = self._select(lambda rows: [row for (row,) in rows], none, "SELECT id FROM bag")
         return np.array(ids, np.int64) + self.offset
 
     def below(self, level: Level) -> frozenset[int]:
         """Returns the numbers of the bags that have parts below a level."""
-        return self._asked(
+        return self._select(
             lambda rows: frozenset(self.offset + row for (row,) in rows), frozenset(), BELOW, level
         )
 
     def dropped(self) -> dict[str, Ns]:
-        """Returns the topics of which columns were dropped, with the log time (ns) of the first."""
+        """Returns the topics with dropped columns, and the earliest log time (ns) of these."""
         query = (
             "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
             " WHERE dropped <> '' GROUP BY name ORDER BY name"
         )
-        return self._asked(dict, {}, query)
+        return self._select(dict, {}, query)
 
     def oldest(self) -> Ns | None:
         """Returns the earliest log time (ns) of any bag; None without one."""
         query, none = "SELECT min(first_ns) FROM bag", list[tuple[Ns | None]]()
-        return next((first for (first,) in self._asked(list, none, query)), None)
+        return next((first for (first,) in self._select(list, none, query)), None)
 
     def beginning_before(self, before: Ns) -> list[BagKey]:
         """Returns the bags whose first message is earlier than a log time (ns)."""
         query = f"SELECT {_KEY} FROM bag WHERE first_ns < ?"
-        return self._asked(lambda rows: [*map(BagKey._make, rows)], [], query, before)
+        return self._select(lambda rows: [*map(BagKey._make, rows)], [], query, before)
 
     def paths(self) -> list[str]:
-        """Returns the paths of all bags, also of those that are stored in part."""
-        return self._asked(lambda rows: [path for (path,) in rows], [], "SELECT path FROM bag")
+        """Returns the paths of all bags, unfinished ones included."""
+        return self._select(lambda rows: [path for (path,) in rows], [], "SELECT path FROM bag")
 
     def topics(self) -> dict[int, Topic]:
         """Returns all topics that were ever stored, by their numbers."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, Topic]:
             topics = {
-                topic_number: topic
-                for topic_number, topic in self._topics.items()
-                if self.is_current(topic_number)
+                number: topic for number, topic in self._topics.items() if self.is_current(number)
             }
             rows = connection.execute(
                 "SELECT topic.id, name, topic.encoding, latched, layout, type,"
@@ -315,49 +346,45 @@ class ColumnStore(Database):
         return self._topics.get(number) or self.topics().get(number)
 
     def parts(self, topic: str, after: int = 0) -> list[PartHead]:
-        """Returns the parts of a topic, of all its types, that are newer than a part."""
+        """Returns the parts of a topic, of all its types, that are newer than part `after`."""
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT bags, id, topic, first_ns, last_ns, messages, dropped, level FROM part"
+                "SELECT id, topic, first_ns, last_ns, bags, messages, dropped, level FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?)"
                 " AND id > ? ORDER BY first_ns, id",
                 (topic, max(after - self.offset, 0)),
             ).fetchall()
-            # Thousands of small arrays would keep other memory from going back: one has all.
-            texts = [bags[1:-1] for bags, *_ in rows]
+            # One array for all: thousands of small ones would fragment the memory.
+            texts = [bags[1:-1] for *_, bags, _, _, _ in rows]
             all_bags = np.fromstring(",".join(texts), np.int64, sep=",") + self.offset
-            ends = accumulate((text.count(",") + 1 for text in texts), initial=0)
-            bags_of_parts = [all_bags[begin:end] for begin, end in pairwise(ends)]
-            return [
-                PartHead(
+            heads: list[PartHead] = []
+            begin = 0
+            for number, topic_id, first, last, bags, messages, dropped, level in rows:
+                end = begin + bags.count(",") + 1
+                head = PartHead(
                     self.offset + number,
-                    self.offset + topic_number,
+                    self.offset + topic_id,
                     first,
                     last,
-                    numbers,
+                    all_bags[begin:end],
                     messages,
                     tuple(json.loads(dropped)) if dropped else (),
                     level > Level.BAG,
                 )
-                for numbers, (
-                    _,
-                    number,
-                    topic_number,
-                    first,
-                    last,
-                    messages,
-                    dropped,
-                    level,
-                ) in zip(bags_of_parts, rows, strict=True)
-            ]
+                heads.append(head)
+                begin = end
+            return heads
 
         return self.read(ask, [])
 
     def zones(self, topic: int, path: str, parts: range) -> dict[int, Packed]:
-        """Returns what is known of a column in parts of a topic with these numbers.
+        """Returns the zones of a column of a topic, without its data, by the numbers of the parts.
 
-        By the numbers, which ascend; without values.
+        Args:
+            topic: the number of the topic.
+            path: of the column.
+            parts: the numbers to look for; those that are found ascend.
         """
 
         def ask(connection: sqlite3.Connection) -> dict[int, Packed]:
@@ -381,7 +408,7 @@ class ColumnStore(Database):
             " WHERE own.part = ? AND own.path = ?"
         )
         none: bytes | None = None
-        return self._asked(
+        return self._select(
             lambda rows: next((data for (data,) in rows), None),
             none,
             query,
@@ -391,12 +418,18 @@ class ColumnStore(Database):
     def fragments(
         self, kind: str, key: FragmentKey, also_before: Ns = 0
     ) -> list[tuple[FragmentKey, bytes]]:
-        """Returns a fragment of a kind, if it is stored, and those that begin so long before it.
+        """Returns a stored fragment, and those of its kind and settings that begin before it.
 
-        They are of the same settings, the newest first.
+        Args:
+            kind: of the fragments.
+            key: of the fragment.
+            also_before: how long (ns) before it the others begin at most.
+
+        Returns:
+            The newest first.
         """
         key_parts = self._ids(key.parts)
-        return self._asked(
+        return self._select(
             lambda rows: [
                 (key._replace(start=start, parts=self._numbers_of(parts)), data)
                 for start, parts, data in rows
@@ -409,10 +442,14 @@ class ColumnStore(Database):
         )
 
     def fragments_of_others(self, reading: str) -> list[Ns]:
-        """Returns where slices begin whose fragments all depend on other settings, newest first.
+        """Returns the log times (ns) at which only fragments of other settings begin.
 
-        `reading` ends the name of a kind that depends on these; nothing does of one that depends
-        on none.
+        Args:
+            reading: the present settings, with which names of kinds end. Kinds whose names end
+                with nothing do not depend on settings.
+
+        Returns:
+            The newest first.
         """
         query = (
             "SELECT DISTINCT start_ns FROM (SELECT start_ns FROM fragment"
@@ -421,16 +458,16 @@ class ColumnStore(Database):
             " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
             " ORDER BY start_ns DESC"
         )
-        return self._asked(lambda rows: [start for (start,) in rows], [], query, reading)
+        return self._select(lambda rows: [start for (start,) in rows], [], query, reading)
 
     def listings(self) -> dict[str, str]:
         """Returns what each `metadata.yaml` lists, by its folder's path as in a `BagKey`."""
-        return self._asked(dict, {}, "SELECT folder, listed FROM listing")
+        return self._select(dict, {}, "SELECT folder, listed FROM listing")
 
-    def _asked(
+    def _select(
         self, make: Callable[[sqlite3.Cursor], T], unknown: T, query: str, *given: str | int
     ) -> T:
-        """Returns what is made of the rows of a query; `unknown` where the file cannot be read."""
+        """Returns what is made of the rows of a query; `unknown` if the file cannot be read."""
         return self.read(lambda connection: make(connection.execute(query, given)), unknown)
 
     def _ids(self, parts: Iterable[int]) -> str:
@@ -442,10 +479,10 @@ class ColumnStore(Database):
     # Writing
 
     def put_fragments(self, kind: str, fragments: Sequence[tuple[FragmentKey, bytes]]) -> bool:
-        """Stores fragments in place of those of the same time, settings and some of the parts.
+        """Stores fragments whose parts are still stored.
 
-        Not those of a part that is not stored any more. What was stored of the same parts may be
-        damaged, so others take its place, too.
+        Each replaces the fragments of the same start and settings that share a part with it; the
+        one of the same parts, too, since that may be damaged.
         """
 
         def write(connection: sqlite3.Connection) -> None:
@@ -457,7 +494,7 @@ class ColumnStore(Database):
         return self.write(write)
 
     def put_listings(self, listings: dict[str, str]) -> bool:
-        """Replaces all that `listings` returns; returns whether the file has them then."""
+        """Replaces all listings; returns whether the file has the new ones now."""
 
         def write(connection: sqlite3.Connection) -> None:
             connection.execute("DELETE FROM listing")
@@ -468,14 +505,14 @@ class ColumnStore(Database):
         return self.write(write)
 
     def put(self, bags: Sequence[ReadBag], tables: Sequence[Table], level: Level) -> Written:
-        """Stores bags of one recording in the same parts, in place of what they were stored with.
+        """Stores bags of one recording in common parts, which replace their old ones.
 
-        One with parts of this level stays as it is: another program has stored it. One that
-        changed meanwhile is left out.
+        A bag that has parts of this level already stays as it is: another program has stored it. A
+        bag that has changed meanwhile is left out.
 
         Args:
-            bags: those of the tables, by their numbers there.
-            tables: with all of their messages.
+            bags: by their numbers in the tables.
+            tables: all of their messages.
             level: of the parts.
         """
         written = Written(0, ())
@@ -488,26 +525,26 @@ class ColumnStore(Database):
                 f" AND id NOT IN ({BELOW})",
                 (self._definitions, json.dumps([bag.key.path for bag in bags]), level),
             )
-            stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
-            missing = {
-                number: bag
-                for number, bag in enumerate(bags)
-                if bag.key not in stored or (bag.hashed and not stored[bag.key])
-            }
-            new = {number: bag for number, bag in missing.items() if bag.is_current()}
+            is_hashed = {BagKey(*key): bool(hashed) for *key, hashed in rows}
+            new: dict[int, ReadBag] = {}
+            stored = 0
+            for number, bag in enumerate(bags):
+                if bag.key in is_hashed and (is_hashed[bag.key] or not bag.hashed):
+                    stored += 1
+                elif bag.is_current():
+                    new[number] = bag
             delete_bags(connection, [bag.key.path for bag in new.values()])
-            parts = insert_bags(
+            ids = insert_bags(
                 connection, new, tables, self._definitions, self._layouts, level=level
             )
-            done = len(bags) - len(missing) + len(new)
-            written = Written(done, [self.offset + row for row in parts])
+            written = Written(stored + len(new), [self.offset + part for part in ids])
 
         return written if self.write(write) else Written(0, ())
 
     def renew(self, key: BagKey, bag: BagFile) -> bool:
-        """Keeps what is stored of a bag whose sidecar is another one now; returns whether it did.
+        """Gives a stored bag the mtime of its new sidecar; returns whether it did.
 
-        Only if it was stored with as many messages of each topic as it has now.
+        It does so only if the bag was stored with as many messages of each topic as it has now.
         """
 
         def write(connection: sqlite3.Connection) -> bool:
@@ -530,12 +567,12 @@ class ColumnStore(Database):
     ) -> bool:
         """Stores a bag as parts, group by group; returns whether it did.
 
-        A bag that is stored in part is none: it has its key only once the last group is written.
-        Its rows go where that is not reached.
+        The bag counts as stored only once the last group is written. If that is not reached, its
+        rows are deleted.
 
         Args:
-            to_store: the bag; whether it is current is asked with each group.
-            groups: all of its messages, in several goes. What they raise is raised here.
+            to_store: the bag; its `is_current` is called for each group.
+            groups: all of its messages; errors of the iterator are raised here.
             budget: how many bytes the parts may take.
         """
         long = LongBag(to_store, self._definitions, budget)
@@ -547,35 +584,34 @@ class ColumnStore(Database):
             is_whole = goes_on and self.write(long.end)
         finally:
             if not is_whole:
-                self.write(long.delete_half)
+                self.write(long.delete_unfinished)
         return is_whole
 
     def thin(self, shares: Sequence[tuple[Sequence[int], int]], max_share: float) -> bool:
-        """Drops the columns of the largest topics of some parts, beyond what these may take.
+        """Drops the columns of the largest topics of parts that take more than their share.
 
         Args:
-            shares: the numbers of parts, and how many bytes these may take in any case; more as
-                long as all parts take less than their share.
+            shares: groups of parts, and how many bytes each group may take in any case. It may take
+                more while all parts together take less than `max_share`.
             max_share: of the bytes of all bags.
         """
 
         def write(connection: sqlite3.Connection) -> None:
             usual = bytes_of_topics(connection)
             stored, taken = _query_merged_bytes(connection)
-            for parts, at_least in shares:
+            for parts, share in shares:
                 if all(map(self.is_current, parts)):
                     numbers = [part - self.offset for part in parts]
                     spare = round(max_share * stored) - taken
-                    taken -= thin_parts(connection, numbers, usual, at_least, spare)
+                    taken -= thin_parts(connection, numbers, usual, share, spare)
 
         return not shares or self.write(write)
 
     def delete(self, paths: Sequence[str]) -> bool:
-        """Deletes bags, and the parts and summaries that are of none that is left."""
+        """Deletes bags, and the parts and summaries that no other bag has."""
 
         def write(connection: sqlite3.Connection) -> None:
             delete_bags(connection, paths)
-            # Those that state pauses are of one bag alone.
             connection.execute(UNUSED_SUMMARIES)
 
         return self.write(write)
@@ -585,7 +621,7 @@ class ColumnStore(Database):
         return self.read(_query_merged_bytes, (0, 0))
 
     def used_bytes(self) -> int:
-        """Returns the bytes of the file that hold something."""
+        """Returns the bytes of the pages in use."""
 
         def ask(connection: sqlite3.Connection) -> int:
             pages, free, size = (
@@ -600,12 +636,12 @@ class ColumnStore(Database):
 def _insert_fragment(
     connection: sqlite3.Connection, identity: tuple[str, str, Ns], parts: str, data: bytes
 ) -> None:
-    """Stores a fragment if all of its parts are stored, in place of others of some of them.
+    """Stores a fragment if all of its parts are stored; see `ColumnStore.put_fragments`.
 
     Args:
         connection: to the store.
         identity: the fragment's kind, settings and start.
-        parts: the numbers of its parts in the file, as JSON.
+        parts: the ids of its parts, as JSON.
         data: of the fragment.
     """
     inserted = connection.execute(
@@ -617,7 +653,7 @@ def _insert_fragment(
         (*identity, parts, data, parts, parts),
     ).fetchall()
     for (number,) in inserted:
-        # What followed before there were all of these parts is not asked for again.
+        # A fragment that was made before all of these parts existed is not asked for again.
         older = connection.execute(
             "DELETE FROM fragment WHERE kind = ? AND settings = ? AND start_ns = ?"
             " AND id <> ? AND id IN (SELECT fragment FROM fragment_part"

@@ -1,10 +1,11 @@
-"""Parts, and what else is written into the tables of a store: bags and topics.
+"""Writes bags, topics and parts into the tables of a store.
 
-A part is the rows of one topic in some bags of a recording, column by column. Beside the columns of
-the topic's layout it has `#log_time`, `#bag` (the number of each row's bag) and, where copies of a
-message of some bag may lie in other recordings, `#payload_hash`, `#delay` (how much later a message
-was received than published) and the zone of `#publish_time`. In rows of its other bags the hash is
-`UNHASHED` and the delay 0. The owners of the elements of a sequence lie under its path and `#`.
+A part has the rows of one topic in some bags of a recording, column by column. Beside the columns
+of the topic's layout it has `#log_time` and `#bag` (the number of each row's bag). If other
+recordings may have copies of its messages, it also has `#payload_hash`, `#delay` (the time from
+publishing to receiving a message) and the zone of `#publish_time`; in rows of bags without copies
+the hash is `UNHASHED` and the delay 0. The owners of the elements of a sequence have its path with
+`#` behind it.
 """
 
 from __future__ import annotations
@@ -14,13 +15,11 @@ from collections import defaultdict
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
-from itertools import chain, repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.columns.pack import Packed, compressed, pack
-from ros2_memory.columns.steps import EXACT
 from ros2_memory.columns.stored import Layout, columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -38,10 +37,10 @@ PART_NS: Final[Ns] = 3600 * NS_PER_S
 
 
 class Level(IntEnum):
-    """What the bags of a part have in common, but for their recording.
+    """The slot of the clock whose bags, of one recording, are in a part together.
 
-    A part of a level takes the place of those below it. Few large parts are read and followed from
-    sooner than many small ones; the newest bags are stored at once all the same.
+    The newest bags are stored at once, each in parts of its own. Parts of a higher level replace
+    them later: a few large parts are read sooner than many small ones.
     """
 
     BAG = 0
@@ -50,12 +49,12 @@ class Level(IntEnum):
 
     @property
     def length(self) -> Ns:
-        """How long (ns) the slots of the clock are in which the bags begin; 0 of one bag."""
+        """The length of a slot (ns); 0 for a single bag."""
         return (0, 600 * NS_PER_S, PART_NS)[self]
 
 
 _MOST_ROWS: Final = 24_576
-"""Of a part, about: who asks about one message unpacks columns of all."""
+"""Of a part, about: a question about one message unpacks whole columns."""
 BELOW: Final = "SELECT value FROM part, json_each(part.bags) WHERE level < ?"
 """Selects the bags that have parts below a level."""
 _MOST_INTEGER: Final = 2**63 - 1
@@ -67,11 +66,11 @@ PAYLOAD_HASH: Final = "#payload_hash"
 BAG: Final = "#bag"
 DELAY: Final = "#delay"
 ZONE_ALONE: Final = "zone"
-"""The codec of a column of which there is never more than the zone."""
+"""The codec of a column that only has a zone."""
 DROPPED: Final = "dropped"
-"""The codec of a column of which only the zone is stored: the rest is beyond the bags' share."""
+"""The codec of a column whose bytes were dropped, since they are beyond the bags' share."""
 UNUSED_SUMMARIES: Final = "DELETE FROM summary WHERE id NOT IN (SELECT summary FROM bag)"
-ALWAYS: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
+_NEVER_DROPPED: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class PackedPart:
         last: the latest, inclusive.
         messages: how many rows.
         bags: the numbers of the bags that its rows are of, ascending.
-        columns: by their paths, packed; the data is compressed.
+        columns: packed, by their paths; the data is compressed.
     """
 
     first: Ns
@@ -93,43 +92,44 @@ class PackedPart:
     columns: Mapping[str, Packed]
 
     @cached_property
-    def first_of(self) -> dict[bytes, str]:
-        """By data, the path of the first column that has it: it is stored once."""
-        paths = reversed([*self.columns.items()])
-        return {packed.data: path for path, packed in paths if packed.data}
+    def path_of_data(self) -> dict[bytes, str]:
+        """The path of the first column with some data: equal data is stored once."""
+        path_of: dict[bytes, str] = {}
+        for path, packed in self.columns.items():
+            if packed.data:
+                path_of.setdefault(packed.data, path)
+        return path_of
 
     @property
     def size(self) -> int:
         """How many bytes its data takes."""
-        return sum(map(len, self.first_of))
+        return sum(map(len, self.path_of_data))
 
 
 def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
-    """Returns the rows of a table of a layout, each with the number of its bag, as a part."""
-    common: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
-    packed: dict[str, Packed] = {}
+    """Returns the rows of a table as a part.
+
+    Args:
+        layout: of the table.
+        table: the rows.
+        bags: the number of each row's bag.
+    """
+    packed = {LOG_TIME: pack(table.log_times), BAG: pack(bags)}
     if table.payload_hashes is not None:
         is_hashed = table.payload_hashes != UNHASHED
-        common[PAYLOAD_HASH] = table.payload_hashes
-        common[DELAY] = np.where(is_hashed, table.log_times - table.publish_times, 0)
-        # Those of a table without columns may be log times.
+        packed[PAYLOAD_HASH] = pack(table.payload_hashes)
+        packed[DELAY] = pack(np.where(is_hashed, table.log_times - table.publish_times, 0))
+        # A table without columns may have log times in place of publish times.
         if is_hashed.all() or "" not in table.left_out:
             published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
             packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
-    steps = (kind.step for kind in layout.slots.values())
-    columns = [*common.values(), *(column for _, column in columns_in(table))]
-    packs = map(pack, columns, chain(repeat(EXACT, len(common)), steps))
-    packed.update(zip((*common, *layout.slots), packs, strict=True))
-    return PackedPart(
-        int(table.log_times[0]),
-        int(table.log_times[-1]),
-        len(table),
-        tuple(np.unique(bags).tolist()),
-        {
-            path: replace(column, data=compressed(column.data)) if column.data else column
-            for path, column in packed.items()
-        },
-    )
+    for path, column in columns_in(table):
+        packed[path] = pack(column, layout.slots[path].step)
+    for path, whole in packed.items():
+        if whole.data:
+            packed[path] = replace(whole, data=compressed(whole.data))
+    first, last = int(table.log_times[0]), int(table.log_times[-1])
+    return PackedPart(first, last, len(table), tuple(np.unique(bags).tolist()), packed)
 
 
 class ReadBag(NamedTuple):
@@ -138,8 +138,8 @@ class ReadBag(NamedTuple):
     Attributes:
         key: of the bag.
         bag: the bag, for its times.
-        hashed: whether tables have the hashes of all its payloads.
-        is_current: whether the bag may be stored, asked once nobody else can write.
+        hashed: whether its tables have the hashes of all payloads.
+        is_current: returns whether the bag may still be stored; called inside the transaction.
     """
 
     key: BagKey
@@ -151,7 +151,8 @@ class ReadBag(NamedTuple):
 class LongBag:
     """A bag that is written in several transactions.
 
-    What writes returns whether it may be written on, as that transaction found.
+    `begin`, `add` and `end` return whether writing may go on: False if the file was replaced, or
+    the bag was deleted or has changed.
 
     Args:
         to_store: the bag.
@@ -169,7 +170,7 @@ class LongBag:
         self._layouts = Layouts()
 
     def begin(self, connection: sqlite3.Connection) -> bool:
-        """Inserts the bag with a key that none has, in place of what its path was stored with."""
+        """Inserts the bag in place of one with its path; a size of -1 marks it as unfinished."""
         if not self._bag.is_current():
             return False
         key = self._bag.key
@@ -184,18 +185,18 @@ class LongBag:
             return False
         self._lacks_definitions |= any(map(lacks_definitions, tables))
         parts: list[int] = []
-        for table in tables:
+        for table in filter(len, tables):
             topic, layout = topic_of(connection, table, self._layouts)
-            pieces = map(_in_parts, _by_hour(table)) if len(table) else ()
-            for rows in chain.from_iterable(pieces):
-                part = pack_rows(layout, rows, np.full(len(rows), self._number, np.int64))
-                parts.append(_insert_part(connection, topic, part, Level.HOUR))
+            for hour in _split_by_hour(table):
+                for rows in _split_by_size(hour):
+                    part = pack_rows(layout, rows, np.full(len(rows), self._number, np.int64))
+                    parts.append(_insert_part(connection, topic, part, Level.HOUR))
         share = round(self._share * sum(map(len, tables)))
         thin_parts(connection, parts, bytes_of_topics(connection), share)
         return True
 
     def end(self, connection: sqlite3.Connection) -> bool:
-        """Gives the bag its key: now it is stored."""
+        """Gives the bag its size: now it is stored."""
         if not self._may_go_on(connection):
             return False
         definitions = self._definitions if self._lacks_definitions else ""
@@ -205,22 +206,22 @@ class LongBag:
         )
         return True
 
-    def delete_half(self, connection: sqlite3.Connection) -> None:
-        """Deletes the parts of it that were written, where it is not stored whole."""
-        if self._is_there(connection):
+    def delete_unfinished(self, connection: sqlite3.Connection) -> None:
+        """Deletes the parts that were written."""
+        if self._exists(connection):
             delete_bags(connection, [self._bag.key.path])
 
     def _may_go_on(self, connection: sqlite3.Connection) -> bool:
-        return self._is_there(connection) and self._bag.is_current()
+        return self._exists(connection) and self._bag.is_current()
 
-    def _is_there(self, connection: sqlite3.Connection) -> bool:
+    def _exists(self, connection: sqlite3.Connection) -> bool:
         # Meanwhile the file may have been lost, or another program may have deleted the bag.
         row = connection.execute("SELECT 1 FROM bag WHERE id = ?", (self._number,)).fetchone()
         return connection is self._connection and row is not None
 
 
 def bytes_of_topics(connection: sqlite3.Connection) -> dict[int, float]:
-    """Returns how many bytes the parts of each topic take, with those that were dropped."""
+    """Returns how many bytes the parts of each topic take, dropped columns included."""
     return dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
 
 
@@ -228,43 +229,49 @@ def thin_parts(
     connection: sqlite3.Connection,
     parts: Sequence[int],
     usual: Mapping[int, float],
-    at_least: int,
-    spare: int = -(2**62),
+    share: int,
+    spare: int | None = None,
 ) -> int:
     """Drops the columns of the largest topics of some parts; returns how many bytes they took.
 
-    Those that are the largest in all parts, so that not each topic has some parts without data.
+    The largest topics in the whole store are dropped first: else each topic would lack its columns
+    in some parts.
 
     Args:
         connection: to the store.
         parts: their numbers.
         usual: as `bytes_of_topics`.
-        at_least: how many bytes they may take in any case.
-        spare: how many they may take more than now; of less than 0, by how many less.
+        share: how many bytes the parts may take in any case.
+        spare: how many bytes they may take more than now (if negative, less), where that is more.
     """
     sizes: dict[int, dict[int, int]] = defaultdict(dict)
+    total = 0
     for part, topic, size in connection.execute(
         "SELECT id, topic, bytes FROM part WHERE id IN (SELECT value FROM json_each(?))"
         " AND dropped = ''",
         (json.dumps(parts),),
     ):
         sizes[topic][part] = size
-    of_topic = {topic: sum(by_part.values()) for topic, by_part in sizes.items()}
-    left, dropped = max(sum(of_topic.values()) + spare, at_least), 0
+        total += size
+    left = share if spare is None else max(share, total + spare)
+    dropped = 0
     for topic in sorted(sizes, key=lambda topic: usual[topic]):
-        left -= of_topic[topic]
-        for part, size in sizes[topic].items() if left < 0 else ():
-            dropped += size * _drop_columns(connection, topic, part)
+        left -= sum(sizes[topic].values())
+        if left >= 0:
+            continue
+        for part, size in sizes[topic].items():
+            if _drop_columns(connection, topic, part):
+                dropped += size
     return dropped
 
 
 def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> bool:
-    """Leaves of a part the zones of its columns, and its times; returns whether it had more."""
+    """Drops the columns of a part, but for times, hashes and zones; returns whether it had any."""
     rows = connection.execute(
         "SELECT path FROM part_column WHERE part = ? AND (length(data) > 0 OR same NOT NULL)",
         (part,),
     )
-    paths = [path for (path,) in rows if path not in ALWAYS]
+    paths = [path for (path,) in rows if path not in _NEVER_DROPPED]
     if not paths:
         return False
     listed = json.dumps(paths)
@@ -278,26 +285,24 @@ def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> bool
         (part, listed),
     )
     connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (listed, part))
-    # Who knows the part looks again.
-    _number_deletion(connection)
+    _note_deletion(connection)  # so that what is remembered of the part is read again
     return True
 
 
-def _number_deletion(connection: sqlite3.Connection) -> None:
-    """Gives the newest deletion the next number; the table has no other."""
+def _note_deletion(connection: sqlite3.Connection) -> None:
+    """Replaces the one row of `deletion` by a new one, whose number tells that rows changed."""
     connection.execute("DELETE FROM deletion")
     connection.execute("INSERT INTO deletion DEFAULT VALUES")
 
 
-def _by_hour(table: Table) -> Iterator[Table]:
-    """Yields the rows of a table by the hour that they are in."""
+def _split_by_hour(table: Table) -> Iterator[Table]:
     edges = np.flatnonzero(np.diff(table.log_times // PART_NS)) + 1
     for rows in np.split(np.arange(len(table)), edges):
         yield table.rows(rows)
 
 
-def _in_parts(table: Table) -> Iterator[Table]:
-    """Yields the rows of a table in as many parts as need be; those of one time are in one."""
+def _split_by_size(table: Table) -> Iterator[Table]:
+    """Yields a table in pieces of about `_MOST_ROWS`; rows of one log time stay together."""
     times = table.log_times
     edges = np.unique(np.searchsorted(times, times[_MOST_ROWS::_MOST_ROWS]))
     if not edges.any():
@@ -308,7 +313,7 @@ def _in_parts(table: Table) -> Iterator[Table]:
 
 
 def lacks_definitions(table: Table) -> bool:
-    """Returns whether a table has no columns: with other definitions it may have some."""
+    """Returns whether a table has no columns; it may have some with other definitions."""
     return "" in table.left_out
 
 
@@ -317,9 +322,9 @@ def _messages_of(bag: BagFile) -> int:
 
 
 def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: str) -> int:
-    """Inserts a bag; returns its number."""
+    """Inserts a bag; returns its id."""
     key, bag, hashed, _ = to_store
-    summary = _number_of(connection, "summary", topics=bag.summary.schema.to_json())
+    summary = _find_or_insert(connection, "summary", topics=bag.summary.schema.to_json())
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
         " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -337,22 +342,20 @@ def insert_bags(
     *,
     level: Level,
 ) -> list[int]:
-    """Inserts bags of one recording, in parts for each topic; returns the ids of these.
+    """Inserts bags of one recording, in parts for each topic; returns the ids of the parts.
 
     Args:
         connection: to the store.
         bags: by their numbers in the tables.
-        tables: with all messages of these bags, each of another topic or layout; and of others,
-            which are left out.
+        tables: all messages of these bags, a table for each topic and layout. Rows of other bags
+            are left out.
         definitions: as `ColumnStore` has them.
-        layouts: of tables before these.
+        layouts: remembers layouts.
         level: of the parts.
     """
-    lacking = {
-        number
-        for table in filter(lacks_definitions, tables)
-        for number in np.unique(table.bag_numbers).tolist()
-    }
+    lacking: set[int] = set()
+    for table in filter(lacks_definitions, tables):
+        lacking.update(np.unique(table.bag_numbers).tolist())
     ids = np.zeros(max(bags, default=0) + 1, np.int64)
     for number, bag in bags.items():
         ids[number] = insert_bag(connection, bag, definitions if number in lacking else "")
@@ -362,7 +365,7 @@ def insert_bags(
         if is_stored.any():
             topic, layout = topic_of(connection, table, layouts)
             rows = table if is_stored.all() else table.rows(np.flatnonzero(is_stored))
-            for piece in _in_parts(rows):
+            for piece in _split_by_size(rows):
                 part = pack_rows(layout, piece, ids[piece.bag_numbers])
                 parts.append(_insert_part(connection, topic, part, level))
     return parts
@@ -375,46 +378,41 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart, l
         (topic, part.first, part.last, part.messages, json.dumps(part.bags), part.size, level),
     )
     number = int(cursor.lastrowid or 0)
-    columns: list[tuple[int, str, str | None, bytes | None]] = []
     for path, packed in part.columns.items():
-        # Numbers that are rounded to one take no bytes, but are no constant.
+        least, greatest, nulls, words = packed.zone
+        zone = (_bound(least), _bound(greatest), nulls, words)
+        connection.execute(
+            "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (topic, path, number, packed.codec, packed.count, packed.error, *zone),
+        )
+        # Numbers that are all rounded to one take no bytes, but are no constant.
         if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}:
-            first = part.first_of.get(packed.data, path)
-            own = (None, packed.data) if first == path else (first, None)
-            columns.append((number, path, *own))
-    connection.executemany("INSERT INTO part_column VALUES (?, ?, ?, ?)", columns)
-    marks = ", ".join("?" * 10)
-    connection.executemany(
-        f"INSERT INTO zone VALUES ({marks})",
-        [
-            (topic, path, number, packed.codec, packed.count, packed.error, *_stored(packed.zone))
-            for path, packed in part.columns.items()
-        ],
-    )
+            first = part.path_of_data.get(packed.data, path)
+            same, data = (None, packed.data) if first == path else (first, None)
+            connection.execute(
+                "INSERT INTO part_column VALUES (?, ?, ?, ?)", (number, path, same, data)
+            )
     return number
 
 
-def _stored(zone: Zone) -> tuple[int | float | str | None, ...]:
-    """Returns a zone as SQLite can store it: bounds of a uint64 above its integers as texts."""
-    bounds: list[int | float | None] = [zone.least, zone.greatest]
-    stored = (
-        str(bound) if isinstance(bound, int) and bound > _MOST_INTEGER else bound
-        for bound in bounds
-    )
-    return (*stored, zone.nulls, zone.words)
+def _bound(number: float | None) -> float | str | None:
+    """Returns a bound of a zone for SQLite: a uint64 beyond its integers as text."""
+    if number is None or type(number) is float:
+        return number
+    return str(number) if number > _MOST_INTEGER else number
 
 
 def zone_of(
     least: float | str | None, greatest: float | str | None, nulls: int, words: str | None
 ) -> Zone:
-    """Returns the zone that was stored so."""
+    """Returns the zone that has these values in the table `zone`."""
     least = int(least) if isinstance(least, str) else least
     greatest = int(greatest) if isinstance(greatest, str) else greatest
     return Zone(least, greatest, nulls, words)
 
 
 class Layouts:
-    """Remembers the layouts of tables: those of one schema that leave out the same are the same."""
+    """Remembers layouts by schema and by the fields that are left out, which determine them."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Schema, tuple[tuple[str, str], ...]], tuple[Layout, str]] = {}
@@ -433,26 +431,26 @@ class Layouts:
 
 
 def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:
-    """Returns the number of a table's topic, which is inserted if it is new, and its layout."""
-    channel, (layout, described) = table.channel, layouts.of(table)
+    """Returns the id of a table's topic, which is inserted if it is new, and its layout."""
+    channel, (layout, layout_json) = table.channel, layouts.of(table)
     schema = channel.schema
-    definition = _number_of(
+    definition = _find_or_insert(
         connection, "definition", type=schema.name, encoding=schema.encoding, text=schema.text
     )
-    topic = _number_of(
+    topic = _find_or_insert(
         connection,
         "topic",
         name=channel.topic,
         encoding=channel.encoding,
         latched=channel.latched,
         definition=definition,
-        layout=described,
+        layout=layout_json,
     )
     return topic, layout
 
 
-def _number_of(connection: sqlite3.Connection, table: str, **values: str | bytes | int) -> int:
-    """Returns the id of the row with these values, which is inserted if it is new."""
+def _find_or_insert(connection: sqlite3.Connection, table: str, **values: str | bytes | int) -> int:
+    """Returns the id of the row with these values, which is inserted if there is none."""
     given = tuple(values.values())
     where = " AND ".join(f"{name} = ?" for name in values)
     row = connection.execute(f"SELECT id FROM {table} WHERE {where}", given).fetchone()
@@ -464,35 +462,43 @@ def _number_of(connection: sqlite3.Connection, table: str, **values: str | bytes
 
 
 def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
-    """Deletes bags, and the parts that have rows of none that is left."""
+    """Deletes bags, and the parts whose bags are all deleted."""
     deleted = connection.execute(
         "DELETE FROM bag WHERE path IN (SELECT value FROM json_each(?)) RETURNING id",
         (json.dumps(paths),),
     ).fetchall()
     if not deleted:
         return
-    # A part goes with the last of its bags.
-    gone = connection.execute(
+    parts_of_topic: dict[int, list[int]] = defaultdict(list)
+    for part, topic in connection.execute(
         "SELECT id, topic FROM part WHERE NOT EXISTS"
         " (SELECT 1 FROM json_each(part.bags) JOIN bag ON bag.id = value)"
-    ).fetchall()
-    for topic in {topic for _, topic in gone}:
-        parts = json.dumps([part for part, of_topic in gone if of_topic == topic])
-        # By the paths that the topic has: zones are ordered by these, and parts come last.
-        connection.execute(
-            "WITH RECURSIVE known (path) AS (SELECT min(path) FROM zone WHERE topic = :topic"
-            " UNION ALL SELECT (SELECT min(path) FROM zone WHERE topic = :topic"
-            " AND path > known.path) FROM known WHERE known.path IS NOT NULL)"
-            " DELETE FROM zone WHERE topic = :topic AND path IN (SELECT path FROM known)"
-            " AND part IN (SELECT value FROM json_each(:parts))",
-            {"topic": topic, "parts": parts},
+    ):
+        parts_of_topic[topic].append(part)
+    for topic, parts in parts_of_topic.items():
+        _delete_zones(connection, topic, parts)
+        ids = [(part,) for part in parts]
+        connection.executemany(
+            "DELETE FROM fragment WHERE id IN (SELECT fragment FROM fragment_part WHERE part = ?)",
+            ids,
         )
-    numbers = [(part,) for part, _ in gone]
-    connection.executemany(
-        "DELETE FROM fragment WHERE id IN (SELECT fragment FROM fragment_part WHERE part = ?)",
-        numbers,
-    )
+        connection.executemany("DELETE FROM part_column WHERE part = ?", ids)
+        connection.executemany("DELETE FROM part WHERE id = ?", ids)
     connection.execute("DELETE FROM fragment_part WHERE fragment NOT IN (SELECT id FROM fragment)")
-    connection.executemany("DELETE FROM part_column WHERE part = ?", numbers)
-    connection.executemany("DELETE FROM part WHERE id = ?", numbers)
-    _number_deletion(connection)
+    _note_deletion(connection)
+
+
+def _delete_zones(connection: sqlite3.Connection, topic: int, parts: Sequence[int]) -> None:
+    """Deletes the zones of some parts of a topic.
+
+    The table is ordered by topic, path and part. So the paths of the topic are listed first, one by
+    one; to delete by part alone would read all zones of the topic.
+    """
+    connection.execute(
+        "WITH RECURSIVE known (path) AS (SELECT min(path) FROM zone WHERE topic = :topic"
+        " UNION ALL SELECT (SELECT min(path) FROM zone WHERE topic = :topic"
+        " AND path > known.path) FROM known WHERE known.path IS NOT NULL)"
+        " DELETE FROM zone WHERE topic = :topic AND path IN (SELECT path FROM known)"
+        " AND part IN (SELECT value FROM json_each(:parts))",
+        {"topic": topic, "parts": json.dumps(parts)},
+    )

@@ -95,7 +95,7 @@ def test_a_file_that_is_replaced_while_a_scan_is_read_hides_no_row(tmp_path: Pat
     assert check_rows(world, "/chatter") == check_rows(world, "/odom") == 1
 
 
-@pytest.mark.parametrize("name", ["parts", "topics", "part_data", "state", "rows_of"])
+@pytest.mark.parametrize("name", ["parts", "topics", "part_data", "state", "stored_bags"])
 def test_a_store_that_fails_while_it_is_asked_hides_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
