@@ -1,8 +1,8 @@
-"""Scans a topic: from the store where it has the rows, else from the bags, each message once.
+"""Scans a topic: stored parts, and the bags that are not stored, each message once.
 
-A scan yields `Rows`: a table, and which of its rows count. Rows of different tables may overlap in
-time where recordings do. Queries open scans by `history.scan`; parts come from the `Scanner`, whose
-columns are unpacked when they are first used.
+A scan yields `Rows`: a table, and which of its rows count. Rows of different tables overlap in time
+if recordings do. Queries open scans by `history.scan`. Parts come from the `Scanner`; their columns
+are unpacked when they are first used.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.store import PartHead
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.zones import PartZones
+    from ros2_memory.index.segment import TopicExtent
     from ros2_memory.index.timeline import Timeline
 
 Decode: TypeAlias = "Callable[[BagFile, str, bool], Iterable[Table]]"
@@ -53,18 +54,25 @@ Decode: TypeAlias = "Callable[[BagFile, str, bool], Iterable[Table]]"
 _SLICE_NS: Final = 600 * NS_PER_S
 """How much of overlapping recordings is compared at a time."""
 STRETCH_NS: Final[Ns] = 4 * 3600 * NS_PER_S
-"""What follows from the rows of so much of the clock is joined once."""
+"""Fragments of so much of the clock are joined once."""
 _ATTEMPTS: Final = 5
-"""How often a scan looks what is stored, while that changes; then it reads the bags."""
+"""How often a scan looks up what is stored, while that changes; then it reads the bags."""
 _MOST_DECODED: Final = 16
 """Bags whose tables a scan keeps, to compare them with others."""
 _MOST_BYTES: Final = 64 << 20
-"""Columns that are held at once; those of a bag with more are not, and it is read."""
+"""Columns in memory at once; a bag with more has none, and its messages are read."""
 _TOO_LARGE: Final = "its messages are too large to hold their columns"
 
 
 class _Source(NamedTuple):
-    """Where rows come from: a part, or a bag that is not stored."""
+    """Where rows come from: a part, or a bag that is not stored.
+
+    Attributes:
+        first: the log time (ns) of the first row.
+        last: the log time (ns) of the last row.
+        part: the part, or None.
+        bag: the bag, or None.
+    """
 
     first: Ns
     last: Ns
@@ -73,7 +81,7 @@ class _Source(NamedTuple):
 
     @property
     def number(self) -> int | None:
-        """The number of the part; None of a bag."""
+        """The number of the part; None if it is a bag."""
         return None if self.part is None else self.part.number
 
 
@@ -82,9 +90,9 @@ class Stretch(NamedTuple):
 
     Attributes:
         window: the stretch.
-        last: no row of a part that begins in it is later (log time, ns).
-        parts: the numbers of the whole parts that all rows in it and beside it are of; None where
-            there are others, or the scan has not all of them.
+        last: the latest log time (ns) of the parts that begin in it.
+        parts: the numbers of the whole parts with all rows in it and beside it; None if bags or
+            parts of a single bag have some, too, or the scan does not have all of them.
     """
 
     window: TimeWindow
@@ -92,7 +100,7 @@ class Stretch(NamedTuple):
     parts: tuple[int, ...] | None
 
     def key(self, settings: str = "") -> FragmentKey | None:
-        """Returns the key of fragments made of its rows; None where these rows may change."""
+        """Returns the key of fragments made of its rows; None if these rows may still change."""
         return None if self.parts is None else FragmentKey(self.window.start, settings, self.parts)
 
 
@@ -106,19 +114,18 @@ class Scan:
         window: of log time.
         timeline: the bags.
         decode: decodes a topic of a bag that is not stored.
-        shared: the half-open spans in which different recordings may hold copies, in order; once
-            it is made, those of them in which two sources may have the same messages.
-        repeats_latched: whether recordings may have received a message again, as a latched one.
-        may_match: says by zones which parts may have rows that are wanted, of each or of all;
-            the others are left out.
-        may_not_match: whether the others are yielded, too, as such.
-        may_be_empty: whether rows are yielded also where none of them counts. Which do is then
-            found out only where that is asked.
+        shared: half-open spans, in order, in which different recordings may have copies. The scan
+            reduces them to those in which two sources may have the same messages.
+        repeats_latched: whether recordings may have received a latched message again.
+        may_match: returns which parts may have rows that are wanted, by their zones; the other
+            parts are left out.
+        may_not_match: whether the other parts are yielded all the same, marked as such.
+        may_be_empty: whether rows are yielded before it is known that any of them counts.
         within: half-open spans, in order and apart; tables that overlap none of them are left out.
-            None: none is.
+            None: all tables are wanted.
         stored: whether bags that are not stored are left out.
-        check: is called before each table with a log time that what is left does not lie behind
-            (with `newest_first`: is not later than); raises where the call's time is over.
+        check: called before each table with its first log time (with `newest_first` its last one);
+            raises when the call's time is over.
     """
 
     scanner: Scanner
@@ -143,18 +150,17 @@ class Scan:
         self._latched_again: dict[object, IntArray] = {}
         self._latched_again_since = MAX_NS
         self.shared = _overlapping(self.shared, self.window)
-        self._coverage: Coverage | None = None
-        sources = self._settled(self._reach())  # which also sets `_coverage`
+        self._coverage, sources = self._read_sources(self._reach())
         self._sources = self._ordered(sources)
         self._firsts = np.array([source.first for source in self._sources], np.int64)
         self._lasts = np.array([source.last for source in self._sources], np.int64)
         self._latest = np.maximum.accumulate(self._lasts)
         if self.shared:
-            self.shared = self._holding_copies()
-        self._ends = [stop for _, stop in self.shared]
+            self.shared = [span for span in self.shared if self._may_have_copies(span)]
+        self._shared_stops = [stop for _, stop in self.shared]
 
     def _reach(self) -> TimeWindow:
-        """Returns the window, and the times beside it in which it may have copies of messages."""
+        """Returns the window, widened by the times in which copies of its messages may lie."""
         if self.repeats_latched:
             return TimeWindow.everything()
         return self.window.widened(2 * COPY_HORIZON_NS) if self.shared else self.window
@@ -162,22 +168,24 @@ class Scan:
     def rows(
         self, *, newest_first: bool = False, among: TimeWindow | None = None
     ) -> Iterator[Rows]:
-        """Yields what counts of the topic in the window.
+        """Yields the rows of the topic that count in the window.
 
-        In the order of the first log time of each table, or with `newest_first` of the last, from
-        the newest on. Only of the tables that reach into `among`, where that is given.
+        Args:
+            newest_first: whether tables are in the order of their last log times, the newest
+                first; else in the order of their first log times.
+            among: if given, only tables that reach into this window are yielded.
 
         Raises:
-            QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
+            QueryTimeoutError: raised by `check`.
+            GoneError: stored rows were deleted meanwhile.
         """
         sources, ruled_out = self._asked_sources(newest_first=newest_first, among=among)
         waiting: list[Rows] = []
         for nth, source in enumerate(sources):
             self.check(source.last if newest_first else source.first)
-            waiting += [
-                Rows(unit, partial(self._counting, unit), source.number not in ruled_out)
-                for unit in self._units(source)
-            ]
+            for unit in self._units(source):
+                may_match = source.number not in ruled_out
+                waiting.append(Rows(unit, partial(self._counting_rows, unit), may_match))
             # A bag has a table for each type: one may be later than the next bag, the other not.
             waiting.sort(key=lambda rows: -rows.last if newest_first else rows.first)
             after = sources[nth + 1] if nth + 1 < len(sources) else None
@@ -189,11 +197,11 @@ class Scan:
     def _asked_sources(
         self, *, newest_first: bool, among: TimeWindow | None
     ) -> tuple[Sequence[_Source], set[int]]:
-        """Returns the sources that are asked for, in their order; and the parts without a match."""
+        """Returns the sources to read, in their order, and the parts that cannot match."""
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
-        # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
+        # Before the zones are read: a part outside of the window says nothing about what matches.
         sources = [s for s in sources if self.window.overlaps(s.first, s.last)]
         ruled_out: set[int] = set()
         if self.may_match is not None:
@@ -207,30 +215,36 @@ class Scan:
         return sources, ruled_out
 
     def stretches(self, beside: Ns = 0) -> list[Stretch]:
-        """Returns the stretches of the clock that the window consists of, the newest first.
+        """Returns the stretches of the clock that make up the window, the newest first.
 
-        Those of `STRETCH_NS` in which all rows are of whole parts, also those so long (ns) before
-        and after, and what lies between them.
+        Stretches of `STRETCH_NS` are settled: whole parts have all of their rows. What lies between
+        them is not.
+
+        Args:
+            beside: how long (ns) before and after a settled stretch whole parts have all rows, too.
         """
+        settled = self._settled_stretches(beside) if self._sources else []
         stretches: list[Stretch] = []
-        until = self.window.stop
+        stop = self.window.stop
+        for stretch in settled:
+            stretches += [*self._unsettled_stretch(stretch.window.stop, stop), stretch]
+            stop = stretch.window.start
+        return [*stretches, *self._unsettled_stretch(self.window.start, stop)]
 
-        def between(start: Ns) -> Iterator[Stretch]:
-            if start < until:
-                latest = self._latest[: np.searchsorted(self._firsts, until)].tolist()
-                yield Stretch(TimeWindow(start, until), max([until - 1, *latest[-1:]]), None)
-
-        for stretch in self._settled_stretches(beside) if self._sources else ():
-            stretches += [*between(stretch.window.stop), stretch]
-            until = stretch.window.start
-        return [*stretches, *between(self.window.start)]
+    def _unsettled_stretch(self, start: Ns, stop: Ns) -> list[Stretch]:
+        """Returns a stretch whose rows may change; none if it is empty."""
+        if start >= stop:
+            return []
+        latest = self._latest[: np.searchsorted(self._firsts, stop)]
+        last = max([stop - 1, *latest[-1:].tolist()])
+        return [Stretch(TimeWindow(start, stop), last, None)]
 
     def whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
-        """Returns the whole parts that all rows in a window are of; None where others are, too.
+        """Returns the whole parts with all rows in a window; None if there are other sources.
 
-        With them those that latched messages in the window may have been received in before.
+        If latched messages in the window may repeat earlier ones, the parts of these are included.
         """
-        parts = self._parts_reaching_into(window)
+        parts = self._whole_parts_in(window)
         late = [part for part in parts or () if self.repeats_latched and self._may_be_late(part)]
         if not late:
             return parts
@@ -238,20 +252,21 @@ class Scan:
         if published < window.start - STRETCH_NS:
             return None
         since = min(int(published) - COPY_HORIZON_NS, window.start)
-        return self._parts_reaching_into(TimeWindow(since, window.stop))
+        return self._whole_parts_in(TimeWindow(since, window.stop))
 
-    def _parts_reaching_into(self, window: TimeWindow) -> tuple[int, ...] | None:
+    def _whole_parts_in(self, window: TimeWindow) -> tuple[int, ...] | None:
+        """Returns the whole parts with all rows in a window; None if there are other sources."""
         if self._coverage is None:
             return None
         begin = int(np.searchsorted(self._latest, window.start))
         end = int(np.searchsorted(self._firsts, window.stop))
-        if self._others[end] > self._others[begin]:
+        if self._others_before[end] > self._others_before[begin]:
             return None
         reaching = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
         return tuple(self._numbers[reaching].tolist())
 
     def is_stored(self, window: TimeWindow) -> bool:
-        """Returns whether all rows in a window are of parts."""
+        """Returns whether parts have all rows in a window."""
         return all(source.part for source in self._sources_in(window))
 
     def recording_of(self, part: int) -> Path:
@@ -271,8 +286,8 @@ class Scan:
         return {head.number: head for head in _heads(self._sources)}
 
     @cached_property
-    def _others(self) -> IntArray:
-        """How many of the first sources are not whole parts of which all rows count."""
+    def _others_before(self) -> IntArray:
+        """How many sources before each are not whole parts of which all rows count."""
         is_whole = np.array([bool(s.part and s.part.is_whole) for s in self._sources], np.bool_)
         bags = [head.bags for head in _heads(self._sources)]
         if self._coverage is not None and bags:
@@ -282,89 +297,92 @@ class Scan:
         return np.concatenate([[0], np.cumsum(~is_whole)])
 
     def _settled_stretches(self, beside: Ns) -> list[Stretch]:
-        """Returns the stretches of which all rows are of whole parts; see `stretches`."""
-        window, firsts, latest = self.window, self._firsts, self._latest
-        newest = self.timeline.latest
+        """Returns the stretches whose rows whole parts have; see `stretches`."""
+        window, firsts = self.window, self._firsts
         starts = np.unique(firsts // STRETCH_NS)[::-1] * STRETCH_NS
         stops = starts + STRETCH_NS
         begin, end = np.searchsorted(firsts, starts), np.searchsorted(firsts, stops)
-        after, before = np.append(firsts, MAX_NS), np.append(MIN_NS, latest)
-        # What reaches over an edge overlaps nothing that begins behind it.
-        is_apart = (before[begin] < after[begin]) & (before[end] < after[end])
-        lasts = np.maximum(before[end], stops - 1)
+        # The first log time from a source on, and the last one of all sources before it.
+        first_from, last_before = np.append(firsts, MAX_NS), np.append(MIN_NS, self._latest)
+        # A source may reach over an edge if it overlaps none that begins behind it.
+        is_apart = (last_before[begin] < first_from[begin]) & (last_before[end] < first_from[end])
+        lasts = np.maximum(last_before[end], stops - 1)
         is_inside = (starts - beside >= window.start) & (lasts + beside < window.stop)
+        is_over = stops <= self.timeline.latest
         stretches = []
-        for nth in np.flatnonzero(is_apart & is_inside & (stops <= newest)).tolist():
+        for nth in np.flatnonzero(is_apart & is_inside & is_over).tolist():
             start, stop, last = int(starts[nth]), int(stops[nth]), int(lasts[nth])
             around = TimeWindow(start - beside, last + beside + 1)
-            # Which rows are copies follows from those beside them, too.
-            copied = around.widened(2 * COPY_HORIZON_NS)
-            has_copies = overlaps_any(self.shared, copied.start, copied.stop)
-            parts = self.whole_parts(copied if has_copies else around)
+            # The rows beside a row decide whether it is a copy.
+            compared = around.widened(2 * COPY_HORIZON_NS)
+            has_copies = overlaps_any(self.shared, compared.start, compared.stop)
+            parts = self.whole_parts(compared if has_copies else around)
             if parts is not None:
                 stretches.append(Stretch(TimeWindow(start, stop), last, parts))
         return stretches
 
     def copies(self) -> Iterator[Rows]:
-        """Yields the rows that do not count, as another recording has their messages, too.
+        """Yields the rows that do not count, since another recording has their messages, too.
 
         Raises:
             QueryTimeoutError: as for `rows`.
         """
-        spans = [TimeWindow(*span) for span in self.shared]
-        shared = {id(source) for span in spans for source in self._sources_in(span)}
-        asked = [
-            source
-            for source in self._sources
-            if id(source) in shared or (self.repeats_latched and self._may_be_late(source.number))
-        ]
-        for source in asked:
+        shared: set[int] = set()
+        for span in self.shared:
+            shared.update(map(id, self._sources_in(TimeWindow(*span))))
+        for source in self._sources:
+            may_be_late = self.repeats_latched and self._may_be_late(source.number)
+            if id(source) not in shared and not may_be_late:
+                continue
             self.check(source.first)
             for unit in self._units(source):
                 repeated = self._repeated(unit)
                 if repeated.size:
                     yield Rows.of(unit, np.unique(repeated))
 
-    def _settled(self, reach: TimeWindow) -> list[_Source]:
-        """Returns the sources that may have rows in a window, as the store is at one moment."""
+    def _read_sources(self, reach: TimeWindow) -> tuple[Coverage | None, list[_Source]]:
+        """Returns the sources that may have rows in a window, and the coverage that has the parts.
+
+        Without a store, or if that changes all the time, there is no coverage, and all are bags.
+        """
         store = self.scanner.store
         for _ in range(_ATTEMPTS):
             if store is None:
                 break
             failures = store.failures
-            self._coverage = self.scanner.coverage(self.timeline)
-            sources = [*self._sources_of(reach)]
+            coverage = self.scanner.coverage(self.timeline)
+            if coverage is None:
+                break
+            sources = [*self._stored_sources(coverage, reach)]
             # Meanwhile another process may have replaced parts, or the file may have failed: rows
             # would be missing.
-            if self._coverage is None:
-                return sources
-            before, now = self._coverage.state, store.state()
+            before, now = coverage.state, store.state()
             is_same = (before.part, before.deletion) == (now.part, now.deletion)
             if is_same and store.failures == failures:
-                return sources
-        self._coverage = None
-        return [*self._sources_of(reach)]
+                return coverage, sources
+        return None, self._bag_sources(self.timeline.extents(self.topic, reach))
 
-    def _sources_of(self, reach: TimeWindow) -> Iterator[_Source]:
-        """Yields the sources that may have rows in a window."""
-        coverage = self._coverage
-        if coverage is None or self.scanner.store is None:
-            extents = self.timeline.extents(self.topic, reach)
-        else:
-            for head in self.scanner.parts(self.topic, reach, coverage):
-                yield _Source(head.first, head.last, head)
-            if self.stored:
-                # Of bags nothing is read: those near the window tell what does not settle in it.
-                reach = reach.intersect(self.window.widened(2 * STRETCH_NS))
-            extents = coverage.missing_extents(self.topic, reach)
-        of_bags: dict[str, _Source] = {}
-        for bag, *span in extents:
-            first, last = bag.summary.span_of([self.topic]) if bag.file in of_bags else span
-            of_bags[bag.file] = _Source(first, last, None, bag)
-        yield from of_bags.values()
+    def _stored_sources(self, coverage: Coverage, reach: TimeWindow) -> Iterator[_Source]:
+        """Yields the parts that may have rows in a window, then the bags that are not stored."""
+        for head in self.scanner.parts(self.topic, reach, coverage):
+            yield _Source(head.first, head.last, head)
+        if self.stored:
+            # No bag is read: those near the window are needed to tell which stretches are settled.
+            reach = reach.intersect(self.window.widened(2 * STRETCH_NS))
+        yield from self._bag_sources(coverage.missing_extents(self.topic, reach))
+
+    def _bag_sources(self, extents: Iterable[TopicExtent]) -> list[_Source]:
+        """Returns one source for each bag, which has two extents if the topic has two types."""
+        source_of: dict[str, _Source] = {}
+        for bag, first, last in extents:
+            if bag.file in source_of:
+                source_of[bag.file] = _Source(*bag.summary.span_of([self.topic]), None, bag)
+            else:
+                source_of[bag.file] = _Source(first, last, None, bag)
+        return [*source_of.values()]
 
     def _ordered(self, sources: Iterable[_Source]) -> list[_Source]:
-        """Returns sources in order of time; of those of the same times as their bags are."""
+        """Returns sources in order of time; those of equal times in the order of their bags."""
         by_time = sorted(sources, key=lambda source: (source.first, source.last))
         if len({(source.first, source.last) for source in by_time}) == len(by_time):
             return by_time
@@ -376,13 +394,13 @@ class Scan:
         return sorted(by_time, key=order)
 
     def _first_bag(self, part: PartHead) -> BagFile | None:
-        """Returns the first bag of a part of which rows count, if any."""
+        """Returns the first bag whose rows in a part count, if there is one."""
         assert self._coverage is not None  # noqa: S101 - there are no parts without one
         counting = self._coverage.of_part(part.number, part.bags)
         return self._coverage.bag(int(counting[0])) if counting.size else None
 
     def _units(self, source: _Source) -> Iterable[Unit]:
-        """Returns what a source has."""
+        """Returns the tables of a source."""
         if source.part is None and self.stored:
             return ()
         if source.part is not None and self._coverage is not None:
@@ -392,57 +410,59 @@ class Scan:
         return self._units_of_bag(source.bag)
 
     def _units_of_bag(self, bag: BagFile) -> list[BagUnit]:
-        """Returns the tables of a bag, which is decoded unless it is one of those at hand."""
+        """Returns the tables of a bag, which is decoded unless it was lately."""
         if bag.file not in self._decoded:
             hashed = bool(self.shared) or self.repeats_latched
-            tables = self.decode(bag, self.topic, hashed)
-            held = _without_columns_if_large(tables)
-            units = [BagUnit(bag, table, nth) for nth, table in enumerate(held) if len(table)]
+            tables = _without_columns_if_large(self.decode(bag, self.topic, hashed))
+            units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
             self._decoded[bag.file] = units
-            while len(self._decoded) > _MOST_DECODED or (
-                len(self._decoded) > 1 and self._decoded_bytes() > _MOST_BYTES
-            ):
-                # What lies farthest away is done with; a long bag serves all beside it.
-                others = [*self._decoded][:-1]
-                del self._decoded[max(others, key=lambda file: self._apart(file, bag))]
+            self._drop_decoded(bag)
         return self._decoded[bag.file]
 
-    def _apart(self, file: str, bag: BagFile) -> Ns:
-        """Returns how far the rows of a decoded bag lie from another bag (ns); less, the longer."""
-        units = self._decoded[file]
-        return min((max(u.first - bag.end, bag.start - u.last) for u in units), default=MAX_NS)
+    def _drop_decoded(self, newest: BagFile) -> None:
+        """Drops decoded bags beyond the limits, those first whose rows are farthest from `newest`.
 
-    def _decoded_bytes(self) -> int:
-        return sum(unit.memory_bytes for units in self._decoded.values() for unit in units)
+        A long bag is needed for all beside it, so its age says little.
+        """
 
-    def _counting(self, unit: Unit) -> IntArray | None:
-        """Returns the rows of a unit that count in the window; None: all do."""
+        def distance(file: str) -> Ns:
+            units = self._decoded[file]
+            gaps = (max(unit.first - newest.end, newest.start - unit.last) for unit in units)
+            return min(gaps, default=MAX_NS)
+
+        while len(self._decoded) > 1:
+            units = [unit for of_bag in self._decoded.values() for unit in of_bag]
+            is_large = sum(unit.memory_bytes for unit in units) > _MOST_BYTES
+            if len(self._decoded) <= _MOST_DECODED and not is_large:
+                break
+            others = [file for file in self._decoded if file != newest.file]
+            del self._decoded[max(others, key=distance)]
+
+    def _counting_rows(self, unit: Unit) -> IntArray | None:
+        """Returns the rows of a unit that count in the window; None if all do."""
         window = self.window
-        is_covered = window.covers(unit.first, unit.last)
-        is_counted = unit.counting() if is_covered else _in_window(unit, window)
+        is_inside = window.covers(unit.first, unit.last)
+        is_counting = unit.counting() if is_inside else _in_window(unit, window)
         repeated = self._repeated(unit)
         if repeated.size:
-            is_counted = np.ones(len(unit.table), np.bool_) if is_counted is None else is_counted
-            is_counted[repeated] = False
-        return None if is_counted is None or is_counted.all() else np.flatnonzero(is_counted)
+            if is_counting is None:
+                is_counting = np.ones(len(unit.table), np.bool_)
+            is_counting[repeated] = False
+        return None if is_counting is None or is_counting.all() else np.flatnonzero(is_counting)
 
     # Copies
 
-    def _holding_copies(self) -> list[Span]:
-        """Returns the shared spans in which two sources may have messages of one publish time."""
-
-        def may_repeat(span: Span) -> bool:
-            published = sorted(
-                self._published.get(source.number, (-math.inf, math.inf))
-                for source in self._sources_in(TimeWindow(*span))
-            )
-            return any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published))
-
-        return [span for span in self.shared if may_repeat(span)]
+    def _may_have_copies(self, span: Span) -> bool:
+        """Returns whether two sources in a span may have messages of one publish time."""
+        published = sorted(
+            self._published.get(source.number, (-math.inf, math.inf))
+            for source in self._sources_in(TimeWindow(*span))
+        )
+        return any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published))
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
-        for start, stop in self.shared[bisect_right(self._ends, unit.first) :]:
+        for start, stop in self.shared[bisect_right(self._shared_stops, unit.first) :]:
             if start > unit.last:
                 break
             first = start + max(unit.first - start, 0) // _SLICE_NS * _SLICE_NS
@@ -450,40 +470,43 @@ class Scan:
                 if begin not in self._compared:
                     self._compared.add(begin)
                     end = min(begin + _SLICE_NS, stop)
-                    self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
+                    self._find_copies(TimeWindow(begin, end), TimeWindow(start, stop))
         copies = self._copies.get(unit.key, [])
         if self.repeats_latched:
             copies = [*copies, self._received_again(unit)]
         return np.concatenate(copies) if copies else np.empty(0, np.int64)
 
-    def _compare(self, span: TimeWindow, part: TimeWindow) -> None:
-        """Finds the copies in a part of a shared span."""
+    def _find_copies(self, window: TimeWindow, span: TimeWindow) -> None:
+        """Finds the copies in a window of a shared span."""
 
         def are_copies(messages: Identities) -> Mask:
             times = messages.log_times
-            return copies_among(messages) & (times >= part.start) & (times < part.stop)
+            return copies_among(messages) & (times >= window.start) & (times < window.stop)
 
-        around = part.widened(2 * COPY_HORIZON_NS).intersect(span)
-        for unit, rows in self._judged(around, are_copies):
+        around = window.widened(2 * COPY_HORIZON_NS).intersect(span)
+        for unit, rows in self._compare_recordings(around, are_copies):
             self._copies[unit.key].append(rows)
 
-    def _judged(
-        self, window: TimeWindow, judge: Callable[[Identities], Mask]
+    def _compare_recordings(
+        self, window: TimeWindow, compare: Callable[[Identities], Mask]
     ) -> Iterator[tuple[Unit, IntArray]]:
-        """Yields the units of several recordings, with those rows in a window that are judged so.
+        """Yields the units in a window, if several recordings have some, with the rows picked.
 
-        `judge` is given all of their messages in the window.
+        Args:
+            window: of log time.
+            compare: picks some of all messages of these units in the window.
         """
         units = [unit for source in self._sources_in(window) for unit in self._units(source)]
-        if len({unit.first_bag.recording for unit in units}) > 1:
-            rows = [np.flatnonzero(_in_window(unit, window)) for unit in units]
-            judged = judge(self._messages(units, rows))
-            for unit, unit_rows in zip(units, rows, strict=True):
-                yield unit, unit_rows[judged[: unit_rows.size]]
-                judged = judged[unit_rows.size :]
+        if len({unit.first_bag.recording for unit in units}) < 2:
+            return
+        rows = [np.flatnonzero(_in_window(unit, window)) for unit in units]
+        is_picked = compare(self._messages(units, rows))
+        of_units = np.split(is_picked, np.cumsum([unit_rows.size for unit_rows in rows])[:-1])
+        for unit, unit_rows, mask in zip(units, rows, of_units, strict=True):
+            yield unit, unit_rows[mask]
 
     def _received_again(self, unit: Unit) -> IntArray:
-        """Returns the rows of a unit that were received before, as late messages of a latch."""
+        """Returns the rows of a unit whose latched messages another recording received before."""
         none = np.empty(0, np.int64)
         may_be_late = unit.table.channel.latched and self._may_be_late(unit.part)
         identities = unit.identities() if may_be_late else None
@@ -498,53 +521,51 @@ class Scan:
             # As much again before it: late messages come many at once, of about the same age.
             self._latched_again_since = max(since - (unit.last - since), MIN_NS)
             window = TimeWindow(self._latched_again_since, MAX_NS)
-            for late, rows in self._judged(window, repeated_among):
-                if late.table.channel.latched:
-                    self._latched_again[late.key] = rows
+            for latched_unit, rows in self._compare_recordings(window, repeated_among):
+                if latched_unit.table.channel.latched:
+                    self._latched_again[latched_unit.key] = rows
         return self._latched_again.get(unit.key, none)
 
     @cached_property
     def _delays(self) -> dict[int | None, tuple[float, float]]:
-        return self._bounds(DELAY)
+        return self.scanner.bounds(_heads(self._sources), DELAY)
 
     @cached_property
     def _published(self) -> dict[int | None, tuple[float, float]]:
-        return self._bounds(PUBLISH_TIME)
-
-    def _bounds(self, path: str) -> dict[int | None, tuple[float, float]]:
-        bounds = self.scanner.bounds(_heads(self._sources), path)
-        return {number: span for number, span in bounds.items()}  # noqa: C416 - also of None
+        return self.scanner.bounds(_heads(self._sources), PUBLISH_TIME)
 
     def _may_be_late(self, part: int | None) -> bool:
-        """Returns whether a part, or a bag, may have messages that were received long after."""
-        return self._delays.get(part, (0.0, math.inf))[1] > REPEATED_NS
+        """Returns whether a part, or a bag (None), may have messages received long after."""
+        _, longest = self._delays.get(part, (0.0, math.inf))
+        return longest > REPEATED_NS
 
     def _sources_in(self, window: TimeWindow) -> list[_Source]:
-        # They are in the order of their first times, and reach beyond the next ones.
+        """Returns the sources that reach into a window."""
+        # They are in the order of their first times; an early one may end after later ones.
         begin = int(np.searchsorted(self._latest, window.start))
         stop = int(np.searchsorted(self._firsts, window.stop))
         return [source for source in self._sources[begin:stop] if source.last >= window.start]
 
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
-        """Returns what tells messages apart, of some rows of each unit."""
-        # By their names: of messages of one time that counts which lies in the first recording.
+        """Returns what tells apart the messages in some rows of each unit."""
+        # In the order of names: of copies with one log time that of the first recording counts.
         recordings = sorted({unit.first_bag.recording for unit in units}, key=str)
         number_of = {recording: nth for nth, recording in enumerate(recordings)}
         parts: list[Identities] = []
         for unit, unit_rows in zip(units, rows, strict=True):
             recording = number_of[unit.first_bag.recording]
             published, hashes = self._identities(unit, unit_rows)
-            # Another for each recording: what has no hash is no copy.
+            # A hash of its own for each recording, so that unhashed messages are no copies.
             hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)
             of_recording = np.full(unit_rows.size, recording)
             parts.append(Identities(unit.times()[unit_rows], published, hashes, of_recording))
         return Identities(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _identities(self, unit: Unit, positions: IntArray) -> tuple[IntArray, IntArray]:
-        """Returns publish times and hashes of some rows of a unit.
+        """Returns the publish times and hashes of some rows of a unit.
 
-        Bags that were stored before another recording came beside them are read. Rows of one that
-        has changed meanwhile have their log times, and are `UNHASHED`.
+        A bag that was stored before another recording came beside it has no hashes, and is read.
+        Rows of a bag that has changed meanwhile have their log times, and are `UNHASHED`.
         """
         times = unit.times()
         published, hashes = unit.identities() or (times, np.full(times.size, UNHASHED))
@@ -574,7 +595,7 @@ def _in_window(unit: Unit, window: TimeWindow) -> Mask:
 
 
 def _overlapping(spans: Sequence[Span], window: TimeWindow) -> Sequence[Span]:
-    """Returns those half-open spans, of some in order and apart, that overlap a window."""
+    """Returns the half-open spans that overlap a window; they are in order and apart."""
     begin = bisect_right(spans, window.start, key=itemgetter(1))
     end = bisect_left(spans, window.stop, begin, key=itemgetter(0))
     return spans[begin:end]
@@ -585,20 +606,20 @@ def _heads(sources: Iterable[_Source]) -> list[PartHead]:
 
 
 def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:
-    """Returns whether no row of the sources from `after` on comes before a table."""
+    """Returns whether rows come before those of the next source, `after`."""
     if after is None:
         return True
     return rows.last >= after.last if newest_first else rows.first <= after.first
 
 
 def _without_columns_if_large(tables: Iterable[Table]) -> list[Table]:
-    """Returns the tables of a bag; without their columns where these take too much together."""
-    held: list[Table] = []
+    """Returns the tables of a bag, without their columns if these take too much memory together."""
+    kept: list[Table] = []
     size = 0
     for table in tables:
         size += table.memory_bytes
-        held.append(table)
+        kept.append(table)
         if size > _MOST_BYTES:
-            held = [earlier.without_columns(_TOO_LARGE) for earlier in held]
-        del table
-    return held
+            kept = [earlier.without_columns(_TOO_LARGE) for earlier in kept]
+        del table  # before the next one is decoded
+    return kept

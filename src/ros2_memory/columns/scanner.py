@@ -1,14 +1,14 @@
-"""What is stored of a bag directory: parts, with zones and columns that are remembered.
+"""Reads the stored parts of a bag directory, and remembers their zones and columns.
 
-It lies between a `Scan`, which asks for parts, and the `ColumnStore`, which reads the bytes of
-their columns. Of a part that nothing needs not even the times are unpacked.
+A `Scan` asks a `Scanner` for parts, which reads the bytes of their columns from the `ColumnStore`.
+A column is unpacked when it is first used, the log times too.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, fields
-from functools import partial, reduce
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.columns.store import ColumnStore, PartHead
+    from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
@@ -44,8 +45,8 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes, besides the numbers of its bags."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
-_TOGETHER: Final = 512
-"""Parts with so many numbers in a row, as a day has, are known together."""
+_NEIGHBOURS: Final = 512
+"""Parts, about those of a day, whose zones of a column are read and remembered together."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 DECODED_BYTES: Final = 8 << 20
 """The tables of a bag that is not stored are remembered if they take no more memory than this."""
@@ -58,22 +59,22 @@ class _Heads(NamedTuple):
     """The parts of a topic, in order of their first log times.
 
     Attributes:
-        coverage: of the timeline that they were compared with.
+        coverage: which bags the timeline has.
         heads: the parts.
-        firsts: their first log times.
-        lasts: their last ones.
-        live: of how many of its bags the rows of each count.
+        firsts: the first log time of each.
+        lasts: the last log time of each.
+        counting_bags: how many bags of each the timeline has.
     """
 
     coverage: Coverage
     heads: Sequence[PartHead]
     firsts: IntArray
     lasts: IntArray
-    live: IntArray
+    counting_bags: IntArray
 
     @classmethod
     def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
-        """Returns the parts as of a coverage."""
+        """Returns the parts with what a coverage says of them."""
         return cls(
             coverage,
             heads,
@@ -84,63 +85,61 @@ class _Heads(NamedTuple):
 
     def within(self, window: TimeWindow) -> list[PartHead]:
         """Returns the parts that may have rows in a window."""
-        is_within = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
+        is_within = (self.firsts < window.stop) & (self.lasts >= window.start)
+        is_within &= self.counting_bags > 0
         return [self.heads[nth] for nth in np.flatnonzero(is_within).tolist()]
 
 
-class _Known(NamedTuple):
-    """What is known of a column of a topic in neighbouring parts, without values.
+class _ColumnZones(NamedTuple):
+    """The zones of a column of a topic in neighbouring parts.
 
     Attributes:
-        newest: the newest of these parts; it need not have the column.
-        packed: by part, how the column is packed; also of parts that were deleted since.
-        zones: those of the parts.
+        newest: the newest part that was looked up; it need not have the column.
+        packed: how the column is packed, without data, by part; deleted parts may be among them.
+        zones: the zones of these parts.
     """
 
     newest: int
     packed: Mapping[int, Packed]
     zones: Zones
 
-    def joined(self, newest: int, packed: Mapping[int, Packed]) -> _Known:
-        """Returns it with what is known of newer parts."""
-        zones = Zones.of([*packed], [of_part.zone for of_part in packed.values()])
-        return _Known(
-            max([newest, *packed]),
-            {**self.packed, **packed},
-            self.zones.joined(zones),
+    def with_newer(self, newest: int, packed: Mapping[int, Packed]) -> _ColumnZones:
+        """Returns these zones and those of newer parts."""
+        zones = Zones.of([*packed], [column.zone for column in packed.values()])
+        return _ColumnZones(
+            max([newest, *packed]), {**self.packed, **packed}, self.zones.joined(zones)
         )
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        words = (of_part.zone.words for of_part in self.packed.values())
-        texts = sum(map(len, filter(None, words)))
+        texts = sum(len(column.zone.words or "") for column in self.packed.values())
         return _COLUMN_BYTES * len(self.packed) + texts + self.zones.memory_bytes
 
 
-_UNKNOWN: Final = _Known(0, {}, Zones.of([], []))
+_NO_ZONES: Final = _ColumnZones(0, {}, Zones.of([], []))
 
 
 @dataclass(frozen=True, slots=True)
 class Caches:
-    """What scanners read last, and what they made of it, within one capacity for all of them.
+    """Caches of all scanners, and of what is derived from parts, within one capacity.
 
     So the memory of a server does not grow with the robots that it is asked about.
 
     Attributes:
-        read: by part and path, unpacked columns; by kind and key, fragments.
-        known: by topic, path and the first of the parts, what is known of a column in them.
-        heads: by topic, its parts.
-        decoded: by file, topic and window, the tables of bags that are not stored, in groups.
-        pairs: by part, the parents and children of its transforms.
-        clock_steps: by pause and the bags beside it, the steps of the clock in it.
-        statics: by topics, the static transforms of sessions of a timeline.
-        sights: by ten minutes and all that they follow from, what detectors saw.
-        things: by settings, what was estimated of all bags of a timeline.
+        read: unpacked columns, by part and path; fragments, by kind and key.
+        zones: the zones of a column, by topic, path and the first of `_NEIGHBOURS` parts.
+        heads: the parts of a topic, by its name.
+        decoded: the tables of bags that are not stored, in groups, by file, topic and window.
+        pairs: the parents and children of transforms, by part.
+        clock_steps: the steps of the clock in a pause, by the pause and the bags beside it.
+        statics: the static transforms of sessions of a timeline, by topics.
+        sights: what detectors saw in ten minutes, by these and what it is computed from.
+        things: what was estimated from all bags of a timeline, by settings.
     """
 
     read: ByteLru[object]
-    known: ByteLru[_Known]
+    zones: ByteLru[_ColumnZones]
     heads: ByteLru[_Heads]
     decoded: ByteLru[list[list[Table]]]
     pairs: ByteLru[frozenset[Pair]]
@@ -156,24 +155,25 @@ class Caches:
         return cls(**{cache.name: whole.namespace() for cache in fields(cls)})
 
     def namespace(self) -> Caches:
-        """Returns caches with keys of their own, within the capacities of these."""
+        """Returns caches with keys of their own, within the same capacity."""
         return Caches(
             **{cache.name: getattr(self, cache.name).namespace() for cache in fields(self)}
         )
 
 
 class Scanner:
-    """What is stored of one bag directory, and what was read of it last. Thread-safe.
+    """Reads the stored parts of one bag directory. Thread-safe.
 
     Args:
-        store: the store; None where nothing is stored.
+        store: the store; None if nothing is stored.
         bag_dir: the bag directory.
-        reading: what identifies how bags are read, on which fragments depend besides the bags.
-        large: the turn to hold much of a bag, which large columns need, too.
-        caches: those of all scanners; None where it has some of its own.
+        reading: identifies the settings with which bags are read, on which fragments depend.
+        large: the turn to hold much of a bag in memory, which large columns need, too.
+        caches: the caches of all scanners; None for some of its own.
 
     Attributes:
-        caches: what was read last.
+        store: as given.
+        caches: the part of the caches that is its own.
     """
 
     def __init__(
@@ -190,12 +190,12 @@ class Scanner:
         self.caches = Caches.of() if caches is None else caches.namespace()
         self._reading = reading
         self._damaged: dict[tuple[str | Ns, ...], str] = {}
-        # They follow from columns alone, and are of use where these were dropped.
+        # Outlines depend on no settings, so that they serve where columns were dropped.
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
 
     def met_damage(self, bag: BagFile, error: BagError) -> None:
-        """Remembers why a part of a bag is lost, if it is: only who reads it finds that out."""
+        """Remembers the error if a part of a bag is lost: only reading the bag finds that out."""
         if error.lost is None or isinstance(error, BagContradictionError):
             return
         if len(self._damaged) >= _MOST_DAMAGED:
@@ -204,10 +204,10 @@ class Scanner:
 
     def damaged_parts(self, bags: Sequence[BagFile]) -> list[tuple[BagFile, str]]:
         """Returns the bags of which a part was found lost since the program began, and why."""
-        if not self._damaged:
+        if not self._damaged:  # else no bag's identity is needed
             return []
-        reasons = ((bag, self._damaged.get(bag.identity)) for bag in bags)
-        return [(bag, reason) for bag, reason in reasons if reason is not None]
+        damaged = self._damaged
+        return [(bag, damaged[bag.identity]) for bag in bags if bag.identity in damaged]
 
     def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
@@ -218,9 +218,10 @@ class Scanner:
         return cast("Fragments[T]", self._fragments[kind.name])
 
     def outlines_made(self, timeline: Timeline, window: TimeWindow) -> Iterator[Ns]:
-        """Makes the outlines of the whole parts that have rows in a window, the newest first.
+        """Makes the outlines of whole parts with rows in a window, the newest part first.
 
-        Yields a log time (ns) of each.
+        Yields:
+            The first log time (ns) of each part, once its outline is made.
         """
         coverage = self.coverage(timeline)
         if coverage is None:
@@ -236,11 +237,11 @@ class Scanner:
             yield head.first
 
     def fragments_of_others(self) -> list[Ns]:
-        """Returns where slices begin that have fragments of other settings alone, newest first."""
+        """Returns the log times (ns) at which only fragments of other settings begin."""
         return [] if self.store is None else self.store.fragments_of_others(self._reading)
 
     def write_fragments(self) -> None:
-        """Stores the fragments that were made since."""
+        """Stores the fragments that were made since the last call."""
         for fragments in [*self._fragments.values()]:
             cast("Fragments[Sized]", fragments).write()
 
@@ -249,7 +250,7 @@ class Scanner:
         return None if self._covering is None else self._covering.of(timeline)
 
     def channels(self, timeline: Timeline, bag: BagFile) -> list[Channel]:
-        """Returns the channels of all that was ever stored; none where a bag is not stored."""
+        """Returns the channels of all topics ever stored; none if `bag` is not stored."""
         coverage = self.coverage(timeline)
         if self.store is None or coverage is None or bag in coverage.missing:
             return []
@@ -279,7 +280,7 @@ class Scanner:
     def matching(
         self, heads: Sequence[PartHead], may_match: Callable[[PartZones], bool | Mask]
     ) -> Mask:
-        """Returns which of some parts may have rows that are wanted, by their zones."""
+        """Returns which parts may match, by their zones."""
         possible = np.ones(len(heads), np.bool_)
         topics = np.array([head.topic for head in heads], np.int64)
         numbers = np.array([head.number for head in heads], np.int64)
@@ -292,9 +293,9 @@ class Scanner:
                 possible[is_of_topic] = may_match(PartZones(topic, of_topic, zones))
         return possible
 
-    def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int, tuple[float, float]]:
-        """Returns the least and greatest value of a column by part; infinite if not stored."""
-        by_part: dict[int, tuple[float, float]] = {}
+    def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int | None, tuple[float, float]]:
+        """Returns the least and greatest value of a column by part; infinite if not known."""
+        by_part: dict[int | None, tuple[float, float]] = {}
         for topic in {head.topic for head in heads}:
             parts = [head.number for head in heads if head.topic == topic]
             zones = self._zones(topic, np.array(parts, np.int64), path)
@@ -316,26 +317,28 @@ class Scanner:
     def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
         """Returns the zones of a column in some parts of a topic."""
         ascending = np.sort(parts)
-        newest = ascending[np.diff(ascending // _TOGETHER, append=-1) != 0].tolist()
-        known = (self._known(topic, path, part).zones for part in newest)
-        return reduce(Zones.joined, known, _UNKNOWN.zones).among(parts)
+        newest = ascending[np.diff(ascending // _NEIGHBOURS, append=-1) != 0].tolist()
+        zones = _NO_ZONES.zones
+        for part in newest:
+            zones = zones.joined(self._column_zones(topic, path, part).zones)
+        return zones.among(parts)
 
-    def _known(self, topic: int, path: str, part: int) -> _Known:
-        """Returns what is known of a column of a topic, in a part and in older ones beside it."""
+    def _column_zones(self, topic: int, path: str, part: int) -> _ColumnZones:
+        """Returns the zones of a column of a topic, in a part and in its older neighbours."""
         store = self._store_of_parts
-        first = part // _TOGETHER * _TOGETHER
+        first = part // _NEIGHBOURS * _NEIGHBOURS
         key = (topic, path, first)
-        known = self.caches.known.get(key) or _UNKNOWN
+        known = self.caches.zones.get(key) or _NO_ZONES
         if part > known.newest:
             failures = store.failures
-            newer = range(max(first, known.newest + 1), first + _TOGETHER)
-            known = known.joined(part, store.zones(topic, path, newer))
+            newer = range(max(first, known.newest + 1), first + _NEIGHBOURS)
+            known = known.with_newer(part, store.zones(topic, path, newer))
             if store.failures == failures:
-                self.caches.known.put(key, known, known.memory_bytes)
+                self.caches.zones.put(key, known, known.memory_bytes)
         return known
 
     def part(self, head: PartHead, coverage: Coverage) -> Unit | None:
-        """Returns a part; None where no row of it counts.
+        """Returns a part; None if no row of it counts.
 
         Raises:
             GoneError: it was deleted meanwhile.
@@ -344,6 +347,37 @@ class Scanner:
         topic = self._store_of_parts.topic(head.topic)
         if topic is None:
             raise GoneError
+        counting = coverage.of_part(head.number, head.bags)
+        if not counting.size:
+            return None
+        table = self._table(head, topic)
+
+        def load(path: str) -> IntArray | None:
+            packed = table.packed(path)
+            if packed is None:
+                return None
+            return np.asarray(self._column(head.number, path, packed), np.int64)
+
+        def bag_of(number: int) -> BagFile:
+            bag = coverage.bag(number + offset)
+            if bag is None:
+                raise GoneError
+            return bag
+
+        return Unit(
+            head.number,
+            table,
+            head.first,
+            head.last,
+            load,
+            counting - offset,
+            bag_of,
+            head.number if head.is_whole else None,
+            counting.size == head.bags.size,
+        )
+
+    def _table(self, head: PartHead, topic: Topic) -> StoredTable:
+        """Returns the table of a part; its columns are unpacked when they are first used."""
         packed = partial(self.packed, head, {LOG_TIME, BAG} | topic.layout.slots.keys())
 
         def load(path: str) -> Column:
@@ -352,28 +386,15 @@ class Scanner:
                 raise KeyError(path)
             return self._column(head.number, path, column)
 
-        counting = coverage.of_part(head.number, head.bags)
-        if not counting.size:
-            return None
-
-        def integers(path: str) -> IntArray | None:
-            return None if packed(path) is None else np.asarray(load(path), np.int64)
-
-        def bag_of(number: int) -> BagFile:
-            bag = coverage.bag(number + offset)
-            if bag is None:
-                raise GoneError
-            return bag
-
         left_out = topic.layout.left_out
         if head.dropped:
             left_out = {**left_out, **dict.fromkeys(head.dropped, _DROPPED)}
-        none = np.zeros(head.messages, np.int64)  # `Unit` loads the true times
-        table = StoredTable(
+        zeros = np.zeros(head.messages, np.int64)  # `Unit` loads the true times
+        return StoredTable(
             topic.channel,
-            none,
-            none,
-            none,
+            zeros,
+            zeros,
+            zeros,
             *lazy_columns(topic.layout, load, head.dropped),
             left_out,
             define=lambda: topic.definition,
@@ -382,32 +403,26 @@ class Scanner:
             memory=self.caches.read,
             number=head.number,
         )
-        return Unit(
-            head.number,
-            table,
-            head.first,
-            head.last,
-            integers,
-            counting - offset,
-            bag_of,
-            head.number if head.is_whole else None,
-            counting.size == head.bags.size,
-        )
 
     def packed(self, head: PartHead, always: Collection[str], path: str) -> Packed | None:
-        """Returns what is known of a column of a part; None where it has no such one.
+        """Returns how a column of a part is packed, without data; None if there is no such column.
+
+        Args:
+            head: of the part.
+            always: the paths of the columns that each part of the topic has.
+            path: of the column.
 
         Raises:
-            GoneError: it is one that each part has `always`, and the part was deleted meanwhile, or
-                the store cannot be read.
+            GoneError: a column in `always` is missing: the part was deleted meanwhile, or the store
+                cannot be read.
         """
-        packed = self._known(head.topic, path, head.number).packed.get(head.number)
+        packed = self._column_zones(head.topic, path, head.number).packed.get(head.number)
         if packed is None and path in always:
             raise GoneError
         return packed
 
     def _column(self, part: int, path: str, packed: Packed) -> Column:
-        """Returns a column of a part, of which the compressed bytes are not kept.
+        """Returns a column of a part; remembers it, but not its compressed bytes.
 
         Raises:
             GoneError: the part was deleted meanwhile, or the store cannot be read, or is damaged.
@@ -416,15 +431,9 @@ class Scanner:
         cached = self.caches.read.get(key)
         if cached is not None:
             return cast("Column", cached)
-        stored: bytes | None = b""
-        # The one value of a constant is its least, unless it is a text.
+        # The zone has the one value of a constant number.
         is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
-        if packed.count and not is_constant:
-            stored = self._store_of_parts.part_data(part, path)
-            if stored is None:
-                raise GoneError
-            if is_large(stored):
-                self._large.acquire()
+        stored = self._stored_bytes(part, path) if packed.count and not is_constant else b""
         try:
             data = decompressed(stored) if stored else b""
             column = unpack(packed.codec, packed.count, packed.zone.least, data)
@@ -432,14 +441,22 @@ class Scanner:
             # Else each question about the part would fail, for ever.
             self._store_of_parts.give_up(error)
             raise GoneError from error
-        is_number = path == BAG or path.endswith("#")
-        if is_number and not isinstance(column, Texts) and all(column.strides):
-            # Numbers of rows and bags: none is negative, and few need eight bytes.
+        has_row_numbers = path == BAG or path.endswith("#")
+        if has_row_numbers and not isinstance(column, Texts) and all(column.strides):
+            # Numbers of rows and bags are not negative, and few need eight bytes.
             column = column.astype(np.min_scalar_type(column.max(initial=0)))
         self.caches.read.put(key, column, column_bytes(column))
         return column
 
+    def _stored_bytes(self, part: int, path: str) -> bytes:
+        stored = self._store_of_parts.part_data(part, path)
+        if stored is None:
+            raise GoneError
+        if is_large(stored):
+            self._large.acquire()
+        return stored
+
 
 def _outline_key(head: PartHead) -> FragmentKey:
-    # Those of a day are read together: of one topic alone.
+    # The topic as settings, since the outlines of a day and topic are read together.
     return FragmentKey(head.first, str(row_id(head.topic)), (head.number,))

@@ -100,7 +100,7 @@ def test_every_question_is_answered_as_without_a_store(
         known = with_store(plain, bags, part=part)
 
         # Parts are few here: what is known of columns is still read in several pieces.
-        with patch("ros2_memory.columns.scanner._TOGETHER", 1 + seed % 9):
+        with patch("ros2_memory.columns.scanner._NEIGHBOURS", 1 + seed % 9):
             for tool, question in questions:
                 first, last = draw.choice([sorted(draw.choices(moments, k=2)), [0, 4 * 10**18]])
                 given_ = {**question, "start": first / S, "end": last / S}
