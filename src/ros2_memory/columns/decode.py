@@ -1,7 +1,7 @@
 """Decodes a bag as tables, all messages of a topic at once.
 
-What the walk over bytes (`walk.py`) does not read, for whatever reason, goes through the reader's
-decoder message by message (`_level_of`), into the same columns. No message is decoded in part.
+The walk over bytes (`walk.py`) reads a batch of messages whole or not at all. Batches that it does
+not read go through the reader's decoder message by message (`_level_of`), into the same columns.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ BULKY_TYPES: Final = frozenset(
 """Images and clouds, which have no columns in any file."""
 _BULKY: Final = "images, clouds and the like have no columns"
 _HELD_BYTES: Final = LARGE_BYTES
-"""Payloads, and what lies between them, that wait in a group to be decoded together."""
+"""Bytes of buffers that wait in a group to be decoded together."""
 LARGEST_MESSAGE_BYTES: Final = LARGE_BYTES
 """A topic has no columns in a bag once a message of it is larger."""
 _NOT_ASKED: Final = "only times were asked for"
@@ -89,9 +89,14 @@ _EVERYTHING: Final = TimeWindow.everything()
 
 
 class _Kind(NamedTuple):
-    """How the messages of a channel are decoded; without a plan, `reason` says why they are not.
+    """How the messages of a channel are decoded.
 
-    `first` is the bag's first channel of the same topic, type and definition.
+    Attributes:
+        first: the bag's first channel of the same topic, type and definition.
+        definition: the fields of the messages; None if they are not known.
+        plan: how payloads are read; None if the messages have no columns.
+        reason: why they have no columns.
+        is_hashed: whether payloads are hashed.
     """
 
     first: Channel
@@ -114,58 +119,49 @@ def undecoded(
 ) -> Iterator[Group]:
     """Yields the messages of a bag in groups, for `Group.tables`.
 
-    In one group there is one table for each topic, type and definition with messages; a bag whose
-    messages and tables take less than `GROUP_BYTES` is one group. Tables of later groups may
-    overlap earlier ones in time, as the chunks of the file do, but a table has all messages of a
-    log time. Lazy: nothing is opened before the first group is requested. In memory are one group
-    and one buffer of the reader.
+    A bag whose messages and tables take less than `GROUP_BYTES` is one group. A group has one table
+    for each topic, type and definition. Tables of later groups may overlap earlier ones in time, as
+    the chunks of the file do, but all messages of one log time are in one table.
+
+    The iterator is lazy: it opens the file when the first group is requested, and has one group and
+    one buffer of the reader in memory.
 
     Args:
         reader: reads the bag.
         path: the file.
         window: of log time.
-        topics: those to decode; None for all.
-        hashed: of which channels the payloads are hashed.
-        columns: whether there are columns; else only the times of all messages, also of those that
-            cannot be decoded.
-        skip_undecodable: whether a message that cannot be decoded has no row. Else its topic has
-            rows alone in this group: the bag has to be asked about each of them.
-        number: becomes that of the bag in the tables.
+        topics: the topics to decode; None for all.
+        hashed: returns whether the payloads of a channel are hashed.
+        columns: whether to decode messages; else tables have only the times of all messages.
+        skip_undecodable: whether messages that cannot be decoded are left out. If not, one of them
+            leaves its topic without columns in this group.
+        number: the number of the bag in the tables.
 
     Raises:
         BagVanishedError: the file is not there.
-        BagError: as by `BagReader.batches`. The iterator continues behind it, with all that can be
-            read.
+        BagError: as by `BagReader.batches`. The iterator continues behind the error, with all that
+            can be read.
     """
 
     def read() -> Iterator[Group | BagError]:
-        channels = [
-            channel
-            for channel in reader.channels(path)
-            if topics is None or channel.topic in topics
-        ]
-        kinds = _Kinds(reader, hashed, columns)
-        kinds.look_at(channels, path, window)
-        alone = reader.times_alone(path)
+        channels = reader.channels(path)
+        if topics is not None:
+            channels = [channel for channel in channels if channel.topic in topics]
         wanted = {channel.topic for channel in channels}
-        # Copies of messages without a payload are recognised by their publish times.
-        bare = wanted - {
-            channel.topic
-            for channel in channels
-            if (kind := kinds.of(channel)).plan is not None
-            or (kind.is_hashed and channel.topic not in alone)
-        }
+        kinds = _Kinds(reader, hashed, columns)
+        kinds.find_bulky(channels, path, window)
+        bare = wanted - kinds.topics_with_payload(channels, reader.times_alone(path))
         group = Group(reader, skip_undecodable)
         for batch in errors_as_items(reader.batches(path, wanted, window, bare=bare)):
             if isinstance(batch, BagError):
                 yield batch
             elif batch.sizes.size:
                 if group.is_full_before(batch):
-                    full, group = group, Group(reader, skip_undecodable)
-                    full.pass_on(group)
+                    full = group
+                    group = full.split_off_last()
                     yield full
                     del full
-                group.add(_Undecoded(kinds.read(batch), batch, number))
+                group.add(_Undecoded(kinds.of_batch(batch), batch, number))
             del batch  # and its buffer, before the next is read
         if group.has_messages:
             yield group
@@ -176,7 +172,7 @@ def undecoded(
 
 @dataclass(slots=True)
 class _Kinds:
-    """The kinds of the channels of one bag, while it is read."""
+    """Decides how the channels of one bag are decoded, while the bag is read."""
 
     reader: BagReader
     hashed: Callable[[Channel], bool]
@@ -188,8 +184,8 @@ class _Kinds:
     _known: dict[int, _Kind] = field(default_factory=dict)
     _bulky: set[str] = field(default_factory=set)
 
-    def look_at(self, channels: Sequence[Channel], path: Path, window: TimeWindow) -> None:
-        """Finds the topics of a large file that have large messages, by the newest of each."""
+    def find_bulky(self, channels: Sequence[Channel], path: Path, window: TimeWindow) -> None:
+        """Finds the topics of a large file that have large messages, by their newest message."""
         try:
             is_large = self.columns and path.stat().st_size > LARGE_FILE_BYTES
         except OSError:
@@ -201,8 +197,24 @@ class _Kinds:
                     if newest is not None and len(newest.payload) > BULKY_BYTES:
                         self._bulky.add(channel.topic)
 
+    def topics_with_payload(
+        self, channels: Sequence[Channel], times_alone: Collection[str]
+    ) -> set[str]:
+        """Returns the topics whose payloads are needed, for columns or for hashes.
+
+        Args:
+            channels: of the bag.
+            times_alone: topics of which only the publish times tell copies.
+        """
+        topics: set[str] = set()
+        for channel in channels:
+            kind = self.of(channel)
+            if kind.plan is not None or (kind.is_hashed and channel.topic not in times_alone):
+                topics.add(channel.topic)
+        return topics
+
     def of(self, channel: Channel) -> _Kind:
-        """Returns the kind of a channel."""
+        """Returns how the messages of a channel are decoded."""
         kind = self._known.get(id(channel))
         if kind is None:
             definition = self.reader.definition(channel)
@@ -213,8 +225,11 @@ class _Kinds:
             self._known[id(channel)] = kind
         return kind
 
-    def read(self, batch: Batch) -> _Kind:
-        """Returns how a batch is decoded: once messages are large, without columns from then on."""
+    def of_batch(self, batch: Batch) -> _Kind:
+        """Returns how a batch is decoded.
+
+        From the first message on that is too large, a channel has no columns.
+        """
         if batch.buffer is not self._buffer:
             self._buffer = batch.buffer
             self._read_bytes += len(batch.buffer)
@@ -225,6 +240,7 @@ class _Kinds:
         return kind
 
     def _plan(self, channel: Channel, definition: Definition | None) -> tuple[Plan | None, str]:
+        """Returns the plan of a channel, or None and the reason why it has no columns."""
         if not self.columns:
             return None, _NOT_ASKED
         if channel.type in BULKY_TYPES or channel.topic in self._bulky:
@@ -254,12 +270,12 @@ class _Undecoded(NamedTuple):
 
 @dataclass(slots=True)
 class Group:
-    """Some buffers of one bag, or of several bags, of which each topic is decoded at once.
+    """Messages of one bag or of several, of which each topic is decoded at once.
 
     Attributes:
         reader: of the bags.
         skip_undecodable: as for `undecoded`.
-        memory_bytes: what the tables take that are decoded so far.
+        memory_bytes: the memory of the tables that are decoded so far.
     """
 
     reader: BagReader
@@ -273,18 +289,18 @@ class Group:
 
     @property
     def has_messages(self) -> bool:
-        """Whether there are any."""
+        """Whether the group has any messages."""
         return bool(self._waiting or self._tables)
 
     def is_full_before(self, batch: Batch) -> bool:
-        """Returns whether a batch begins the next group; only the first of a buffer may."""
+        """Returns whether a batch begins the next group; only the first batch of a buffer may."""
         if batch.buffer is self._buffer or not self.has_messages:
             return False
         # Tables may take more than the payloads.
         return max(self._bytes + len(batch.buffer), self.memory_bytes) > GROUP_BYTES
 
     def add(self, undecoded: _Undecoded) -> None:
-        """Adds a batch; decodes those before it that take too much memory with it."""
+        """Adds a batch; decodes the waiting ones first if all would take too much memory."""
         buffer = undecoded.batch.buffer
         if buffer is not self._buffer:
             if self._waiting_bytes + len(buffer) > _HELD_BYTES:
@@ -305,27 +321,29 @@ class Group:
         for undecoded in other._waiting:
             self.add(undecoded)
 
-    def pass_on(self, following: Group) -> None:
-        """Leaves the messages of each topic's last log time to the next group of the bag.
+    def split_off_last(self) -> Group:
+        """Moves the messages of each topic's last log time to the next group, which it returns.
 
-        As messages of one log time are numbered within a table. Where they are many they stay. The
-        next group is empty.
+        Messages of one log time are numbered within a table, so they must not be in two. If they
+        take too much memory they stay.
         """
         self._decode()
+        following = Group(self.reader, self.skip_undecodable)
         room = GROUP_BYTES // 4
         for key, parts in self._tables.items():
             [table] = _joined_alike(parts)  # of one bag
             begin = int(np.searchsorted(table.log_times, table.log_times[-1]))
             last = table.rows(np.arange(begin, len(table)))
-            parts[:] = [table]
             if last.memory_bytes <= room:
                 room -= last.memory_bytes
                 following._tables[key] = [last]
                 following.memory_bytes += last.memory_bytes
-                parts[:] = [table.rows(np.arange(begin))]
+                table = table.rows(np.arange(begin))
+            parts[:] = [table]
+        return following
 
     def tables(self) -> list[Table]:
-        """Returns the messages as tables, and has none of them any more."""
+        """Returns the messages as tables, and empties the group."""
         self._decode()
         self._buffer = b""
         tables: list[Table] = []
@@ -335,7 +353,7 @@ class Group:
         return [table for table in reversed(tables) if len(table)]
 
     def _decode(self) -> None:
-        """Decodes what waits, all messages of a topic at once."""
+        """Decodes the batches that wait, all messages of a topic at once."""
         waiting, self._waiting, self._waiting_bytes = self._waiting, [], 0
         buffers = {id(batch.buffer): batch.buffer for _, batch, _ in waiting}
         begins = dict(zip(buffers, accumulate(map(len, buffers.values()), initial=0), strict=False))
@@ -354,21 +372,18 @@ class Group:
     def _decoded(
         self, waiting: Sequence[_Undecoded], buffer: bytes, begins: Mapping[int, int]
     ) -> Iterator[Table]:
-        """Yields messages of one topic and plan; what cannot be walked the reader decodes.
+        """Yields the tables of batches of one topic and plan.
+
+        The reader decodes messages that cannot be walked.
 
         Args:
-            waiting: the messages.
+            waiting: the batches.
             buffer: all buffers, one after the other.
-            begins: by the identity of a buffer, where it begins there.
+            begins: where each buffer begins in it, by the identity of the buffer.
         """
         kind = waiting[0].kind
         batch, bags, is_hashed = _as_one(waiting, buffer, begins)
-        hashes = None
-        if is_hashed.any():
-            starts, sizes = batch.starts[is_hashed], batch.sizes[is_hashed]
-            spans = zip(starts.tolist(), (starts + sizes).tolist(), strict=True)
-            hashes = np.full(len(bags), UNHASHED)
-            hashes[is_hashed] = [zlib.crc32(buffer[begin:end]) for begin, end in spans]
+        hashes = _payload_hashes(batch, is_hashed) if is_hashed.any() else None
         table = Table(
             kind.first,
             batch.log_times,
@@ -398,7 +413,7 @@ class Group:
 
 
 def _pieces_of(batch: Batch) -> Iterator[Batch]:
-    """Yields a batch of a large chunk in parts: to walk one takes some times its bytes."""
+    """Yields a large batch in pieces: to walk a batch takes several times its bytes."""
     if batch.sizes.sum() <= BATCH_BYTES:
         yield batch
         return
@@ -410,9 +425,9 @@ def _pieces_of(batch: Batch) -> Iterator[Batch]:
 def _as_one(
     waiting: Sequence[_Undecoded], buffer: bytes, begins: Mapping[int, int]
 ) -> tuple[Batch, IntArray, Mask]:
-    """Returns batches as one in a common buffer, by log time.
+    """Returns batches as one in a common buffer, in order of log time.
 
-    And of each message its bag, and whether it is hashed.
+    Behind it the number of each message's bag, and whether the message is hashed.
     """
     batches = [batch for _, batch, _ in waiting]
     counts = [batch.sizes.size for batch in batches]
@@ -433,26 +448,34 @@ def _as_one(
     return batch.select(order), bags[order], is_hashed[order]
 
 
-def _joined_alike(parts: Sequence[Table]) -> list[Table]:
-    """Returns tables of one topic and definition joined.
+def _payload_hashes(batch: Batch, is_hashed: Mask) -> IntArray:
+    """Returns the CRC-32 of each payload that is hashed, `UNHASHED` of the others."""
+    hashes = np.full(is_hashed.size, UNHASHED)
+    starts, sizes = batch.starts[is_hashed], batch.sizes[is_hashed]
+    spans = zip(starts.tolist(), (starts + sizes).tolist(), strict=True)
+    hashes[is_hashed] = [zlib.crc32(batch.buffer[begin:end]) for begin, end in spans]
+    return hashes
 
-    Of each bag either all rows have columns, or none has.
+
+def _joined_alike(parts: Sequence[Table]) -> list[Table]:
+    """Returns tables of one topic and definition, joined where they have the same columns.
+
+    If some rows of a bag have no columns, the others lose theirs.
     """
     if len({part.left_out.get("") for part in parts}) == 1:
         return [joined(parts)]
-    reasons = {
-        number: part.left_out[""]
-        for part in reversed(parts)
-        if "" in part.left_out
-        for number in np.unique(part.bag_numbers).tolist()
-    }
-    alike: dict[str | None, list[Table]] = defaultdict(list)
+    reason_of: dict[int, str] = {}  # why a bag has no columns
+    for part in parts:
+        if "" in part.left_out:
+            for number in np.unique(part.bag_numbers).tolist():
+                reason_of.setdefault(number, part.left_out[""])
+    by_reason: dict[str | None, list[Table]] = defaultdict(list)
     for part in parts:
         for number in np.unique(part.bag_numbers).tolist():
             rows = part.rows(np.flatnonzero(part.bag_numbers == number))
-            reason = reasons.get(number)
-            alike[reason].append(rows if reason is None else rows.without_columns(reason))
-    return [*map(joined, alike.values())]
+            reason = reason_of.get(number)
+            by_reason[reason].append(rows if reason is None else rows.without_columns(reason))
+    return [*map(joined, by_reason.values())]
 
 
 def _with_columns(table: Table, level: LevelColumns) -> Table:
@@ -462,35 +485,35 @@ def _with_columns(table: Table, level: LevelColumns) -> Table:
 def _one_by_one(
     reader: BagReader, plan: Plan, batch: Batch, table: Table, *, skip: bool
 ) -> Iterator[Table]:
-    """Yields parts of a table whose messages the reader decodes.
+    """Yields pieces of a table whose messages the reader decodes.
 
     Raises:
-        UndecodableError: it cannot decode one, unless those are skipped.
+        UndecodableError: a message cannot be decoded, and such messages are not skipped.
     """
+    ends = np.cumsum(batch.sizes)
     begin = 0
-    sizes = batch.sizes.tolist()
     while begin < len(table):
+        before = int(ends[begin - 1]) if begin else 0
+        end = int(np.searchsorted(ends, before + _DECODED_BYTES, side="right"))
+        end = max(end, begin + 1)  # a larger message is decoded alone
         messages: list[object] = []
         rows: list[int] = []
-        size, nth = 0, begin
-        while nth < len(table) and (nth == begin or size + sizes[nth] <= _DECODED_BYTES):
+        for row in range(begin, end):
             try:
-                messages.append(reader.decode(batch.record(nth)))
-                rows.append(nth)
+                messages.append(reader.decode(batch.record(row)))
+                rows.append(row)
             except UndecodableError:
                 if not skip:
                     raise
-            size += sizes[nth]
-            nth += 1
         yield _with_columns(table.rows(np.array(rows, np.int64)), _level_of(plan, messages))
-        begin = nth
+        begin = end
 
 
 # Messages that the reader decoded one by one
 
 
 def _level_of(plan: Plan, messages: Sequence[object]) -> LevelColumns:
-    """Returns the columns of decoded messages of the type of a plan."""
+    """Returns the columns of decoded messages of one type, in the steps of its plan."""
     level = LevelColumns(left_out=dict(plan.left_out))
     for step in plan.steps:
         if isinstance(step, Run):
@@ -514,7 +537,7 @@ def _level_of(plan: Plan, messages: Sequence[object]) -> LevelColumns:
 
 
 def _values(messages: Sequence[object], attribute: str) -> Sequence[object]:
-    """Returns a field of all messages; "" stands for the value itself."""
+    """Returns a field of all messages; "" stands for the messages themselves."""
     return [*map(attrgetter(attribute), messages)] if attribute else messages
 
 
