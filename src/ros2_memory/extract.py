@@ -73,7 +73,13 @@ _AS_JSON: Final = json.JSONEncoder(separators=(",", ":")).encode
 
 @dataclass(frozen=True, slots=True)
 class Extracted:
-    """A value for a reply, sentences on what was left out of it, and its JSON in ASCII."""
+    """A value for a reply.
+
+    Attributes:
+        value: the value.
+        notes: sentences on what was left out of it.
+        text: the value as JSON in ASCII.
+    """
 
     value: JsonValue
     notes: tuple[str, ...]
@@ -82,19 +88,25 @@ class Extracted:
 
 @dataclass(frozen=True, slots=True)
 class PointPose:
-    """Reads a pose from a point and a rotation; PX4 writes them as arrays, if `arrays`."""
+    """Reads a pose from a point and a rotation.
+
+    Attributes:
+        position: where the point is.
+        orientation: where the rotation is.
+        arrays: whether both may be arrays, as PX4 writes them.
+    """
 
     position: Route
     orientation: Route
     arrays: bool = False
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
-        """Returns position and rotation in a message; None where it has no position."""
-        place, turned = self.position.of(message), self.orientation.of(message)
-        position, turn = xyz(place), rotation(turned)
+        """Returns position (m) and rotation in a message; None if it has no position."""
+        point_node, turn_node = self.position.of(message), self.orientation.of(message)
+        position, turn = xyz(point_node), rotation(turn_node)
         if self.arrays:
-            position = triple(place) if position is None else position
-            turn = _px4_rotation(turned) if turn is None else turn
+            position = triple(point_node) if position is None else position
+            turn = _px4_rotation(turn_node) if turn is None else turn
         return None if position is None else (position, turn)
 
 
@@ -102,7 +114,10 @@ class PointPose:
 class PlanarPose:
     """Reads a pose from x, y, perhaps z (m; 0 without one) and a heading (rad).
 
-    Where the heading `is_needed`, a message that has no such field has no pose.
+    Attributes:
+        x: where x is; likewise y and z.
+        heading: where the heading is.
+        is_needed: whether a message without a field for the heading has no pose.
     """
 
     x: Route
@@ -112,14 +127,14 @@ class PlanarPose:
     is_needed: bool = False
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
-        """Returns position and rotation in a message; None where it has no position."""
+        """Returns position (m) and rotation in a message; None if it has no position."""
         x, y = number(self.x.of(message)), number(self.y.of(message))
         if x is None or y is None:
             return None
-        turned = self.heading.of(message)
-        if turned is ABSENT and self.is_needed:
+        heading_node = self.heading.of(message)
+        if heading_node is ABSENT and self.is_needed:
             return None
-        z, heading = number(self.z.of(message)), number(turned)
+        z, heading = number(self.z.of(message)), number(heading_node)
         if heading is None or not math.isfinite(heading):
             return (x, y, z or 0.0), None
         return (x, y, z or 0.0), (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
@@ -127,7 +142,16 @@ class PlanarPose:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The compiled schema map of one type. Poses, twists and latitudes are tried in order."""
+    """The compiled schema map of one type.
+
+    Attributes:
+        fields: the path of each field that is shown.
+        poses: ways to read a pose, the first choice first.
+        twists: the paths of linear and angular velocities, the first choice first.
+        geodetic: the paths of latitudes, longitudes, altitudes and the status of a fix.
+        pose_frame: the path of PX4's number of the pose's frame.
+        velocity_frame: the path of PX4's number of the velocity's frame.
+    """
 
     fields: Mapping[str, Segments]
     poses: tuple[PointPose | PlanarPose, ...]
@@ -163,9 +187,7 @@ FRAME: Final = Route("header", "frame_id")
 _CHILD_FRAME: Final = Route("child_frame_id")
 _STAMP: Final = Route("header", "stamp")
 _TRANSFORMS: Final = Route("transforms")
-_STRAIGHT: Final[dict[tuple[type, Segments], Callable[[object], object] | None]] = {}
-_MAX_STRAIGHT: Final = 4096
-"""Getters of `_straight` by class and path."""
+_MOST_GETTERS: Final = 4096
 _TRANSLATION: Final = Route("transform", "translation")
 _ROTATION: Final = Route("transform", "rotation")
 POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
@@ -205,6 +227,8 @@ class SchemaExtractor:
         self.schemas = schemas
         self._max_chars = max_chars
         self._plans = {name: _compile(name, fields) for name, fields in schemas.items()}
+        # By class and path.
+        self._getters: dict[tuple[type, Segments], Callable[[object], object] | None] = {}
 
     def exact(self, message: object, type_name: str) -> JsonValue:
         """Returns the whole extracted value, neither thinned nor rounded, for conditions.
@@ -216,7 +240,7 @@ class SchemaExtractor:
         return self._whole(ExactJson(self.limit), message, type_name)
 
     def exact_at(self, message: object, type_name: str, path: str) -> JsonValue:
-        """Returns one of the `fields` of `shown`, exactly; null where this message has none."""
+        """Returns a field, found as by `shown`, neither thinned nor rounded; null if absent."""
         node = self._find(message, type_name, path)
         return None if node is ABSENT else ExactJson(self.limit).value(node, path)
 
@@ -251,10 +275,10 @@ class SchemaExtractor:
             limit, squeeze = max(limit // 2, 1), squeeze * 2
 
     def pose(self, message: object, type_name: str) -> Pose | None:
-        """Returns the pose of a message, in its header's frame; None where it has none.
+        """Returns the pose of a message (m), in its header's frame; None if it has none.
 
-        By the schema map's names; for a type that is not in the map, by a point at
-        `pose.pose.position`, `pose.position` or `position`, or by `x`, `y` and a heading.
+        It is read by the schema map's names; for a type that is not in the map, from a point at
+        `pose.pose.position`, `pose.position` or `position`, or from `x`, `y` and a heading.
         Coordinates are those of the message, NaN included.
         """
         plan = self.plan(type_name)
@@ -262,15 +286,15 @@ class SchemaExtractor:
             pose = route.of(message)
             if pose is not None:
                 px4_frame = _px4_frame(plan.pose_frame, message, POSE_FRAMES)
-                return Pose(*pose, _text(FRAME.of(message)) or px4_frame)
+                return Pose(*pose, self.frame(message) or px4_frame)
         return None
 
     def geodetic(self, message: object, type_name: str) -> Geodetic | None:
-        """Returns the position on the Earth of a message; None where it has none.
+        """Returns the position of a message on the Earth (degrees, m); None if it has none.
 
-        By the schema map's names; for a type that is not in the map, by `latitude` and `longitude`,
-        or `lat` and `lon`, in the message, its `position` or `pose.position`, unless these numbers
-        cannot be degrees.
+        It is read by the schema map's names; for a type that is not in the map, from `latitude` and
+        `longitude`, or `lat` and `lon`, in the message, its `position` or `pose.position`, unless
+        these numbers cannot be degrees.
         """
         plan = self.plan(type_name)
         for routes in plan.geodetic:
@@ -279,35 +303,33 @@ class SchemaExtractor:
                 continue
             if plan is UNMAPPED and (abs(latitude) > 90 or abs(longitude) > 360):
                 continue
-            above = math.nan if altitude is None else altitude
+            altitude_m = math.nan if altitude is None else altitude
             has_fix = status is None or status >= 0
-            return Geodetic(latitude, longitude, above, _text(FRAME.of(message)), has_fix)
+            return Geodetic(latitude, longitude, altitude_m, self.frame(message), has_fix)
         return None
 
     def own_path(self, path: str, type_name: str) -> str:
-        """Returns a full path in a message as one in its extracted value.
+        """Returns a full path in a message as a path in its extracted value.
 
-        Such as `position.x` for `pose.pose.position.x` of an odometry. A path that no mapped field
-        leads to is returned as it is, and so is one that begins with the name of another one.
+        For an odometry it returns `position.x` for `pose.pose.position.x`. A path that no mapped
+        field leads to is returned as it is, and so is one that begins with the name of another
+        field.
         """
         fields, segments = self.plan(type_name).fields, tuple(path.split("."))
-        leading = [
-            (len(mapped), name)
-            for name, mapped in fields.items()
-            if segments[: len(mapped)] == mapped
-            and (name == segments[0] or segments[0] not in fields)
-        ]
-        if not leading:
-            return path
-        length, name = max(leading)
-        return ".".join((name, *segments[length:]))
+        longest, own_name = 0, ""
+        for name, mapped in fields.items():
+            is_other = segments[0] in fields and name != segments[0]
+            leads_there = segments[: len(mapped)] == mapped and not is_other
+            if leads_there and (len(mapped), name) > (longest, own_name):
+                longest, own_name = len(mapped), name
+        return ".".join((own_name, *segments[longest:])) if own_name else path
 
     def fields_of(self, type_name: str) -> Mapping[str, Segments]:
-        """Returns the fields that the schema map names, with their paths; none if it has none."""
+        """Returns the fields that the schema map has for a type, with their paths."""
         return self.plan(type_name).fields
 
     def is_mapped(self, type_name: str) -> bool:
-        """Returns whether the schema map lists a type; what any other carries its messages show."""
+        """Returns whether the schema map has a type."""
         return self.plan(type_name) is not UNMAPPED
 
     def kinds_of(self, type_name: str) -> frozenset[str]:
@@ -315,42 +337,42 @@ class SchemaExtractor:
         plan = self.plan(type_name)
         if plan is UNMAPPED:
             return frozenset()
-        has = {
+        kinds: set[str] = set()
+        for route in plan.poses:
             # Not a point without an orientation, such as one that somebody clicked.
-            "position": any(
-                isinstance(route, PlanarPose) or route.orientation is not _NOWHERE
-                for route in plan.poses
-            ),
-            "velocity": bool(plan.twists),
-            "geodetic": bool(plan.geodetic),
-        }
-        return frozenset(kind for kind, is_there in has.items() if is_there)
+            if isinstance(route, PlanarPose) or route.orientation is not _NOWHERE:
+                kinds.add("position")
+        if plan.twists:
+            kinds.add("velocity")
+        if plan.geodetic:
+            kinds.add("geodetic")
+        return frozenset(kinds)
 
     def twist(self, message: object, type_name: str) -> Twist | None:
-        """Returns the velocity of a message; None where it has none.
+        """Returns the velocity of a message (m/s, rad/s); None if it has none.
 
-        By the schema map's `linear_velocity` and `angular_velocity`; for a type that is not in the
-        map, by vectors at `twist.twist` or `twist`. It is expressed in the child frame where the
-        message names one (nav_msgs/Odometry), otherwise in the header's frame.
+        It is read by the schema map's `linear_velocity` and `angular_velocity`; for a type that is
+        not in the map, from vectors at `twist.twist` or `twist`. It is expressed in the child frame
+        if the message names one (nav_msgs/Odometry), otherwise in the header's frame.
         """
         plan = self.plan(type_name)
-        for linear, angular in plan.twists:
-            moving, turning = linear.of(message), angular.of(message)
-            along, about = xyz(moving), xyz(turning)
-            if along is None and plan is not UNMAPPED:
-                along, about = _velocity(moving, 0), _velocity(turning, 2)
-            if along is not None and about is not None:
-                frame = _text(_CHILD_FRAME.of(message)) or _text(FRAME.of(message))
+        for linear_route, angular_route in plan.twists:
+            linear_node, angular_node = linear_route.of(message), angular_route.of(message)
+            linear, angular = xyz(linear_node), xyz(angular_node)
+            if linear is None and plan is not UNMAPPED:
+                linear, angular = _velocity(linear_node, 0), _velocity(angular_node, 2)
+            if linear is not None and angular is not None:
+                frame = _text(_CHILD_FRAME.of(message)) or self.frame(message)
                 px4_frame = _px4_frame(plan.velocity_frame, message, _VELOCITY_FRAMES)
-                return Twist(along, about, frame or px4_frame)
+                return Twist(linear, angular, frame or px4_frame)
         return None
 
     def frame(self, message: object) -> str:
-        """Returns the frame in a message's header; empty where it has none."""
+        """Returns the frame in a message's header; "" if it has none."""
         return _text(FRAME.of(message))
 
     def stamp(self, message: object) -> Ns | None:
-        """Returns the stamp (ns) in a message's header; None where it has none."""
+        """Returns the stamp (ns) in a message's header; None if it has none."""
         return nanoseconds(_STAMP.of(message))
 
     def transforms(
@@ -358,53 +380,61 @@ class SchemaExtractor:
     ) -> tuple[StampedTransform, ...]:
         """Returns the edges of a TFMessage, rotations normalised, frames without leading slash.
 
-        Left out, as tf2's buffer refuses them: an edge without a frame name or from a frame to
+        It leaves out what tf2's buffer refuses: an edge without a frame name or from a frame to
         itself, and one whose numbers are not finite or whose quaternion is zero.
+
+        Args:
+            message: the decoded message.
+            log_time: of the message (ns).
+            static: whether it is of a topic of static transforms.
         """
-        listed = _TRANSFORMS.of(message)
-        if not isinstance(listed, list):
+        nodes = _TRANSFORMS.of(message)
+        if not isinstance(nodes, list):
             return ()
-        edges = (_edge(transform, log_time, static=static) for transform in listed)
+        edges = (_edge(node, log_time, static=static) for node in nodes)
         return tuple(edge for edge in edges if edge is not None)
 
     def plan(self, type_name: str) -> Plan:
-        """Returns the compiled schema map of a type; `UNMAPPED` where it is not in the map."""
+        """Returns the compiled schema map of a type; `UNMAPPED` if it is not in the map."""
         plan = self._plans.get(type_name)
         if plan is None and type_name.count("/") == 1:  # as recorders before 2019 wrote it
             plan = self._plans.get(type_name.replace("/", "/msg/"))
         return UNMAPPED if plan is None else plan
 
     def _whole(self, rendering: ExactJson, message: object, type_name: str) -> JsonValue:
-        plan = self.plan(type_name)
-        nodes = [(name, _converted(name, _at(message, path))) for name, path in plan.fields.items()]
-        absent = [name for name, node in nodes if node is ABSENT]
+        nodes = {
+            name: _converted(name, self._at(message, path))
+            for name, path in self.plan(type_name).fields.items()
+        }
+        absent = [name for name, node in nodes.items() if node is ABSENT]
         for name in absent:
             rendering.note("absent", name, f"{name}: this message has no such field")
         if len(absent) == len(nodes):
             return rendering.value(message, "")
-        return {name: rendering.value(node, name) for name, node in nodes}
+        return {name: rendering.value(node, name) for name, node in nodes.items()}
 
     def _find(self, message: object, type_name: str, path: str) -> object:
         """Returns what is at a path in a message, or `ABSENT`.
 
-        By the name that the schema map has for it; in a type that it does not map, as the message
-        is shown; else by the path of the message's own fields.
+        The path begins with a name of the schema map, or with a field of a type that is not mapped;
+        or else it is the full path in the message, or that of a named element of an array.
         """
         plan = self.plan(type_name)
         segments = tuple(path.split("."))
         mapped, node = plan.fields.get(segments[0]), ABSENT
         if mapped is not None:
-            node = descend(_converted(segments[0], _at(message, mapped)), segments[1:], view)
+            node = descend(_converted(segments[0], self._at(message, mapped)), segments[1:], view)
         elif not plan.fields:
             node = descend(message, segments, view)
         if node is ABSENT:
-            node = _plain(_at(message, segments))
-        return self._named(message, type_name, path) if node is ABSENT else node
+            node = _plain(self._at(message, segments))
+        return self._named_element(message, type_name, path) if node is ABSENT else node
 
-    def _named(self, message: object, type_name: str, path: str) -> object:
-        """Returns what an array has for a name in the list beside it, as `positions.elbow`.
+    def _named_element(self, message: object, type_name: str, path: str) -> object:
+        """Returns the element of an array that has a name in the list beside it.
 
-        Null where the list has other names, `ABSENT` where there is none.
+        For the path `positions.elbow` it returns the position of the joint named elbow; null if the
+        list does not have the name, `ABSENT` if there is no such list.
         """
         head, _, name = path.partition(".")
         value = self._whole(ExactJson(self.limit), message, type_name)
@@ -414,6 +444,20 @@ class SchemaExtractor:
             return ABSENT
         at = names.index(name) if name in names else len(array)
         return array[at] if at < len(array) else None
+
+    def _at(self, message: object, path: Segments) -> object:
+        """Returns what is at a path of the message's own fields, or `ABSENT`."""
+        key = (type(message), path)
+        try:
+            getter = self._getters[key]
+        except KeyError:
+            if len(self._getters) >= _MOST_GETTERS:
+                self._getters.clear()
+            getter = self._getters[key] = _getter(message, path)
+        if getter is not None:
+            return getter(message)
+        node = descend(message, path, view)
+        return descend(message, path) if node is ABSENT else node
 
 
 def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
@@ -430,15 +474,13 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
     def route(name: str) -> Route:
         return Route(*paths[name]) if name in paths else _NOWHERE
 
-    has_twist = paths.keys() >= {"linear_velocity", "angular_velocity"}
-    has_geodetic = paths.keys() >= {"latitude", "longitude"}
+    twist = (route("linear_velocity"), route("angular_velocity"))
+    geodetic = tuple(map(route, ("latitude", "longitude", "altitude", "fix_status")))
     return Plan(
         fields=paths,
         poses=_poses(paths.keys(), route),
-        twists=((route("linear_velocity"), route("angular_velocity")),) if has_twist else (),
-        geodetic=(tuple(map(route, ("latitude", "longitude", "altitude", "fix_status"))),)
-        if has_geodetic
-        else (),
+        twists=() if _NOWHERE in twist else (twist,),
+        geodetic=() if _NOWHERE in geodetic[:2] else (geodetic,),
         pose_frame=route("pose_frame") if "pose_frame" in paths else None,
         velocity_frame=route("velocity_frame") if "velocity_frame" in paths else None,
     )
@@ -464,20 +506,21 @@ def _px4_rotation(node: object) -> Quaternion | None:
 
 
 def _velocity(node: object, axis: int) -> Vector3 | None:
-    """Returns a velocity that is an array, or one number: along or about this axis."""
+    """Returns a velocity that is an array, or a number: the component of one axis."""
     component = number(node)
     if component is None:
         return triple(node)
     return (component, 0.0, 0.0) if axis == 0 else (0.0, 0.0, component)
 
 
-def _px4_frame(route: Route | None, message: object, named: Mapping[int, str]) -> str:
+def _px4_frame(route: Route | None, message: object, names: Mapping[int, str]) -> str:
+    """Returns the name of the frame whose number is at a path; "" if there is none."""
     frame = None if route is None else number(route.of(message))
-    return "" if frame is None or not math.isfinite(frame) else named.get(int(frame), "")
+    return "" if frame is None or not math.isfinite(frame) else names.get(int(frame), "")
 
 
 def _converted(name: str, node: object) -> object:
-    """Returns the value of a name of the schema map: an array as the point or rotation it is."""
+    """Returns the value of a name of the schema map: an array becomes a point or a rotation."""
     if not isinstance(node, np.ndarray):
         return node
     if name in POINTS:
@@ -489,21 +532,8 @@ def _converted(name: str, node: object) -> object:
     return node
 
 
-def _at(message: object, path: Segments) -> object:
-    key = (type(message), path)
-    if key not in _STRAIGHT:
-        if len(_STRAIGHT) >= _MAX_STRAIGHT:
-            _STRAIGHT.clear()
-        _STRAIGHT[key] = _straight(message, path)
-    straight = _STRAIGHT[key]
-    if straight is not None:
-        return straight(message)
-    node = descend(message, path, view)
-    return descend(message, path) if node is ABSENT else node
-
-
-def _straight(message: object, path: Segments) -> Callable[[object], object] | None:
-    """Returns a quick getter of a path in messages of this class; None where fields are converted.
+def _getter(message: object, path: Segments) -> Callable[[object], object] | None:
+    """Returns a fast getter of a path in messages of this class; None if fields are converted.
 
     A definition fixes the classes of all fields, so what holds for one message holds for all.
     """
@@ -523,7 +553,7 @@ def _straight(message: object, path: Segments) -> Callable[[object], object] | N
 
 
 def _plain(node: object) -> object:
-    """Returns a node that was asked for by its full path: a quaternion then stays x, y, z, w."""
+    """Returns a node for a full path in the message: a quaternion stays x, y, z, w."""
     if isinstance(node, list):
         return [_plain(element) for element in node]
     numbers = xyzw(node) if kind_of(node) is ValueKind.QUATERNION else None
@@ -536,8 +566,8 @@ def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> st
     if not plan.fields:
         what_it_has = f"its fields are: {fields}" if names else "it has no fields"
         return f"{type_name} has no field {path!r}; {what_it_has}"
-    turned = [f"{name}.{path}" for name in plan.fields if path in ANGLES and name in _TURNS]
-    meant = f" (did you mean {turned[0]}?)" if turned else ""
+    angles = [f"{name}.{path}" for name in plan.fields if path in ANGLES and name in _TURNS]
+    meant = f" (did you mean {angles[0]}?)" if angles else ""
     return (
         f"{type_name} has no field {path!r}{meant}; its fields are: {', '.join(plan.fields)}; "
         f"or give a full path in the message, which begins with one of: {fields}"
@@ -549,6 +579,7 @@ def _text(node: object) -> str:
 
 
 def _edge(node: object, log_time: Ns, *, static: bool) -> StampedTransform | None:
+    """Returns an edge of a TFMessage; None if it is left out."""
     parent = _text(FRAME.of(node)).removeprefix("/")
     child = _text(_CHILD_FRAME.of(node)).removeprefix("/")
     stamp = nanoseconds(_STAMP.of(node))

@@ -1,8 +1,8 @@
 """Message definitions: the fields of each type, and a deserializer for it.
 
-A definition is looked up in this order: in the bag (the schema text, nested types included), in the
-configured `.msg` folders, among the standard types. Every distinct schema text gets a typestore of
-its own, so two bags that define one type differently are each read with their own.
+A definition is looked up first in the bag (the schema text, nested types included), then in the
+configured `.msg` folders, then among the standard types. Every distinct schema text has a typestore
+of its own, so that two bags that define one type differently are read correctly.
 
 Definitions are read from files that anybody may have written. Their size, nesting and arrays are
 bounded before the parser and the code generator of rosbags see them: both take exponential time or
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 MAX_TEXT_BYTES: Final = 1 << 20
 MAX_STATEMENTS: Final = 2_000
-"""In the definition of one type. The parser takes half a millisecond for each."""
+"""Of the definition of one type; the parser takes half a millisecond for each."""
 MAX_MEMBERS: Final = 4_000
 """Fields and constants of a type and all that it is made of; the largest standard type has 112."""
 MAX_NESTING: Final = 40
@@ -43,7 +43,7 @@ MAX_UNROLLED: Final = 5_000
 MAX_CACHED_BYTES: Final = 8 << 20
 """Of definitions whose deserializers are cached; a deserializer takes some ten times as much."""
 _CACHED_TYPE_BYTES: Final = 2_048
-"""Counted for each besides its text, so that no more than 4,096 are cached."""
+"""Added to the size of each text, so that at most 4,096 types are cached."""
 _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
@@ -69,18 +69,18 @@ _IDL_NESTED_SEQUENCE: Final = re.compile(r"sequence\s*<\s*sequence")
 
 
 class MessageType(NamedTuple):
-    """What one schema defines.
+    """The type that a schema defines.
 
     Attributes:
-        fields: from the root down, for readers that do not know rosbags.
-        store: compiles a deserializer when one is first asked for: columns need none.
+        fields: the definition, for readers that do not know rosbags.
+        store: compiles a deserializer when it is first used; columns need none.
     """
 
     fields: Definition
     store: Typestore
 
     def compiled(self) -> MessageType | str:
-        """Returns the type with a deserializer; or why none can be made."""
+        """Compiles the deserializer; returns the type, or why it cannot be compiled."""
         try:
             with _run_by_rosbags():
                 self.store.get_msgdef(self.fields.type)
@@ -110,8 +110,8 @@ class Typestores:
     """Deserializers by schema content. Thread-safe.
 
     Args:
-        custom_msg_paths: folders that contain `<package>/msg/*.msg` at any depth, or a package.
-            A type that is in several is taken from the first.
+        custom_msg_paths: folders that contain `<package>/msg/*.msg` at any depth, or a package. If
+            several folders have a type, the first one counts.
 
     Raises:
         ConfigError: a path is not a folder, has no `.msg` file in it, or cannot be read.
@@ -129,8 +129,8 @@ class Typestores:
         """Returns the type that a schema of a bag defines, or why it cannot be decoded.
 
         Args:
-            name: the type, `package/msg/Name`.
-            encoding: `ros2msg`, `ros2idl`, or empty where the bag has no definition.
+            name: of the type, `package/msg/Name`.
+            encoding: `ros2msg`, `ros2idl`, or empty if the bag has no definition.
             text: the definition followed by the nested ones, as rosbag2 concatenates them.
         """
         key = (name, encoding, text)
@@ -161,10 +161,10 @@ class Typestores:
         definitions: Typesdict = {}
         visited: set[str] = set()
         members = unrolled = 0
-        # Depth first: the trail to a type is what names a definition that contains itself.
-        todo: list[tuple[str, tuple[str, ...]]] = [(root, ())]
-        while todo:
-            name, trail = todo.pop()
+        # Depth first: an error about a type that contains itself names the trail to it.
+        to_visit: list[tuple[str, tuple[str, ...]]] = [(root, ())]
+        while to_visit:
+            name, trail = to_visit.pop()
             if name in trail:
                 raise _UnusableError(f"its definition contains itself: {' > '.join(trail)}")
             if name in visited:
@@ -173,26 +173,23 @@ class Typestores:
             if len(trail) > MAX_NESTING:
                 raise _UnusableError(f"its definition nests more than {MAX_NESTING} levels deep")
             if name not in definitions:
-                definition = self._definition(name, in_bag, trail)
-                members += sum(len(named) + len(kept) for named, kept in definition.values())
+                parsed = self._definition(name, in_bag, trail)
+                members += sum(
+                    len(constants) + len(fields) for constants, fields in parsed.values()
+                )
                 if members > MAX_MEMBERS:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
-                definitions.update(definition)
-            shapes = [_shape(field) for _, field in definitions[name][1]]
-            if wide := _WIDE.intersection(kind.rpartition("/")[2] for kind, _ in shapes):
-                raise _UnusableError(f"its definition has a {min(wide)}, which is not decoded")
-            unrolled += sum(
-                length or 0
-                for kind, length in shapes
-                if length != SEQUENCE and ("/" in kind or kind == "string")
-            )
+                definitions.update(parsed)
+            _, fields = definitions[name]
+            shapes = [_shape(field) for _, field in fields]
+            unrolled += _unrolled_elements(shapes)
             if unrolled > MAX_UNROLLED:
                 raise _UnusableError(
                     f"its fixed arrays of strings and messages hold more than {MAX_UNROLLED}"
                     " elements"
                 )
             nested = dict.fromkeys(kind for kind, _ in shapes if "/" in kind)
-            todo += [(inner, (*trail, name)) for inner in reversed(nested)]
+            to_visit += [(inner, (*trail, name)) for inner in reversed(nested)]
         return {
             name: (constants, [(field_name, _unsigned(field)) for field_name, field in fields])
             for name, (constants, fields) in definitions.items()
@@ -221,12 +218,28 @@ class Typestores:
         )
 
 
+def _unrolled_elements(shapes: Sequence[tuple[str, int | None]]) -> int:
+    """Returns how many elements the fixed arrays of strings and messages of a type have.
+
+    Raises:
+        _UnusableError: a field is of a type that is not decoded.
+    """
+    wide = _WIDE.intersection(kind.rpartition("/")[2] for kind, _ in shapes)
+    if wide:
+        raise _UnusableError(f"its definition has a {min(wide)}, which is not decoded")
+    elements = 0
+    for kind, length in shapes:
+        if length != SEQUENCE and ("/" in kind or kind == "string"):
+            elements += length or 0
+    return elements
+
+
 @cache
 def _standard_definitions() -> Typesdict:
     """Returns the definitions of ROS's own messages.
 
-    Made when a bag lacks a definition, which few do: rosbags derives them from six distributions,
-    in 60 ms of processor time.
+    Called only if a bag lacks a definition, since rosbags derives them from six distributions in
+    60 ms of processor time.
     """
     return get_typestore(Stores.LATEST).fielddefs
 
@@ -241,31 +254,28 @@ def _sections(name: str, encoding: str, text: bytes) -> dict[str, _Section]:
     if not plain.strip():
         # A type without fields has an empty text, and so has one whose text was not found.
         return {name: _Section(encoding, "")} if encoding else {}
-    service: dict[str, _Section] = {}
+    sections: dict[str, _Section] = {}
     if encoding != "ros2idl" and _SERVICE.search(plain):
-        service, plain = _service_event(name, plain)
-    pieces = _SEPARATOR.split(plain if plain.endswith("\n") else plain + "\n")
-    root = "ros2msg" if encoding in {"", "ros2msg"} else "ros2idl"
-    sections = service
-    if pieces[0].strip():
-        sections[name] = _Section(root, pieces[0])
-    for kind, named, body in zip(pieces[1::3], pieces[2::3], pieces[3::3], strict=True):
+        sections, plain = _service_event(name, plain)
+    # The root's text, then kind, name and text of each nested definition.
+    root, *nested = _SEPARATOR.split(plain if plain.endswith("\n") else plain + "\n")
+    if root.strip():
+        sections[name] = _Section("ros2msg" if encoding in {"", "ros2msg"} else "ros2idl", root)
+    for kind, nested_name, body in zip(nested[::3], nested[1::3], nested[2::3], strict=True):
         section = _Section("ros2idl" if kind == "IDL" else "ros2msg", body)
-        sections.setdefault(full_name(named), section)
+        sections.setdefault(full_name(nested_name), section)
     return sections
 
 
 def _service_event(name: str, text: str) -> tuple[dict[str, _Section], str]:
-    """Returns the definitions of a service's events, and what follows that of the service.
+    """Returns the definitions of the events of a service, and the text of the nested ones.
 
-    rosbag2 stores the definition of the service itself. An event is that of rosidl's service
-    introspection (REP-2012): who called when, and the request or the response, if contents are
-    published.
+    rosbag2 stores the definition of the service itself. An event of rosidl's service introspection
+    (REP-2012) has who called when, and the request or the response if contents are published.
     """
     separator = _SEPARATOR.search(text)
-    own_text, nested = (
-        (text, "") if separator is None else (text[: separator.start()], text[separator.start() :])
-    )
+    own_end = len(text) if separator is None else separator.start()
+    own_text, nested = text[:own_end], text[own_end:]
     parts = _SERVICE.split(_SERVICE_HEADER.sub("", own_text, count=1))
     words = name.removesuffix(_EVENT).split("/")
     is_event = name.endswith(_EVENT) and len(words) == 3 and words[1] == "srv"
@@ -278,8 +288,8 @@ def _service_event(name: str, text: str) -> tuple[dict[str, _Section], str]:
     for half, part in zip(_HALVES, parts, strict=True):
         member = f"{package}/{short}_{half}"
         parsed = _parse(full_name(member), _Section("ros2msg", part))
-        is_empty = not parsed[full_name(member)][1]
-        body = f"{part}\nuint8 structure_needs_at_least_one_member\n" if is_empty else part
+        _, members = parsed[full_name(member)]
+        body = part if members else f"{part}\nuint8 structure_needs_at_least_one_member\n"
         sections[full_name(member)] = _Section("ros2msg", body)
         fields.append(f"{member}[<=1] {half.lower()}")
     sections[name] = _Section("ros2msg", "\n".join(fields))
@@ -314,29 +324,32 @@ def _parse(name: str, section: _Section) -> Typesdict:
 
 @contextmanager
 def _run_by_rosbags() -> Iterator[None]:
-    """Translates what is raised in the block, in which rosbags makes Python of definitions."""
+    """Translates errors of rosbags, which turns definitions into Python code and runs it."""
     try:
         yield
-    # It runs that, too: its failures have no common base.
+    # Errors of that code have no common base.
     except Exception as error:
         raise _UnusableError(f"its definition cannot be used: {_brief(error)}") from error
 
 
 def _plain_idl(text: str) -> str:
-    """Returns IDL without comments and annotations; refuses what the parser would not finish.
+    """Returns IDL without comments and annotations.
 
-    rosbags parses an expression 128 times for each parenthesis around it, and a sequence twice for
-    each sequence around it; message definitions need neither.
+    Raises:
+        _UnusableError: the parser would take too long. rosbags parses an expression 128 times for
+            each parenthesis around it, and a sequence twice for each sequence around it; message
+            definitions need neither.
     """
     kept: list[str] = []
-    depth = 0
+    depth = 0  # of parentheses, inside the arguments of an annotation
     for piece in _IDL_PIECE.findall(text):
         if piece.startswith(("//", "/*")):
             kept.append(" ")
-        elif depth:
-            depth += (piece[-1] == "(") - (piece == ")")
-        elif piece[0] == "@":
-            depth = int(piece[-1] == "(")
+        elif depth or piece[0] == "@":
+            if piece[-1] == "(":
+                depth += 1
+            elif piece == ")":
+                depth -= 1
         elif piece == "(":
             raise _UnusableError(
                 "its IDL contains an expression in parentheses, which is not supported"
@@ -355,7 +368,7 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
     """Returns a type and its nested types as the port of bag readers describes them.
 
     Args:
-        definitions: those of the type and of its nested types; none contains itself.
+        definitions: of the type and of its nested types; no type contains itself.
         root: the name of the type.
     """
 
@@ -374,9 +387,9 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
 
 
 def _shape(field: FieldDesc) -> tuple[str, int | None]:
-    """Returns the type of a field, or of its elements, and its length, as that of a `Field`.
+    """Returns the type of a field or of its elements, and its length as of a `Field`.
 
-    Names of messages have a slash, those of primitive types have none.
+    Names of messages have a slash; names of primitive types have none.
     """
     length: int | None = None
     if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
@@ -386,7 +399,7 @@ def _shape(field: FieldDesc) -> tuple[str, int | None]:
 
 
 def _unsigned(field: FieldDesc) -> FieldDesc:
-    """Returns a field whose bytes are unsigned, as in ROS; rosbags decodes them as int8."""
+    """Returns a field with `uint8` in place of `byte`, which rosbags would decode as int8."""
     if _shape(field)[0] != "byte":
         return field
     byte: BaseDesc = (Nodetype.BASE, ("uint8", 0))
@@ -428,6 +441,6 @@ def _package_name(package: Path) -> str:
 
 
 def _brief(error: Exception) -> str:
-    """Returns one line of an error whose text may contain the whole definition."""
+    """Returns an error as one short line; its text may contain the whole definition."""
     words = " ".join(f"{error}".split()) or "no reason given"
     return f"{type(error).__name__}: {words[:160]}"

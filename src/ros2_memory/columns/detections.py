@@ -29,7 +29,7 @@ from ros2_memory.columns.values import (
     UnknownShapeError,
     Values,
     unknown,
-    zone_of,
+    zones_of,
 )
 from ros2_memory.columns.walk import entries_of_codes
 from ros2_memory.core.arrays import Floats, places_among
@@ -409,12 +409,15 @@ def _position_at(
 
 def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
     """Returns whether one of these texts looks like JSON, or has no column."""
-    zones = ((leaf, values.zone(leaf)) for leaf in texts)
-    possible = [leaf for leaf, zone in zones if zone is None or zone.may_be_json]
-    try:
-        return any(looks_like_json(word) for leaf in possible for word in values.texts(leaf).words)
-    except UnknownShapeError:
-        return True
+    for leaf in texts:
+        zones = values.zones(leaf)
+        if zones is None or zones.may_be_json:
+            try:
+                if any(map(looks_like_json, values.texts(leaf).words)):
+                    return True
+            except UnknownShapeError:
+                return True
+    return False
 
 
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
@@ -533,8 +536,8 @@ class DetectionColumns:
             return True
         possible: bool | Mask = False
         for leaf in texts:
-            zone = zone_of(leaf, parts.zone)
-            possible = possible | (True if zone is None else zone.may_be_json)
+            zones = zones_of(leaf, parts.zone)
+            possible = possible | (True if zones is None else zones.may_be_json)
         return possible
 
     def may_have_any(self, table: Table) -> bool:

@@ -1,4 +1,4 @@
-"""Fills the store: decodes each closed bag that is missing, and bags of an hour together."""
+"""Fills the store: decodes closed bags that are not stored, and joins the bags of an hour."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RETRY_NS: Final[Ns] = 600 * NS_PER_S
 IN_MEMORY_BYTES: Final = 64 << 20
 """What the store may take where no file can be written."""
 _MOST_HELD: Final = 64 << 20
-"""Bytes of columns after which bags become parts, though more of their hour wait."""
+"""Bytes of columns after which bags are written, though more bags of their hour wait."""
 _TRIMMED_TO: Final = 0.9
 """A store above its limit is trimmed to this share of it."""
 _MOST_REFUSED: Final = 10_000
@@ -51,12 +51,12 @@ _MOST_REFUSED: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class StoreLimits:
-    """How much the store may take.
+    """How large the store may be.
 
     Attributes:
-        max_share: of the bytes of the bags.
-        max_bytes: in all, where the file is not in the bag directory. The oldest bags go first.
-        least_bytes_per_s: what the columns of a second may take however small the bags are.
+        max_share: its share of the bytes of the bags.
+        max_bytes: its bytes, if the file is not in the bag directory. The oldest bags go first.
+        least_bytes_per_s: how many bytes a second of bags may take, however small they are.
     """
 
     max_share: float = 0.15
@@ -66,9 +66,13 @@ class StoreLimits:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How many closed bags there are, and how many of them are stored.
+    """How many bags are stored.
 
-    `waiting` are still to be stored. `refused` could not be: every question about them reads them.
+    Attributes:
+        closed: closed bags.
+        stored: closed bags that are stored.
+        waiting: bags that will be stored.
+        refused: bags that could not be stored; each question about them reads them.
     """
 
     closed: int
@@ -78,9 +82,11 @@ class Progress:
 
 
 class Batch(NamedTuple):
-    """Bags of one recording that are stored in the same parts, of some level.
+    """Bags of one recording that are stored in the same parts.
 
-    But for one of `Level.BAG`, its slot is over, and it has all its bags without such parts.
+    Attributes:
+        bags: the bags of a slot that do not have parts of the level yet. The slot is over.
+        level: of the parts; with `Level.BAG` it is a single bag, whose slots may go on.
     """
 
     bags: Sequence[BagFile]
@@ -88,15 +94,15 @@ class Batch(NamedTuple):
 
 
 class Filling:
-    """Fills the store of one bag directory. For one thread, but for `progress`.
+    """Fills the store of one bag directory. One thread may use it; any may call `progress`.
 
     Args:
         scanner: of the store.
         reader: reads the bags.
         bag_dir: the bag directory.
         clock: says now.
-        limits: how much the store may take.
-        large: the turn to hold much of a bag, which is passed on after each group of tables.
+        limits: how large the store may be.
+        large: the turn to hold much of a bag in memory, which is passed on after each group.
     """
 
     def __init__(
@@ -127,14 +133,13 @@ class Filling:
     def waiting(self, timeline: Timeline) -> list[BagFile]:
         """Returns the bags to be stored, the newest first.
 
-        Those among them that are stored already lie beside another recording by now, and copies of
-        their messages cannot be recognised.
+        They include stored bags that have no hashes, and beside which another recording lies now.
         """
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
             return []
-        unhashed = (bag for bag in coverage.unhashed() if self._is_shared(bag, timeline))
-        bags = [*coverage.to_store, *unhashed]
+        bags = [*coverage.to_store]
+        bags += [bag for bag in coverage.unhashed() if self._is_shared(bag, timeline)]
         bags = [bag for bag in bags if not self._is_refused(self._key(bag))]
         return self._fitting(sorted(bags, key=in_time, reverse=True))
 
@@ -150,93 +155,98 @@ class Filling:
         )
 
     def batches(self, timeline: Timeline) -> list[Batch]:
-        """Returns the bags to be stored, the newest first: alone until their ten minutes are over.
+        """Returns the bags to be stored, as batches, the newest first.
 
-        Then with those beside them that were stored alone, and so again once their hour is over.
+        A bag is stored alone until its ten minutes are over, then together with the bags of these,
+        and together with the bags of its hour once that is over.
         """
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
             return []
         waiting = self.waiting(timeline)
-        alone = {*self._below(Level.TEN_MINUTES, coverage)}
-        of_ten_minutes = alone.union(waiting)
+        stored_alone = {*self._below(Level.TEN_MINUTES, coverage)}
+        of_ten_minutes = stored_alone.union(waiting)
         recent, hours = list[Batch](), list[Batch]()
-        for bags in _by_slot([*waiting, *self._below(Level.HOUR, coverage)], Level.HOUR):
-            if self._is_over(bags[0], Level.HOUR, timeline):
-                hours.append(Batch(bags, Level.HOUR))
+        for of_hour in _by_slot([*waiting, *self._below(Level.HOUR, coverage)], Level.HOUR):
+            if self._is_over(of_hour[0], Level.HOUR, timeline):
+                hours.append(Batch(of_hour, Level.HOUR))
                 continue
-            for some in _by_slot(filter(of_ten_minutes.__contains__, bags), Level.TEN_MINUTES):
-                if self._is_over(some[0], Level.TEN_MINUTES, timeline):
-                    recent.append(Batch(some, Level.TEN_MINUTES))
+            bags = [bag for bag in of_hour if bag in of_ten_minutes]
+            for of_slot in _by_slot(bags, Level.TEN_MINUTES):
+                if self._is_over(of_slot[0], Level.TEN_MINUTES, timeline):
+                    recent.append(Batch(of_slot, Level.TEN_MINUTES))
                 else:
-                    recent += [Batch([bag], Level.BAG) for bag in some if bag not in alone]
+                    new = [bag for bag in of_slot if bag not in stored_alone]
+                    recent += [Batch([bag], Level.BAG) for bag in new]
         return [*recent, *hours]
 
     def _below(self, level: Level, coverage: Coverage) -> list[BagFile]:
-        """Returns the bags that have parts below a level."""
+        """Returns the stored bags that have parts below a level, and may be stored again."""
         stored = map(coverage.bag, self.store.below(level))
         return [bag for bag in stored if bag and not self._is_refused(self._key(bag))]
 
     def fill(self, batch: Batch, timeline: Timeline) -> int:
-        """Stores bags; returns how many. Others must wait, have changed, or are refused."""
+        """Stores the bags of a batch; returns how many.
+
+        The others must wait, have changed, or are refused.
+        """
         pending: list[ReadBag] = []
-        group, done = Group(self._reader), 0
+        group, stored = Group(self._reader), 0
         try:
             for bag in sorted(batch.bags, key=in_time):
-                done += self._add(bag, pending, group, hashed=self._is_shared(bag, timeline))
+                stored += self._add(bag, pending, group, hashed=self._is_shared(bag, timeline))
                 self._large.release()
                 if group.memory_bytes > _MOST_HELD:
-                    done += self._put(pending, group, batch, timeline)
+                    stored += self._put(pending, group, batch.level, timeline)
                     pending, group = [], Group(self._reader)
-            return done + self._put(pending, group, batch, timeline)
+            return stored + self._put(pending, group, batch.level, timeline)
         except Exception as error:
-            # The others may be whole.
             log.exception("bag_not_stored", path=str(batch.bags[0].path), bags=len(batch.bags))
-            if len(batch.bags) > 1:
-                return self._fill_alone(batch, timeline)
+            if len(batch.bags) > 1:  # the fault may lie in one of them
+                return self._fill_alone(batch.bags, batch.level, timeline)
             self._refuse(batch.bags[0], type(error).__name__)
-            return done
+            return stored
 
     def whole_since(self) -> list[TimeWindow]:
-        """Returns the times in which there are whole parts since the last call, the newest first.
+        """Returns the times of the whole parts written since the last call, the newest first.
 
-        They have all columns until `thin` is called: what follows from parts is made of these.
+        Fragments must be made of these parts before `thin` is called, which drops columns.
         """
         merged, self._merged = united(self._merged), []
         return [TimeWindow(*span) for span in reversed(merged)]
 
     def thin(self) -> None:
-        """Drops columns of the newest whole parts, as far as they are beyond the share.
+        """Drops columns of the whole parts written since the last call, beyond their share.
 
-        A robot that drives has more to store than one that stands: what other bags left of their
-        share is theirs.
+        A robot that drives has more to store than one that stands, so they may also take what other
+        bags left of their share.
         """
         groups, self._whole_parts = self._whole_parts, []
         shares = [(parts, self._share(bags)) for parts, bags in groups]
         self.store.thin(shares, self._limits.max_share)
 
     def count_gone(self, timeline: Timeline) -> tuple[int, int]:
-        """Returns how many stored bags are gone, or have changed, and how many are stored."""
+        """Returns how many stored bags are gone or have changed, and how many there are."""
         coverage, stored = self._scanner.coverage(timeline), self.store.numbers().size
         return stored - (0 if coverage is None else coverage.stored), stored
 
     def prune(self, timeline: Timeline) -> None:
-        """Deletes the bags whose files are gone; nothing where no bag is left.
+        """Deletes the bags whose files are gone.
 
-        Then the disk of the bags is more likely missing than empty.
+        If no bag is left nothing is deleted: the disk is more likely missing than empty.
         """
         files = chain.from_iterable(segment.bags.files() for segment in timeline.segments)
         present = {relative(file, str(self._bag_dir)) for file in files}
         if not present:
             return
-        absent = (path for path in self.store.paths() if path not in present)
+        absent = [path for path in self.store.paths() if path not in present]
         gone = [path for path in absent if not (self._bag_dir / path).exists()]
         if gone:
             self.store.delete(gone)
         self.store.release_pages()
 
     def trim(self) -> None:
-        """Deletes the oldest bags where the store takes more than it may."""
+        """Deletes the oldest bags if the store is larger than it may be."""
         most = self._most_bytes()
         if most is None or self.store.used_bytes() <= most:
             return
@@ -244,24 +254,24 @@ class Filling:
             oldest = self.store.oldest()
             if oldest is None:
                 break
-            # A part goes with the last of its bags, so these go together.
-            length = Level.HOUR.length
-            before = oldest // length * length + length
-            keys = self.store.beginning_before(before)
+            # The bags of an hour together: a part is deleted with the last of its bags.
+            hour = Level.HOUR.length
+            keys = self.store.beginning_before((oldest // hour + 1) * hour)
             if not self.store.delete([key.path for key in keys]):
                 break
-            still = {key: at for key, at in self._trimmed.items() if self._is_refused(key)}
-            self._trimmed = {**still, **dict.fromkeys(keys, self._clock.now())}
+            recent = {key: at for key, at in self._trimmed.items() if self._is_refused(key)}
+            self._trimmed = {**recent, **dict.fromkeys(keys, self._clock.now())}
             log.info("oldest_columns_deleted", bags=len(keys))
         self.store.release_pages()
 
     def _renew(self, bag: BagFile) -> bool:
-        """Keeps what is stored of a bag if a new `handover.json` beside it changes nothing in it.
+        """Keeps a stored bag if a new `handover.json` beside it changes nothing in it.
 
-        Returns whether it is kept.
+        Each rotation writes the file of a recording again, though it concerns one or two of many
+        bags. If all messages of a bag count now, and it was stored with as many, nothing changed.
 
-        Each rotation writes that of a recording with many bags again, and it concerns one or two of
-        these. All messages of the bag count now; if it was stored with as many, all did then.
+        Returns:
+            Whether it is kept.
         """
         if not bag.sidecar_ns or not self._reader.is_file(bag.path):
             return False
@@ -270,9 +280,10 @@ class Filling:
         return self.store.renew(self._key(bag), bag)
 
     def _add(self, bag: BagFile, pending: list[ReadBag], group: Group, *, hashed: bool) -> bool:
-        """Adds a bag to those that are pending, and its messages to theirs; stores a long one.
+        """Adds a bag to `pending` and its messages to `group`; or stores it, if it is a long one.
 
-        Returns whether it is stored already.
+        Returns:
+            Whether the bag is stored.
         """
         if not self._may_be_stored(bag):
             return False
@@ -287,36 +298,40 @@ class Filling:
                 hashed=lambda channel: hashed or channel.latched,
                 number=len(pending),
             )
-            begin = [*islice(groups, 2)]
-            if len(begin) > 1 or bag.end - bag.start > LONG_NS:
-                return self._put_long(to_store, self._released_groups(begin, groups))
+            first_groups = [*islice(groups, 2)]
+            if len(first_groups) > 1 or bag.end - bag.start > LONG_NS:
+                return self._put_long(to_store, self._tables_of_groups(first_groups, groups))
         except BagError as error:
             self._scanner.met_damage(bag, error)
             self._refuse(bag, error.reason)
             return False
         pending.append(to_store)
-        for read in begin:
-            group.take(read)
+        for of_bag in first_groups:
+            group.take(of_bag)
         return False
 
-    def _fill_alone(self, batch: Batch, timeline: Timeline) -> int:
-        return sum(self.fill(Batch([bag], batch.level), timeline) for bag in batch.bags)
+    def _fill_alone(self, bags: Sequence[BagFile], level: Level, timeline: Timeline) -> int:
+        return sum(self.fill(Batch([bag], level), timeline) for bag in bags)
 
     def _put(
-        self, pending: Sequence[ReadBag], group: Group, batch: Batch, timeline: Timeline
+        self, pending: Sequence[ReadBag], group: Group, level: Level, timeline: Timeline
     ) -> int:
-        """Stores bags of a batch in parts together; each alone where the database refuses that."""
-        bags, level = [to_store.bag for to_store in pending], batch.level
+        """Stores bags in common parts, or each alone if the database refuses them.
+
+        Returns:
+            How many are stored.
+        """
+        bags = [to_store.bag for to_store in pending]
         if not bags:
             return 0
         begun, refusals = time.perf_counter_ns(), self.store.refusals
         written = self.store.put(pending, group.tables(), level)
         if self.store.refusals > refusals:
             if len(bags) > 1:
-                return self._fill_alone(Batch(bags, level), timeline)
+                return self._fill_alone(bags, level, timeline)
             self._refuse(bags[0], self.store.refused_for or "")
         if written.parts and level > Level.BAG:
-            begin = _slot(bags[0], level)[1]
+            _, begin = _slot(bags[0], level)
             self._merged.append((begin, begin + level.length))
             self._whole_parts.append((written.parts, bags))
         if written.bags:
@@ -330,40 +345,44 @@ class Filling:
         return written.bags
 
     def _put_long(self, to_store: ReadBag, groups: Iterator[list[Table]]) -> bool:
-        """Stores a bag as parts of an hour each, group by group."""
+        """Stores a bag as parts of an hour each, group by group; returns whether it did."""
         bag = to_store.bag
         refusals = self.store.refusals
         stored, taken = self.store.merged_bytes()
         left = round(self._limits.max_share * stored) - taken
         budget = self._share([bag]) + max(left, 0)
-        is_stored = self.store.put_long(to_store, self._noting_times(groups), budget=budget)
+        is_stored = self.store.put_long(to_store, groups, budget=budget)
         if not is_stored and self.store.refusals > refusals:
             self._refuse(bag, self.store.refused_for or "")
         return is_stored
 
-    def _noting_times(self, groups: Iterable[list[Table]]) -> Iterator[list[Table]]:
-        """Yields groups, and notes when they have rows: decades may lie between two of a bag."""
-        for tables in groups:
-            for table in tables:
-                slots = np.unique(table.log_times // PART_NS).tolist()
-                self._merged += [(slot * PART_NS, (slot + 1) * PART_NS) for slot in slots]
-            yield tables
-
-    def _released_groups(
-        self, begin: list[Group], groups: Iterator[Group]
+    def _tables_of_groups(
+        self, first_groups: list[Group], groups: Iterator[Group]
     ) -> Iterator[list[Table]]:
-        """Yields groups of tables. Each is freed, and the turn released, before the next."""
+        """Yields the tables of a long bag, and notes the hours in which they have rows.
+
+        Before the next tables are decoded, the previous ones are freed and the turn released.
+
+        Args:
+            first_groups: those that were taken from `groups` already.
+            groups: the groups of the bag.
+        """
         while True:
-            group = begin.pop(0) if begin else next(groups, None)
+            group = first_groups.pop(0) if first_groups else next(groups, None)
             if group is None:
                 return
             tables = group.tables()
+            for table in tables:
+                # Hour by hour, since decades may lie between two messages.
+                hours = np.unique(table.log_times // PART_NS).tolist()
+                self._merged += [(hour * PART_NS, (hour + 1) * PART_NS) for hour in hours]
             yield tables
-            tables.clear()  # who asks for the next still has the list
-            if not begin:
+            tables.clear()  # the caller still has the list
+            if not first_groups:
                 self._large.release()
 
     def _share(self, bags: Sequence[BagFile]) -> int:
+        """Returns how many bytes the columns of some bags may take."""
         size = sum(bag.size for bag in bags)
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
         return max(round(self._limits.max_share * size), self._limits.least_bytes_per_s * length)
@@ -383,18 +402,21 @@ class Filling:
         return bag.file in files
 
     def _is_over(self, bag: BagFile, level: Level, timeline: Timeline) -> bool:
-        """Returns whether no other bag that belongs to the slot of a bag is to be expected."""
+        """Returns whether the slot of a bag is over, so that no other bag will begin in it."""
         now = self._clock.now()
         if bag.start > now:  # this clock is behind: else a newest bag that is ahead shows nothing
             now = timeline.segments[-1].latest
         return now >= _slot(bag, level)[1] + level.length
 
     def _fitting(self, bags: Sequence[BagFile]) -> list[BagFile]:
-        """Returns which of these bags may be stored, the newest first.
+        """Returns which bags may be stored.
 
-        Those that are newer than what is stored take the place of the oldest. An older one is
-        stored only where it fits without that, even if it takes twice its share: else it would be
-        deleted, and stored again, for ever.
+        A bag that is newer than the oldest stored one may replace that. An older bag must fit
+        beside what is stored, even if it takes twice its share: else it would be deleted and stored
+        again for ever.
+
+        Args:
+            bags: the newest first.
         """
         most = self._most_bytes()
         if most is None or not bags:
@@ -404,14 +426,16 @@ class Filling:
         fitting: list[BagFile] = []
         for bag in bags:
             size = 2 * self._share([bag])
-            is_newer = oldest is not None and bag.start >= oldest
-            if (size if is_newer else used + size) <= most:
+            if oldest is not None and bag.start >= oldest:
+                if size <= most:
+                    fitting.append(bag)
+            elif used + size <= most:
                 fitting.append(bag)
-                used += 0 if is_newer else size
+                used += size
         return fitting
 
     def _most_bytes(self) -> int | None:
-        """Returns how much the store may take; None: beside the bags, retention sees to that."""
+        """Returns how large the store may be; None beside the bags, where retention limits it."""
         path = self.store.path
         if path is None:
             return min(IN_MEMORY_BYTES, self._limits.max_bytes)
@@ -432,11 +456,12 @@ class Filling:
 
 
 def _slot(bag: BagFile, level: Level) -> tuple[str, Ns]:
+    """Returns the recording of a bag, and the log time (ns) at which its slot begins."""
     return bag.file.rpartition("/")[0], bag.start // level.length * level.length
 
 
 def _by_slot(bags: Iterable[BagFile], level: Level) -> list[list[BagFile]]:
-    """Returns bags, each once, by the slot in which they have parts together."""
+    """Returns distinct bags, grouped by their slots."""
     slots: dict[tuple[str, Ns], list[BagFile]] = defaultdict(list)
     for bag in dict.fromkeys(bags):
         slots[_slot(bag, level)].append(bag)
@@ -444,7 +469,7 @@ def _by_slot(bags: Iterable[BagFile], level: Level) -> list[list[BagFile]]:
 
 
 def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
-    """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
+    """Returns whether a bag is as the index found it, has not changed lately, and is not erased."""
     try:
         stamp = Stamp.of(os.lstat(bag.path), _sidecar_ns(bag.path.with_name(HANDOVER_FILE)))
         return (

@@ -1,8 +1,8 @@
-"""What follows from the rows of some parts: made once, remembered, and stored beside the parts.
+"""Fragments: results that are computed from some parts once, remembered, and stored beside them.
 
-A fragment is of a slice of the clock, and of the parts that have rows in it or beside it. What a
-part says does not change, though columns of it may be dropped later; so a fragment does not change
-either, and goes with the first of its parts.
+A fragment is of a slice of the clock, and of the parts that have rows in it or beside it. The rows
+of a part do not change, though columns of it may be dropped later. So a fragment does not change
+either; it is deleted with the first of its parts.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import struct
 import sys
 import threading
 from collections import deque
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from io import BytesIO
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
@@ -36,14 +36,15 @@ if TYPE_CHECKING:
     Array: TypeAlias = NDArray[np.generic[object]]
 
 _MOST_WAITING: Final = 1_024
-"""Fragments that wait to be stored; of more the oldest are made again."""
+"""Fragments that wait to be stored; if there are more, the oldest have to be made again."""
 
-_MOST: Final = (1 << 63) - 1
+_LARGEST_INT64: Final = (1 << 63) - 1
 _KEY_BYTES: Final = 400
 """About how much memory it takes to remember a fragment, besides its own."""
 _FEW: Final = 256
 """Shorter arrays are stored as they are: to unpack one takes longer than to read it."""
 _TUPLE, _BYTES, _ARRAY, _ROWS, _COLUMN = -1, -2, -3, -4, -5
+"""What a list in the JSON of a fragment is; numbers from 0 on are those of classes."""
 _NUMBERS: Final = {int: "<i8", float: "<f8"}
 _PLAIN: Final = frozenset({int, float, bool, type(None)})
 
@@ -51,7 +52,7 @@ log = get_logger(__name__)
 
 
 class Sized(Protocol):
-    """What is remembered."""
+    """A value that knows how much memory it takes."""
 
     @property
     def memory_bytes(self) -> int:
@@ -62,14 +63,14 @@ T = TypeVar("T", bound=Sized)
 
 
 class FragmentKind(NamedTuple, Generic[T]):
-    """A kind of fragments: what tells it apart from others in the file, and what it consists of.
+    """A kind of fragments.
 
     Attributes:
-        name: of the kind.
-        classes: dataclasses and named tuples that it has in it, besides arrays, tuples, mappings,
-            and values of JSON. Their order is what the file knows them by.
-        join: returns fewer fragments that say the same as those of a stretch of the clock, in
-            order. Without it these stay as they are.
+        name: identifies the kind in the file.
+        classes: the dataclasses and named tuples in its fragments, besides arrays, tuples, mappings
+            and values of JSON. The file has their places in this order.
+        join: returns fewer fragments that say the same as the fragments of a stretch of the clock,
+            which are given in order; as a default, the same ones.
     """
 
     name: str
@@ -78,122 +79,162 @@ class FragmentKind(NamedTuple, Generic[T]):
 
 
 def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
-    """Returns a fragment as it is stored: a line of JSON, and the bytes of arrays one by one.
+    """Returns a fragment as bytes: a line of JSON, then the bytes of arrays one after the other.
 
-    Each list in it begins with what it is: the number of a class, or a number below 0. Values that
-    are alike are there column by column: to make each of its own takes longer.
+    Each list in the JSON begins with a number that says what it is. A tuple of values of one type
+    is stored column by column, since that is faster to restore than value by value.
     """
-    numbers = {cls: number for number, cls in enumerate(classes)}
-    data: list[bytes] = []
-    head = json.dumps(_plain(fragment, numbers, data))
-    return compressed(b"".join((head.encode(), b"\n", *data)))
+    writer = _Writer({cls: number for number, cls in enumerate(classes)})
+    head = json.dumps(writer.json_of(fragment))
+    return compressed(b"".join((head.encode(), b"\n", *writer.data)))
 
 
-# A function within a function that calls itself would keep all of this until garbage is looked for.
-def _plain(value: object, numbers: Mapping[type, int], data: list[bytes]) -> object:
-    if isinstance(value, bytes):
-        data.append(value)
-        return [_BYTES, len(value)]
-    if isinstance(value, np.ndarray):
-        codec, least, packed = _packed(value)
-        data.append(packed)
-        return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
-    if isinstance(value, dict):
-        return {key: _plain(entry, numbers, data) for key, entry in value.items()}
-    number = numbers.get(type(value))
-    if number is not None:
-        return [number, *(_plain(part, numbers, data) for part in _parts(value))]
-    return _plain_rows(value, numbers, data) if isinstance(value, tuple | list) else value
+@dataclass(slots=True)
+class _Writer:
+    """Turns fragments into JSON and bytes.
 
+    Attributes:
+        numbers: the number of each class.
+        data: the bytes of arrays so far.
+    """
 
-def _plain_rows(
-    values: Sequence[object], numbers: Mapping[type, int], data: list[bytes]
-) -> list[object]:
-    """Returns several values: column by column, with the places of None, where others are alike."""
-    there = [value for value in values if value is not None]
-    none = [_TUPLE, *(nth for nth, value in enumerate(values) if value is None)]
-    kinds = {*map(type, there)}
-    kind = kinds.pop() if len(kinds) == 1 < len(there) else object
-    if kind in _NUMBERS and (kind is float or max(map(abs, cast("list[int]", there))) <= _MOST):
-        numbers_there = np.array(there, _NUMBERS[kind]).tobytes()
-        data.append(numbers_there)
-        return [_COLUMN, len(numbers_there), none[1:], _NUMBERS[kind]]
-    if kind is np.ndarray:
-        arrays = cast("list[Array]", there)
-        if len({(array.dtype, array.shape[1:]) for array in arrays}) == 1:
+    numbers: Mapping[type, int]
+    data: list[bytes] = field(default_factory=list)
+
+    def json_of(self, value: object) -> object:
+        """Returns a value as JSON; adds the bytes of its arrays."""
+        if isinstance(value, bytes):
+            self.data.append(value)
+            return [_BYTES, len(value)]
+        if isinstance(value, np.ndarray):
+            codec, least, packed = _pack_array(value)
+            self.data.append(packed)
+            return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
+        if isinstance(value, dict):
+            return {key: self.json_of(entry) for key, entry in value.items()}
+        number = self.numbers.get(type(value))
+        if number is not None:
+            return [number, *map(self.json_of, _attributes(value))]
+        return self._json_of_tuple(value) if isinstance(value, tuple | list) else value
+
+    def _json_of_tuple(self, values: Sequence[object]) -> list[object]:
+        """Returns several values as JSON, column by column if all but None are of one type."""
+        present = [value for value in values if value is not None]
+        none_at = [nth for nth, value in enumerate(values) if value is None]
+        types = {*map(type, present)}
+        if len(types) == 1 < len(present):
+            cls = types.pop()
+            columns = self._json_of_columns(cls, present, none_at)
+            if columns is not None:
+                return columns
+        return [_TUPLE, *map(self.json_of, values)]
+
+    def _json_of_columns(
+        self, cls: type, values: Sequence[object], none_at: Sequence[int]
+    ) -> list[object] | None:
+        """Returns values of one type as JSON, column by column; None if they have no columns.
+
+        Args:
+            cls: the type.
+            values: at least two.
+            none_at: the places of None among them.
+        """
+        if cls in _NUMBERS:
+            if cls is int and max(map(abs, cast("list[int]", values))) > _LARGEST_INT64:
+                return None
+            numbers = np.array(values, _NUMBERS[cls]).tobytes()
+            self.data.append(numbers)
+            return [_COLUMN, len(numbers), none_at, _NUMBERS[cls]]
+        head = [_ROWS, [_TUPLE, *none_at]]
+        if cls is np.ndarray:
+            arrays = cast("list[Array]", values)
+            if len({(array.dtype, array.shape[1:]) for array in arrays}) > 1:
+                return None
             sizes = [_TUPLE, *map(len, arrays)]
-            return [_ROWS, none, sizes, _plain(np.concatenate(arrays), numbers, data)]
-    elif kind is tuple or kind in numbers:
-        rows = [*map(_parts, there)]
-        if rows[0] and len({*map(len, rows)}) == 1:
-            columns = (_plain_rows(column, numbers, data) for column in zip(*rows, strict=True))
-            return [_ROWS, none, numbers.get(kind, _TUPLE), *columns]
-    return [_TUPLE, *(_plain(value, numbers, data) for value in values)]
+            return [*head, sizes, self.json_of(np.concatenate(arrays))]
+        has_attributes = cls is tuple or cls in self.numbers
+        rows = [*map(_attributes, values)] if has_attributes else [()]
+        if not rows[0] or len({*map(len, rows)}) > 1:
+            return None
+        columns = map(self._json_of_tuple, zip(*rows, strict=True))
+        return [*head, self.numbers.get(cls, _TUPLE), *columns]
 
 
-def _parts(value: object) -> Sequence[object]:
+def _attributes(value: object) -> Sequence[object]:
+    """Returns the attributes of a dataclass, or the entries of a tuple."""
     if is_dataclass(value):
-        return [getattr(value, field.name) for field in fields(value)]
+        return [getattr(value, attribute.name) for attribute in fields(value)]
     return cast("Sequence[object]", value)
 
 
 def from_bytes(data: bytes, classes: Sequence[type]) -> object:
-    """Returns the fragment that was stored so.
+    """Returns the fragment that `to_bytes` wrote.
 
     Raises:
-        ValueError, TypeError, LookupError, struct.error: the bytes are none.
+        ValueError, TypeError, LookupError, struct.error: the bytes are no fragment.
     """
     head, tail = decompressed(data).split(b"\n", 1)
     return _restored(json.loads(head), classes, BytesIO(tail))
 
 
 def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
+    """Returns the value that `_Writer.json_of` turned into JSON.
+
+    Args:
+        value: the JSON.
+        classes: of the kind of fragments.
+        tail: the bytes of arrays; those of this value are next.
+    """
     if isinstance(value, dict):
         return {sys.intern(key): _restored(entry, classes, tail) for key, entry in value.items()}
     if not isinstance(value, list):
         # Names of columns and labels are in thousands of fragments.
         return sys.intern(value) if isinstance(value, str) else value
     number, *rest = value
-    if number in {_BYTES, _ARRAY, _COLUMN}:
+    if number in {_BYTES, _ARRAY}:
         size, *array = rest
         packed = tail.read(size)
-        if number == _COLUMN:
-            none, dtype = array
-            return _with_none(np.frombuffer(packed, dtype).tolist(), none)
-        return packed if number == _BYTES else _unpacked(packed, *array)
+        return packed if number == _BYTES else _unpack_array(packed, *array)
+    if number == _COLUMN:
+        size, none_at, dtype = rest
+        return _with_none(np.frombuffer(tail.read(size), dtype).tolist(), none_at)
     parts = rest
-    # Most are numbers: to call for each would take half of the time.
+    # Most are numbers: a call for each would take half of the time.
     if not _PLAIN.issuperset(map(type, rest)):
         parts = [part if type(part) in _PLAIN else _restored(part, classes, tail) for part in rest]
     if number == _ROWS:
-        none, kind, *columns = cast("list[Sequence[object]]", parts)
-        return _rows(cast("Sequence[int]", none), kind, columns, classes)
+        none_at, kind, *columns = cast("list[Sequence[object]]", parts)
+        return _with_none(_rows(kind, columns, classes), cast("Sequence[int]", none_at))
     return tuple(parts) if number == _TUPLE else classes[number](*parts)
 
 
 def _rows(
-    none: Sequence[int], kind: object, columns: Sequence[Sequence[object]], classes: Sequence[type]
-) -> tuple[object, ...]:
-    """Returns the values that `_plain_rows` was given; of arrays `kind` is their lengths."""
-    rows: list[object]
+    kind: object, columns: Sequence[Sequence[object]], classes: Sequence[type]
+) -> list[object]:
+    """Returns the values that were stored column by column.
+
+    Args:
+        kind: the number of their class, `_TUPLE`, or the lengths of arrays.
+        columns: one for each attribute; all arrays, one after the other.
+        classes: of the kind of fragments.
+    """
     if isinstance(kind, tuple):
-        ends = np.cumsum([0, *kind]).tolist()
-        rows = [columns[0][start:stop] for start, stop in pairwise(ends)]
-    elif kind == _TUPLE:
-        rows = [*zip(*columns, strict=True)]
-    else:
-        rows = [*map(classes[cast("int", kind)], *columns)]
-    return _with_none(rows, none)
+        edges = np.cumsum([0, *kind]).tolist()
+        return [columns[0][start:stop] for start, stop in pairwise(edges)]
+    if kind == _TUPLE:
+        return [*zip(*columns, strict=True)]
+    return [*map(classes[cast("int", kind)], *columns)]
 
 
 def _with_none(values: list[object], places: Sequence[int]) -> tuple[object, ...]:
+    """Returns values with None inserted at some places, which ascend."""
     for nth in places:
         values.insert(nth, None)
     return tuple(values)
 
 
-def _packed(array: Array) -> tuple[str, float | None, bytes]:
-    """Returns the codec of an array, its least value, and its bytes. Nothing of it changes."""
+def _pack_array(array: Array) -> tuple[str, float | None, bytes]:
+    """Returns the codec of an array, its least value, and its bytes; all of them exact."""
     if array.size >= _FEW:
         flat = array.reshape(-1, order="F")
         for step in (METRES, EXACT):
@@ -204,7 +245,7 @@ def _packed(array: Array) -> tuple[str, float | None, bytes]:
     return "", None, array.tobytes()
 
 
-def _unpacked(data: bytes, codec: str, least: float | None, dtype: str, *shape: int) -> Array:
+def _unpack_array(data: bytes, codec: str, least: float | None, dtype: str, *shape: int) -> Array:
     if not codec:
         return np.frombuffer(data, dtype).reshape(shape)
     flat = cast("Array", unpack(codec, math.prod(shape), least, data))
@@ -215,9 +256,9 @@ class FragmentKey(NamedTuple):
     """Identifies a fragment of a kind.
 
     Attributes:
-        start: log time (ns) where its slice begins.
-        settings: what else it depends on, as a text.
-        parts: the numbers of the parts.
+        start: the log time (ns) at which its slice begins.
+        settings: identifies what it depends on besides the parts.
+        parts: the numbers of its parts.
     """
 
     start: Ns
@@ -226,7 +267,7 @@ class FragmentKey(NamedTuple):
 
 
 class Joined(NamedTuple, Generic[T]):
-    """The fragments of a stretch of the clock, joined."""
+    """The joined fragments of a stretch of the clock."""
 
     fragments: Sequence[T]
 
@@ -245,10 +286,10 @@ class Fragments(Generic[T]):
     """The fragments of one kind. Thread-safe.
 
     Args:
-        store: where they are stored; None where they are remembered alone.
-        kind: see there.
-        settings: what all of them depend on, as a text.
-        remembered: those of all kinds that were asked for last.
+        store: where they are stored; None to remember them only.
+        kind: of the fragments.
+        settings: identifies what all of them depend on.
+        remembered: the fragments of all kinds that were used last.
     """
 
     def __init__(
@@ -268,8 +309,10 @@ class Fragments(Generic[T]):
     def get(self, key: FragmentKey, also_before: Ns = 0) -> T | None:
         """Returns a fragment; None if it was not made yet.
 
-        If it is stored, those that begin so long (ns) before it are remembered with it: they are
-        asked for next.
+        Args:
+            key: of the fragment.
+            also_before: fragments that begin at most so long (ns) before it are read and remembered
+                with it, since they are asked for next.
         """
         # By name: each kind has one type.
         fragment = cast("T | None", self._remembered.get((self._kind.name, key)))
@@ -277,21 +320,22 @@ class Fragments(Generic[T]):
             for other, data in self._store.fragments(self._name, key, also_before):
                 if self._remembered.get((self._kind.name, other)) is not None:
                     continue
-                loaded = self._loaded(data)
-                if loaded is not None:
-                    self._remember(other, loaded)
-                    fragment = loaded if other == key else fragment
+                restored = self._restored(data)
+                if restored is not None:
+                    self._remember(other, restored)
+                    if other == key:
+                        fragment = restored
         return fragment
 
     def put(self, key: FragmentKey, fragment: T) -> None:
-        """Remembers a fragment, which waits to be stored."""
+        """Remembers a fragment until `write` stores it, and longer if there is room."""
         self._remember(key, fragment)
         if self._store is not None:
             with self._lock:
                 self._waiting.append((key, fragment))
 
     def write(self) -> None:
-        """Stores what was made since; not what follows from parts that are deleted meanwhile."""
+        """Stores the fragments that were put since the last call, unless a part was deleted."""
         with self._lock:
             waiting = [*self._waiting]
             self._waiting.clear()
@@ -303,7 +347,7 @@ class Fragments(Generic[T]):
     def _remember(self, key: FragmentKey, fragment: T) -> None:
         self._remembered.put((self._kind.name, key), fragment, fragment.memory_bytes + _KEY_BYTES)
 
-    def _loaded(self, data: bytes) -> T | None:
+    def _restored(self, data: bytes) -> T | None:
         try:
             return cast("T", from_bytes(data, self._kind.classes))
         except (ValueError, TypeError, LookupError, struct.error) as error:

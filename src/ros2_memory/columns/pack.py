@@ -42,6 +42,7 @@ import math
 import struct
 import threading
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -71,16 +72,22 @@ _CONTAINERS: Final = ("<u1", "<u1", "<u2", "<u4", "<u4", "<u8", "<u8", "<u8", "<
 """For each width in bytes the least unsigned integer that numpy has."""
 _FAR_APART: Final = 1 << 62
 _MOST_MULTIPLES: Final = {4: float(1 << 24), 8: float(1 << 46)}
-"""Multiples of a step up to these are fewer bits than the float32 or float64 itself."""
+"""Up to these, multiples of a step take fewer bits than the float32 or float64 itself."""
 _DECIMALS: Final = (1, 10, 100, 1_000, 10_000, 100_000)
-"""Steps, as `Step.per_unit`, that values of a relative exactness often have anyway."""
+"""Steps, as `Step.per_unit`, that values of relative exactness are often multiples of."""
 _SAMPLE: Final = 16
 _LOOKED_AT: Final = 512
-"""Numbers of a column, about, by which it is arranged."""
+"""About how many numbers of a column decide how it is arranged."""
 
 
 class _Bits(NamedTuple):
-    """The bits of a float: as which integer they are read, and how many of them `rounded` drops."""
+    """The bits of a float.
+
+    Attributes:
+        integer: the dtype as which they are read.
+        magnitude: all bits but the sign.
+        dropped: how many of the lowest bits `rounded` drops.
+    """
 
     integer: str
     magnitude: int
@@ -97,9 +104,9 @@ class Packed:
     Attributes:
         codec: how `data` is read.
         count: how many values there are.
-        error: the greatest absolute error of any value once unpacked, as measured; 0.0: exact.
-        zone: what is known of the values without unpacking them, before any was rounded.
-        data: the bytes, not compressed yet; empty where every value is the zone's least.
+        error: the greatest absolute error of an unpacked value, as measured; 0.0 if all are exact.
+        zone: of the values before they were rounded.
+        data: the bytes, not compressed yet; empty if every value is the zone's least.
     """
 
     codec: str
@@ -110,7 +117,7 @@ class Packed:
 
 
 def pack(column: Column, step: Step = EXACT) -> Packed:
-    """Returns the column as bytes. `step` counts for floats alone; all others are exact."""
+    """Returns the column as bytes; floats are rounded to `step`."""
     if isinstance(column, Texts):
         packed = _pack_texts(column)
     elif not len(column):
@@ -123,12 +130,12 @@ def pack(column: Column, step: Step = EXACT) -> Packed:
 
 
 def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
-    """Returns the column that was packed so, of the same dtype; arrays may be read-only.
+    """Returns a packed column with its dtype; the array may be read-only.
 
     Args:
         codec: `Packed.codec`.
-        count: how many values there are.
-        least: that of the zone.
+        count: `Packed.count`.
+        least: `Zone.least`.
         data: `Packed.data`.
 
     Raises:
@@ -140,8 +147,7 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     dtype = np.dtype(kind)
     if rest == "constant":
         value = np.nan if least is None and dtype.kind == "f" else least or 0
-        # A row of the one value that is held.
-        return np.broadcast_to(np.array(value, dtype), count)
+        return np.broadcast_to(np.array(value, dtype), count)  # one value in memory
     form, _, arrangement = rest.partition(" ")
     if form == "whole":
         return _whole_numbers(arrangement, count, int(least or 0), data).astype(dtype)
@@ -158,7 +164,7 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
 
 
 class _Codecs(threading.local):
-    """A compressor and a decompressor a thread: making new ones takes longer than most columns."""
+    """A compressor and a decompressor for each thread: creating them takes longer than a column."""
 
     def __init__(self) -> None:
         self.compressor = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
@@ -174,7 +180,7 @@ def compressed(data: bytes) -> bytes:
 
 
 def is_large(data: bytes) -> bool:
-    """Returns whether `decompressed` returns more than `LARGE_BYTES`; False if it refuses it."""
+    """Returns whether a frame states more than `LARGE_BYTES`; False if it states nothing."""
     try:
         return zstandard.frame_content_size(data) > LARGE_BYTES
     except zstandard.ZstdError:
@@ -182,10 +188,10 @@ def is_large(data: bytes) -> bool:
 
 
 def decompressed(data: bytes) -> bytes:
-    """Returns what `compressed` was given.
+    """Returns the content of a zstd frame.
 
     Raises:
-        ValueError: it is no such frame, or a damaged one.
+        ValueError: it is no zstd frame, or a damaged one.
     """
     try:
         return _CODECS.decompressor.decompress(data)
@@ -194,7 +200,15 @@ def decompressed(data: bytes) -> bytes:
 
 
 class _Whole(NamedTuple):
-    """A column as whole numbers, the least of them 0, that are yet to be arranged."""
+    """A column as whole numbers that are not arranged yet.
+
+    Attributes:
+        form: the first words of the codec.
+        error: as of `Packed`.
+        zone: as of `Packed`.
+        numbers: the whole numbers; the least of them is 0.
+        head: bytes before those of the numbers.
+    """
 
     form: str
     error: float
@@ -217,7 +231,7 @@ def _pack_integers(column: Numbers) -> Packed | _Whole:
 
 @np.errstate(invalid="ignore")  # of signalling NaNs
 def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
-    """Returns a column as multiples of its step, else with fewer bits, else as it is."""
+    """Returns a column as multiples of its step, or with fewer bits, or else exactly."""
     values = column.astype(np.float64, copy=False)
     zone = _zone_of(values)
     if zone.least == zone.greatest and zone.nulls in {0, len(column)}:
@@ -244,7 +258,7 @@ def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
 
 
 def _decimal_step(values: Floats) -> int:
-    """Returns the coarsest decimal step that some of the values nearly have; 0: none."""
+    """Returns the coarsest decimal step that a sample of values are multiples of; 0 if none is."""
     sample = values[:: max(1, len(values) // _SAMPLE)]
     scaled = np.multiply.outer(np.array(_DECIMALS, np.float64), sample)
     fits = (np.abs(np.rint(scaled) - scaled) <= MOST_RELATIVE * np.abs(scaled)).all(axis=1)
@@ -274,14 +288,18 @@ def _zone_of(values: Floats) -> Zone:
 def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
     """Returns the bits of floats as integers that are ordered as the floats are.
 
-    NaN is the greatest, and -0.0 is 0.0. `rounded`: without the lowest bits of the mantissa.
+    NaN is the greatest, and -0.0 becomes 0.0.
+
+    Args:
+        values: float32 or float64.
+        rounded: whether the lowest bits of the mantissa are dropped.
     """
     integer, magnitude, dropped = _BITS[values.itemsize]
-    alike = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
-    is_nan = np.isnan(alike)
+    canonical = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
+    is_nan = np.isnan(canonical)
     if is_nan.any():
-        alike[is_nan] = np.nan  # one for all: there are negative ones, and others carry bits
-    bits = alike.view(integer).astype(np.int64)
+        canonical[is_nan] = np.nan  # one for all: some are negative, or carry bits
+    bits = canonical.view(integer).astype(np.int64)
     if rounded:
         half = 1 << (dropped - 1)
         bits = (bits + half) >> dropped
@@ -293,7 +311,7 @@ def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
 def _from_ordered(
     whole: IntArray, dtype: np.dtype[np.generic[object]], *, rounded: bool
 ) -> Numbers:
-    """Returns the floats of which `_ordered` made integers."""
+    """Returns the floats that `_ordered` turned into integers."""
     integer, magnitude, dropped = _BITS[dtype.itemsize]
     if rounded:
         bits = (whole ^ ((whole >> 63) & (magnitude >> dropped))) << dropped
@@ -306,24 +324,25 @@ def _from_ordered(
 
 
 def _arranged(column: _Whole) -> Packed:
-    """Returns a column arranged so that its numbers have the fewer bits, by some of them."""
-    flat = left = column.numbers
-    name, head = "flat", b""
+    """Returns a column arranged flat or as differences, whichever takes fewer bits."""
+    flat = written = column.numbers
+    name, head = "flat", column.head
     if int(flat.view(np.uint64).max()) < _FAR_APART:
         slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
         delta = np.diff(flat) - slope
         step = max(1, len(flat) // _LOOKED_AT)
         if _bits_of(delta[::step]) < _bits_of(flat[::step] - flat.mean()):
-            name, head, left = "delta", struct.pack("<q", slope[0]), (delta << 1) ^ (delta >> 63)
-    greatest = int(left.view(np.uint64).max(initial=0))
+            name, head = "delta", head + struct.pack("<q", slope[0])
+            written = (delta << 1) ^ (delta >> 63)
+    greatest = int(written.view(np.uint64).max(initial=0))
     width = (greatest.bit_length() + 7) // 8
-    data = b"".join((column.head, head, byte_planes(left, width)))
+    data = head + byte_planes(written, width)
     codec = f"{column.form} {name} {width}"
     return Packed(codec, len(flat), column.error, column.zone, data)
 
 
 def _bits_of(numbers: Numbers) -> float:
-    """Returns about how many bits all numbers take, with their signs."""
+    """Returns about how many bits numbers take, with their signs."""
     # In single precision and in place: the memory of four such arrays is what takes long.
     sizes = np.abs(numbers.astype(np.float32))
     sizes *= 2
@@ -332,7 +351,7 @@ def _bits_of(numbers: Numbers) -> float:
 
 
 def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> IntArray:
-    """Returns the whole numbers that were arranged; the least of them is `least`."""
+    """Returns the whole numbers of arranged bytes; the least of them is `least`."""
     name, _, width = arrangement.partition(" ")
     if name == "flat":
         return np.add(from_planes(data, 0, count, int(width)).astype(np.int64), _wrapped(least))
@@ -350,24 +369,31 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
 
 
 def signed(numbers: Numbers) -> Numbers:
-    """Returns 0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
+    """Returns signed numbers, which are coded as 0, 1, 2, 3, 4 for 0, -1, 1, -2, 2."""
     signs: Numbers = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
     return np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
 
 
 def _wrapped(number: int) -> np.int64:
-    """The number of 64 bits, signed or not, as numpy adds and subtracts it."""
+    """Returns a number of 64 bits, signed or not, as an int64 with the same bits."""
     return np.int64(number - (1 << 64) if number >= 1 << 63 else number)
 
 
 def byte_planes(numbers: IntArray, width: int) -> bytes:
-    """Returns numbers in planes: the lowest byte of each, then the next; so many of their bytes."""
+    """Returns the lowest `width` bytes of numbers: first the lowest of each, then the next ones."""
     short = numbers.astype(_CONTAINERS[width], copy=False)
     return short.view(np.uint8).reshape(-1, short.itemsize).T[:width].tobytes()
 
 
 def from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
-    """Returns the numbers as unsigned ones of the least width that numpy has."""
+    """Returns the numbers in `byte_planes`, in the smallest unsigned dtype that has `width` bytes.
+
+    Args:
+        data: has the planes.
+        start: where they begin in it.
+        count: how many numbers there are.
+        width: how many bytes each has.
+    """
     planes = np.frombuffer(data, np.uint8, count * width, start).reshape(width, count)
     numbers = np.zeros(count, _CONTAINERS[width])
     rows = numbers.view(np.uint8).reshape(count, numbers.itemsize)
@@ -396,9 +422,9 @@ def _pack_texts(column: Texts) -> Packed | _Whole:
 
 
 def folded(words: Collection[str]) -> str | None:
-    """Returns the words as a zone has them: whole, else what letters are in them, else None.
+    """Returns the words of a zone: whole ones, or the runs of letters in them, or else None.
 
-    JSON with numbers is another text each time, and has few names.
+    Letters alone serve for JSON with numbers, which differs each time but has few names.
     """
     if sum(map(len, words)) + len(words) <= MOST_WORDS_BYTES:
         whole = "\n".join(dict.fromkeys(caseless(word) for word in words))
@@ -415,11 +441,13 @@ def _is_small(text: str) -> bool:
 
 
 def _unpack_texts(arrangement: str, count: int, data: bytes) -> Texts:
-    several, size = struct.unpack_from("<II", data or bytes(8))
-    begin = 8 + 4 * several
+    if not data and arrangement == "constant":
+        return Texts(np.broadcast_to(np.uint32(0), count), ())
+    word_count, size = struct.unpack_from("<II", data)
+    begin = 8 + 4 * word_count
     text = data[begin : begin + size].decode("utf-8", "surrogatepass")
-    ends = np.cumsum(np.frombuffer(data, "<u4", several, 8 * bool(data)), dtype=np.int64).tolist()
-    words = tuple(text[at:stop] for at, stop in zip([0, *ends], ends, strict=False))
+    edges = [0, *np.cumsum(np.frombuffer(data, "<u4", word_count, 8), dtype=np.int64).tolist()]
+    words = tuple(text[start:stop] for start, stop in pairwise(edges))
     if arrangement == "constant":
         return Texts(np.broadcast_to(np.uint32(0), count), words)
     codes = _whole_numbers(arrangement, count, 0, data[begin + size :])

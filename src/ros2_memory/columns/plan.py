@@ -1,9 +1,9 @@
-"""Which columns a message definition has, and how its payloads are gone through.
+"""Plans how the payloads of a message type are read into columns.
 
-CDR (OMG CDR 1.x, as ROS 2 writes it): behind a header of 4 bytes each primitive is aligned to its
-own size, strings and sequences to the 4 bytes of their length; messages are their fields. Fields of
-fixed size that follow each other lie at fixed offsets once their first one is aligned; they make
-one `Run`, which is read by a single array operation.
+In CDR (OMG CDR 1.x, as ROS 2 writes it) a payload has a header of 4 bytes. Behind it each primitive
+is aligned to its own size, strings and sequences to the 4 bytes of their length; a message is the
+sequence of its fields. Neighbouring fields of fixed size lie at fixed offsets from the first one
+once that is aligned. They make one `Run`, which is read by a single array operation.
 """
 
 from __future__ import annotations
@@ -50,11 +50,19 @@ _FILLER: Final = "structure_needs_at_least_one_member"
 
 
 class UnplannedError(Exception):
-    """A definition whose messages cannot be columns; the text is the reason."""
+    """A definition whose messages cannot become columns; the text is the reason."""
 
 
 class Number(NamedTuple):
-    """A number or boolean. `attribute` is its path in a decoded message; `nth` of a fixed array."""
+    """A number or boolean.
+
+    Attributes:
+        path: of its column.
+        attribute: its path in a decoded message, as for all that follow.
+        dtype: as it lies in the payload.
+        is_bool: whether it is a boolean.
+        nth: its place in a fixed array, whose path `attribute` is; None for a field of its own.
+    """
 
     path: str
     attribute: str
@@ -71,7 +79,7 @@ class Time(NamedTuple):
 
 
 class Array(NamedTuple):
-    """A fixed array that is no column."""
+    """A fixed array that is too long for a column of each number."""
 
     path: str
     attribute: str
@@ -84,10 +92,10 @@ class Run(NamedTuple):
     """Fields of fixed size that lie together.
 
     Attributes:
-        align: to what the first one is aligned; 1 where it lies where the position is.
+        align: the alignment of the first field; 1 if the position is aligned already.
         size: bytes of the run.
-        dtype: where those that are read lie in it, by their number in `fields`.
-        fields: those that become columns.
+        dtype: the layout of `fields` in it; they are named by their places.
+        fields: the fields that become columns.
     """
 
     align: int
@@ -97,7 +105,14 @@ class Run(NamedTuple):
 
 
 class Text(NamedTuple):
-    """A string. `align` and `skip` lead to its length, as for all that follows."""
+    """A string.
+
+    Attributes:
+        align: the alignment of its length, as for all that follow.
+        skip: bytes behind the aligned position at which the length begins.
+        path: of its column.
+        attribute: its path in a decoded message.
+    """
 
     align: int
     skip: int
@@ -133,15 +148,15 @@ Step: TypeAlias = Run | Text | NumberSequence | Sequence
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """How messages of a type are gone through.
+    """How messages of a type are read.
 
     Attributes:
         steps: in the order of the payload.
         align: the alignment of the first field.
-        least: the fewest bytes that such a message takes.
-        unit: the alignment that its layout depends on.
-        ends: if its size is fixed, where it ends when it begins 0, 1, .. `unit` - 1 bytes behind a
-            multiple of `unit`; else empty.
+        least: the fewest bytes that a message takes.
+        unit: the greatest alignment of its fields, on which its layout depends.
+        ends: the position at which a message of fixed size ends if it begins at position 0, 1, ..
+            `unit` - 1; empty for a message of variable size.
         left_out: see `Table.left_out`.
         has_objects: whether it has strings or sequences of messages.
     """
@@ -157,36 +172,41 @@ class Plan:
 
 @lru_cache(512)
 def plan_of(definition: Definition) -> Plan:
-    """Returns the plan of a type; the same for the same object.
+    """Returns the plan of a type.
 
     Raises:
-        UnplannedError: it has more columns than `MAX_COLUMNS`, a type that has none, or an array
-            that no message holds.
+        UnplannedError: it has more columns than `MAX_COLUMNS`, a field of a type that cannot become
+            a column, or an array that is too long for any message.
     """
     planner = _Planner(iter(range(MAX_COLUMNS)))
     planner.add_message(definition, "", "")
-    return planner.finished()
+    return planner.plan()
 
 
 @dataclass(slots=True)
 class _Planner:
-    """Follows the position through one message: known to be `rest` behind a multiple of `unit`."""
+    """Follows the position through one message.
 
+    The position is only known to lie `rest` bytes behind a multiple of `unit`.
+    """
+
+    # Columns that may still be added; planners of elements take from the same iterator.
     budget: Iterator[int]
     steps: list[Step] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
     unit: int = 8
     rest: int = 0
-    # The run that is being made.
+    # The run that is being made: its alignment, its size, and its fields with dtype and offset.
     align: int = 1
     size: int = 0
-    read: list[tuple[Number | Time | Array, str, int]] = field(default_factory=list)
-    # Alignment and size of all fields, while their sizes are fixed.
+    run: list[tuple[Number | Time | Array, str, int]] = field(default_factory=list)
+    # Alignment and size of all fields; None once one of them has a variable size.
     layout: list[tuple[int, int]] | None = field(default_factory=list)
+    # The alignment of the first field; 0 before there is one.
     first: int = 0
     least: int = 0
 
-    def finished(self) -> Plan:
+    def plan(self) -> Plan:
         """Returns the plan of the fields that were added."""
         self._flush()
         layout = self.layout or ()
@@ -197,6 +217,7 @@ class _Planner:
         return Plan(steps, self.first or 1, self.least, unit, ends, left_out, has_objects)
 
     def _end(self, at: int) -> int:
+        """Returns where a message of fixed size ends that begins at a position."""
         for align, size in self.layout or ():
             at += -at % align + size
         return at
@@ -214,7 +235,7 @@ class _Planner:
         kind, length = entry.kind, entry.length
         if length is not None and length > _MOST_ELEMENTS:
             raise UnplannedError(f"{path} is an array of {length} elements, more than a bag holds")
-        self._take(1)
+        self._spend(1)
         if entry.name == _FILLER:
             self._pass(1, 1)
         elif length is None and isinstance(kind, Definition):
@@ -223,9 +244,9 @@ class _Planner:
             else:
                 self.add_message(kind, path, attribute)
         elif length is None and kind == "string":
-            align, skip = self._variable()
+            align, skip = self._begin_variable()
             self.steps.append(Text(align, skip, path, attribute))
-            self._behind(1, 5)
+            self._pass_variable(1, 5)
         elif length is None:
             dtype = _dtype(kind)
             number = Number(path, attribute, dtype, kind == "bool")
@@ -237,23 +258,23 @@ class _Planner:
         else:
             self._array(kind, length, path, attribute)
 
-    def _take(self, columns: int) -> None:
+    def _spend(self, columns: int) -> None:
         if len([*islice(self.budget, columns)]) < columns:
             raise UnplannedError(f"it has more than {MAX_COLUMNS} fields")
 
     def _numbers(self, kind: str, path: str, attribute: str) -> None:
         dtype = _dtype(kind)
-        align, skip = self._variable()
+        align, skip = self._begin_variable()
         self.steps.append(
             NumberSequence(align, skip, path, attribute, dtype, kind == "bool", dtype.itemsize)
         )
-        self._behind(min(4, dtype.itemsize), 4)
+        self._pass_variable(min(4, dtype.itemsize), 4)
 
     def _array(self, kind: str, length: int, path: str, attribute: str) -> None:
         dtype = _dtype(kind)
         size = dtype.itemsize
         if length <= MAX_NUMBERS:
-            self._take(length)
+            self._spend(length)
             for nth in range(length):
                 at = f"{path}.{nth}"
                 number = Number(at, attribute, dtype, kind == "bool", nth)
@@ -275,24 +296,26 @@ class _Planner:
             planner.add_message(kind, "", "")
         else:
             planner.add_field(Field("", kind), "", "")
-        inner = planner.finished()
+        inner = planner.plan()
         self._flush()
-        align, skip = self._variable() if length == SEQUENCE else (1, 0)
+        align, skip = self._begin_variable() if length == SEQUENCE else (1, 0)
         self.steps.append(Sequence(align, skip, path, attribute, length, inner))
-        self.left_out |= {f"{path}.{below}": why for below, why in inner.left_out.items()}
+        for inner_path, reason in inner.left_out.items():
+            self.left_out[f"{path}.{inner_path}"] = reason
         if length == SEQUENCE:
-            self._behind(1, _LENGTH_BYTES)
+            self._pass_variable(1, _LENGTH_BYTES)
             return
         self.first = self.first or first
         self.least += length * inner.least
         self.layout, self.unit, self.rest = None, 1, 0
 
-    def _fixed(self, read: Number | Time | Array, dtype: str, align: int, size: int) -> None:
+    def _fixed(self, entry: Number | Time | Array, dtype: str, align: int, size: int) -> None:
         """Adds a field of fixed size to the run."""
         self._pass(align, size)
-        self.read.append((read, dtype, self.size - size))
+        self.run.append((entry, dtype, self.size - size))
 
     def _pass(self, align: int, size: int) -> None:
+        """Moves the position behind a field of fixed size."""
         if align > self.unit:
             self._flush()
             self.align, self.unit, self.rest = align, align, 0
@@ -307,21 +330,32 @@ class _Planner:
     def _flush(self) -> None:
         """Ends the run."""
         if self.size:
-            shown = [(str(nth), kind, at) for nth, (_, kind, at) in enumerate(self.read) if kind]
-            names, formats, offsets = zip(*shown, strict=True) if shown else ((), (), ())
-            dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets})
-            fields = tuple(read for read, _, _ in self.read)
-            self.steps.append(Run(self.align, self.size, dtype, fields))
-        self.align, self.size, self.read = 1, 0, []
+            names: list[str] = []
+            formats: list[str] = []
+            offsets: list[int] = []
+            for nth, (_, dtype, offset) in enumerate(self.run):
+                if dtype:  # a long array is not read
+                    names.append(str(nth))
+                    formats.append(dtype)
+                    offsets.append(offset)
+            layout = np.dtype({"names": names, "formats": formats, "offsets": offsets})
+            fields = tuple(entry for entry, _, _ in self.run)
+            self.steps.append(Run(self.align, self.size, layout, fields))
+        self.align, self.size, self.run = 1, 0, []
 
-    def _variable(self) -> tuple[int, int]:
-        """Ends the run before a length; returns how to get to it: alignment and bytes to skip."""
+    def _begin_variable(self) -> tuple[int, int]:
+        """Ends the run before a length; returns `align` and `skip` of what follows."""
         self._flush()
         self.first = self.first or _LENGTH_BYTES
         return (_LENGTH_BYTES, 0) if self.unit < _LENGTH_BYTES else (1, -self.rest % _LENGTH_BYTES)
 
-    def _behind(self, unit: int, least: int) -> None:
-        """Goes on behind something of variable size, where `unit` is what is known."""
+    def _pass_variable(self, unit: int, least: int) -> None:
+        """Moves the position behind something of variable size.
+
+        Args:
+            unit: the position is a multiple of this.
+            least: the fewest bytes that it takes.
+        """
         self.unit, self.rest, self.layout = unit, 0, None
         self.least += least
 
@@ -332,7 +366,7 @@ def is_time(kind: Definition) -> bool:
 
 
 def first_align(kind: str | Definition) -> int:
-    """Returns the alignment of a value, which is that of its first field."""
+    """Returns the alignment of a value: of a message, that of its first field."""
     while isinstance(kind, Definition):
         if not kind.fields:
             return 1
@@ -342,7 +376,7 @@ def first_align(kind: str | Definition) -> int:
 
 
 def fields_at(definition: Definition | None, path: Iterable[str]) -> list[Field]:
-    """Returns the fields along a path, each inside the one before, as far as there are such."""
+    """Returns the fields along a path, as far as they exist; each is in the message before it."""
     fields: list[Field] = []
     kind: str | Definition | None = definition
     for name in path:

@@ -1,7 +1,8 @@
-"""The poses of a table, from its columns alone.
+"""Reads the poses of a table from its columns.
 
-The same as `SchemaExtractor.pose` and `twist` give for each message, rounded alike everywhere: to
-0.1 mm and what the store keeps of rotations. So what is stored changes no pose below 1e9 m.
+They are those that `SchemaExtractor.pose` and `twist` return for each message, rounded as the store
+rounds them: to 0.1 mm, and rotations to 0.1 mrad. So poses (below 1e9 m) do not depend on what is
+stored.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ if TYPE_CHECKING:
 
 
 _ABOUT_UNIT: Final = 1e-2
-_MOST_STEPPED: Final = 1e9
-"""Larger numbers of metres are no places, and are not rounded here."""
+_MOST_ROUNDED: Final = 1e9
+"""Larger numbers of metres are no places, and are not rounded."""
 
 
 class PoseColumns:
-    """Reads the poses of tables; remembers which columns of a type they are.
+    """Reads the poses of tables; remembers in which columns of a type they are.
 
     Args:
         extractor: has the schema map.
@@ -51,12 +52,12 @@ class PoseColumns:
         )
 
     def of(self, table: Table, times: IntArray, index: IntArray | None) -> Poses | None:
-        """Returns the poses of some rows of a table; None where their messages have to be read.
+        """Returns the poses of some rows of a table; None if their messages have to be read.
 
         Args:
-            table: of messages of one type.
-            times: the log times of these rows.
-            index: their positions in the table; None for all.
+            table: has the rows.
+            times: the log times (ns) of the rows.
+            index: the positions of the rows in the table; None for all.
 
         Raises:
             NoPoseError: messages of this type have no pose.
@@ -77,14 +78,14 @@ class NoPoseError(Exception):
 
 
 class _Columns(NamedTuple):
-    """Which columns a pose is in, by their dot-paths.
+    """The dot-paths of the columns that have a pose.
 
     Attributes:
-        axes: of x, y and, unless it is 0, z; or none.
-        turn: of x, y, z, w; or of a heading (rad); or none.
-        frame: of the frame in the header; empty without one.
-        numbered_frame: of PX4's number of the frame; empty without one.
-        velocity: of the linear velocity's one to three components; or none.
+        axes: of x, y and, unless z is always 0, z (m); empty if there is no pose.
+        turn: of x, y, z and w, or of a heading alone (rad); empty if there is no rotation.
+        frame: of the frame in the header, or "".
+        numbered_frame: of PX4's number of the frame, or "".
+        velocity: of the one to three components of the linear velocity (m/s); empty without one.
     """
 
     axes: tuple[str, ...] = ()
@@ -100,25 +101,25 @@ def _columns_of(plan: Plan, shape: Shape) -> _Columns:
     Raises:
         UnknownShapeError: it depends on the message.
     """
-    routes = (
-        _planar(route, shape) if isinstance(route, PlanarPose) else _point(route, shape)
-        for route in plan.poses
-    )
-    pose = next(filter(None, routes), None)
+    pose: _Columns | None = None
+    for route in plan.poses:
+        pose = _planar(route, shape) if isinstance(route, PlanarPose) else _point(route, shape)
+        if pose is not None:
+            break
     if pose is None:
         return _Columns()
     frame = shape.at(FRAME.segments)
-    is_named = isinstance(frame, Leaf) and frame.kind is Kind.TEXT
+    has_frame = isinstance(frame, Leaf) and frame.kind is Kind.TEXT
     numbered = plan.pose_frame and _number(shape.at(plan.pose_frame.segments))
     return pose._replace(
-        frame=".".join(FRAME.segments) if is_named else "",
+        frame=".".join(FRAME.segments) if has_frame else "",
         numbered_frame=numbered or "",
         velocity=_velocity(plan, shape),
     )
 
 
 def _number(node: Node | None) -> str:
-    """Returns the path of a number; empty for anything else.
+    """Returns the path of a number; "" for anything else.
 
     Raises:
         UnknownShapeError: it is in a list.
@@ -131,10 +132,10 @@ def _number(node: Node | None) -> str:
 
 
 def _numbers(node: Node | None, names: str) -> tuple[str, ...]:
-    """Returns the paths of the numbers that an object has under these names; none unless of all.
+    """Returns the paths of the fields with these names; none unless all of them are numbers.
 
     Raises:
-        UnknownShapeError: it is in a list.
+        UnknownShapeError: the object is in a list.
     """
     if isinstance(node, Listing) and isinstance(node.element, dict):
         raise UnknownShapeError("a path leads through a list")
@@ -146,7 +147,7 @@ def _numbers(node: Node | None, names: str) -> tuple[str, ...]:
 
 
 def _elements(node: Node | None, count: int) -> tuple[str, ...]:
-    """Returns the paths of the numbers of an array; none unless it is one of so many.
+    """Returns the paths of the numbers of an array; none unless it has `count` numbers.
 
     Raises:
         UnknownShapeError: it has another length in each message.
@@ -158,7 +159,7 @@ def _elements(node: Node | None, count: int) -> tuple[str, ...]:
 
 
 def _point(route: PointPose, shape: Shape) -> _Columns | None:
-    """Returns the columns of a point and its rotation; None where there is no point.
+    """Returns the columns of a point and its rotation; None if there is no point.
 
     Raises:
         UnknownShapeError: one is in a list, or an array of another length in each message.
@@ -175,25 +176,38 @@ def _point(route: PointPose, shape: Shape) -> _Columns | None:
 
 
 def _planar(route: PlanarPose, shape: Shape) -> _Columns | None:
-    routes = (route.x, route.y, route.z, route.heading)
-    nodes = [shape.at(axis.segments) for axis in routes]
-    x, y, z, heading = map(_number, nodes)
-    if not x or not y or (route.is_needed and nodes[-1] is None):
+    """Returns the columns of x, y, z and a heading; None without x and y.
+
+    Raises:
+        UnknownShapeError: one is in a list.
+    """
+    x, y, z = (_number(shape.at(axis.segments)) for axis in (route.x, route.y, route.z))
+    heading_node = shape.at(route.heading.segments)
+    heading = _number(heading_node)
+    if not x or not y or (route.is_needed and heading_node is None):
         return None
     return _Columns((x, y, z) if z else (x, y), (heading,) if heading else ())
 
 
 def _velocity(plan: Plan, shape: Shape) -> tuple[str, ...]:
-    """Returns the paths of the first linear velocity that an angular one stands beside."""
+    """Returns the paths of the first linear velocity that has an angular one beside it."""
     for linear_route, angular_route in plan.twists:
-        both = [shape.at(route.segments) for route in (linear_route, angular_route)]
-        velocity, turning = (_numbers(node, "xyz") for node in both)
-        if not velocity and plan is not UNMAPPED:
-            paths = [(_number(node), node) for node in both]
-            velocity, turning = ((path,) if path else _elements(node, 3) for path, node in paths)
-        if velocity and turning:
-            return velocity
+        linear_node, angular_node = (
+            shape.at(linear_route.segments),
+            shape.at(angular_route.segments),
+        )
+        linear, angular = _numbers(linear_node, "xyz"), _numbers(angular_node, "xyz")
+        if not linear and plan is not UNMAPPED:
+            linear, angular = _number_or_array(linear_node), _number_or_array(angular_node)
+        if linear and angular:
+            return linear
     return ()
+
+
+def _number_or_array(node: Node | None) -> tuple[str, ...]:
+    """Returns the path of a number, or the paths of an array of three."""
+    path = _number(node)
+    return (path,) if path else _elements(node, 3)
 
 
 class _RoundedRows:
@@ -207,11 +221,11 @@ class _RoundedRows:
         """Returns a column of numbers, rounded.
 
         Raises:
-            UnknownShapeError: the table does not hold it.
+            UnknownShapeError: the table does not have it.
         """
         column = self._table.columns.get(path)
         if column is None or isinstance(column, Texts):
-            raise UnknownShapeError(f"{path} is not held")
+            raise UnknownShapeError(f"{path} has no column")
         values = cast("Floats", column if self._index is None else column[self._index])
         return rounded(values.astype(np.float64), step)
 
@@ -219,16 +233,16 @@ class _RoundedRows:
         """Returns a column of texts; raises as `floats`."""
         column = self._table.columns.get(path)
         if not isinstance(column, Texts):
-            raise UnknownShapeError(f"{path} is not held")
+            raise UnknownShapeError(f"{path} has no column")
         return column if self._index is None else column.rows(self._index)
 
 
 def rounded(values: NDArray[np.float64], step: Step) -> NDArray[np.float64]:
-    """Returns numbers as the nearest multiples of a step; those for which it is too fine, as is."""
+    """Returns numbers rounded to multiples of a step, but for those beyond `_MOST_ROUNDED`."""
     if not step.per_unit:
         return values
     with np.errstate(all="ignore"):
-        return np.where(np.abs(values) < _MOST_STEPPED, step.nearest(values), values)
+        return np.where(np.abs(values) < _MOST_ROUNDED, step.nearest(values), values)
 
 
 def _read(rows: _RoundedRows, columns: _Columns, times: IntArray) -> Poses:
@@ -259,9 +273,10 @@ def _turns(rows: _RoundedRows, columns: _Columns, count: int) -> Vectors:
 
 
 def _at_unit_length(turns: Vectors) -> Vectors:
-    """Returns quaternions (as rows) at unit length; NaN where they are zero or not finite.
+    """Returns quaternions, as rows, at unit length; NaN if they are zero or not finite.
 
-    Rounded where that is their length already: of others rounding would change the rotation more.
+    Those of about unit length are rounded first; rounding would change the rotation of shorter ones
+    by more than 0.1 mrad.
     """
     with np.errstate(all="ignore"):
         is_about_unit = np.abs(row_sums(turns * turns) - 1) < _ABOUT_UNIT
@@ -270,7 +285,7 @@ def _at_unit_length(turns: Vectors) -> Vectors:
 
 
 def _frames_of(rows: _RoundedRows, columns: _Columns, count: int) -> Texts:
-    """Returns the frames: those of the headers, and PX4's where these are empty."""
+    """Returns the frames in the headers, or PX4's frames where these are empty."""
     frames = Texts(np.zeros(count, np.uint32), ("",) if count else ())
     if columns.frame:
         frames = rows.texts(columns.frame)

@@ -18,19 +18,18 @@ MOST_RELATIVE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What the values of a column of floats are rounded to. Other columns are always exact.
+    """How the values of a column of floats are rounded. Other columns are always exact.
 
     Attributes:
-        per_unit: the values become whole multiples of `1 / per_unit`, so that at most half of that
-            is lost; 0 where no step is absolute.
-        relative: each value may change by a millionth (`MOST_RELATIVE`) of itself.
+        per_unit: values become multiples of `1 / per_unit`; 0 if they do not.
+        relative: whether each value may change by a millionth (`MOST_RELATIVE`) of itself.
     """
 
     per_unit: int = 0
     relative: bool = False
 
     def __str__(self) -> str:
-        """Returns how a layout writes it: `1/10000`, `relative`, `exact`."""
+        """Returns the step as text for a layout: `1/10000`, `relative`, `exact`."""
         if self.per_unit:
             return f"1/{self.per_unit}"
         return "relative" if self.relative else "exact"
@@ -41,10 +40,10 @@ class Step:
 
     @classmethod
     def parse(cls, text: str) -> Step:
-        """Returns the step that was written so.
+        """Returns the step of such a text.
 
         Raises:
-            ValueError: no step is written so.
+            ValueError: the text is of no step.
         """
         if text == "relative":
             return RELATIVE
@@ -119,7 +118,7 @@ def step_of(path: str, definition: Definition | None) -> Step:
 
 
 def _type_at(path: str, definition: Definition | None) -> str:
-    """The type of the message at a path; empty where it is not known."""
+    """Returns the type of the message at a path; "" if it is not known."""
     names = path.split(".") if path else []
     fields = fields_at(definition, names)
     if len(fields) < len(names):
@@ -129,6 +128,13 @@ def _type_at(path: str, definition: Definition | None) -> str:
 
 
 def _axis(name: str, owner: str, field: str) -> Step:
+    """Returns the step of x, y or z.
+
+    Args:
+        name: of the axis.
+        owner: the type of the message that has the axis.
+        field: the name of the field that has this message.
+    """
     if owner == _QUATERNION:
         return QUATERNION
     if owner in _POINTS or (owner in _POSES_2D and name != "z"):

@@ -1,11 +1,11 @@
-"""The columns of a topic's tables, and tables that unpack them when they are first asked for.
+"""The layout of a topic's tables, and tables that unpack columns when they are first used.
 
-The columns are the same from bag to bag, so that they are written down once.
+A topic has the same columns from bag to bag, so their layout is stored once.
 
-What is known of the columns of a part besides their zones, without unpacking them again, is its
-outline. Of numbers how many there are, their sum, and when the least and the greatest was; of texts
-that are too many to be listed (JSON, lines of a log) which rows of letters are in which row. It is
-made while filling, and is there also where a column was dropped.
+The outline of a part says what its zones do not, without a column being unpacked: how many numbers
+a column has, their sum, and the times of the least and the greatest one; and which runs of letters
+are in which text, if a column has too many texts for its zone (JSON, lines of a log). It is made
+while the store is filled, and remains when columns are dropped.
 """
 
 from __future__ import annotations
@@ -49,12 +49,17 @@ if TYPE_CHECKING:
 _BYTES: Final = 500
 """About how much memory an entry takes."""
 _MOST_LETTERS: Final = 1_024
-"""Different rows of letters in the texts of a part; of more nothing is known."""
+"""Distinct runs of letters in the texts of a part; if there are more, the outline has none."""
 V = TypeVar("V")
 
 
 class ColumnKind(NamedTuple):
-    """What a column is: `text` or numpy's name of its dtype, and how exactly it is stored."""
+    """The type of a column.
+
+    Attributes:
+        dtype: `text`, or numpy's name of it.
+        step: how exactly it is stored.
+    """
 
     dtype: str
     step: Step = EXACT
@@ -65,10 +70,10 @@ class Layout:
     """The columns of the tables of one topic, type and definition.
 
     Attributes:
-        slots: all columns in the order in which they are packed, by their path from the table:
-            those of the messages, then of each sequence the owners of its elements, by its path and
-            `#`, and the columns of these (`detections.label`).
-        left_out: what is no column, and why.
+        slots: the kinds of all columns, by their paths from the table, in the order in which they
+            are packed: the columns of the messages; then for each sequence the owners of its
+            elements, whose path ends with `#`, and their columns (`detections.label`).
+        left_out: why fields have no column; see `Table.left_out`.
     """
 
     slots: Mapping[str, ColumnKind]
@@ -76,7 +81,7 @@ class Layout:
 
     @classmethod
     def of(cls, table: Table, definition: Definition | None) -> Layout:
-        """Returns that of a table; the definition names the steps."""
+        """Returns the layout of a table; the definition determines the steps."""
         kinds = {path: _kind_of(column, path, definition) for path, column in columns_in(table)}
         return cls(kinds, table.left_out)
 
@@ -99,12 +104,12 @@ class Layout:
         return levels
 
     def fits(self, table: Table) -> bool:
-        """Whether the table has these columns, and no others, and leaves the same out."""
+        """Returns whether a table has exactly these columns, and leaves out the same fields."""
         paths = [path for path, _ in columns_in(table)]
         return self.left_out == table.left_out and paths == [*self.slots]
 
     def to_json(self) -> str:
-        """Returns it as a person can read it; equal layouts give equal texts."""
+        """Returns the layout as readable JSON; that of equal layouts is equal."""
         columns = {
             path: kind.dtype if kind.step == EXACT else f"{kind.dtype} {kind.step}"
             for path, kind in self.slots.items()
@@ -114,10 +119,10 @@ class Layout:
 
     @classmethod
     def from_json(cls, text: str) -> Layout:
-        """Returns the layout that was written so.
+        """Returns the layout that `to_json` wrote.
 
         Raises:
-            ValueError, LookupError, TypeError: it is not one.
+            ValueError, LookupError, TypeError: the text is no layout.
         """
         described = json.loads(text)
         slots = {}
@@ -128,7 +133,12 @@ class Layout:
 
 
 class LevelPaths(NamedTuple):
-    """The columns of messages or elements, and the sequences in them: by their names, the paths."""
+    """The paths in `Layout.slots` of what messages, or elements of a sequence, have.
+
+    Attributes:
+        columns: by the names of the columns.
+        sequences: by the names of the sequences.
+    """
 
     columns: dict[str, str]
     sequences: dict[str, str]
@@ -150,30 +160,30 @@ def _kind_of(column: Column, path: str, definition: Definition | None) -> Column
     return ColumnKind(name, step_of(path, definition) if column.dtype.kind == "f" else EXACT)
 
 
-class Remembered(Protocol):
-    """What is remembered, as long as there is room for it."""
+class Memory(Protocol):
+    """A cache that forgets values when it is full."""
 
     def get(self, key: Hashable) -> object | None:
-        """Returns what is remembered under a key."""
+        """Returns the value of a key; None if it was forgotten."""
 
     def put(self, key: Hashable, value: object, size: int) -> None:
-        """Remembers a value of about so many bytes."""
+        """Remembers a value of about `size` bytes."""
 
 
-class Lazily(Mapping[str, V]):
-    """A mapping whose values are made when they are first asked for, and kept."""
+class LazyMapping(Mapping[str, V]):
+    """A mapping whose values are made when they are first used, and kept."""
 
     def __init__(self, names: Collection[str], make: Callable[[str], V]) -> None:
         self._names = names
         self._make = make
-        self._made: dict[str, V] = {}
+        self._values: dict[str, V] = {}
 
     def __getitem__(self, name: str) -> V:
-        value = self._made.get(name)
+        value = self._values.get(name)
         if value is None:
             if name not in self._names:
                 raise KeyError(name)
-            value = self._made[name] = self._make(name)
+            value = self._values[name] = self._make(name)
         return value
 
     def __contains__(self, name: object) -> bool:
@@ -188,23 +198,23 @@ class Lazily(Mapping[str, V]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredTable(Table):
-    """A table whose columns are unpacked when they are first asked for, by any thread.
+    """The table of a part, whose columns are unpacked when they are first used, by any thread.
 
     Attributes:
-        packed: returns what is known of a column, by its path as in `Layout.slots`, without its
-            data; None where there is no such one.
-        outline: returns what else is known of them; None where it was not made.
-        memory: has what was made of it, under its number; None where nothing is remembered.
+        packed: returns how the column at a path of `Layout.slots` is packed, without its data; None
+            if there is no such column.
+        outline: returns the outline of the part; None if it was not made.
+        memory: remembers what is made of the part; None to remember nothing.
         number: of the part.
     """
 
     packed: Callable[[str], Packed | None] = field(kw_only=True)
     outline: Callable[[], Outline | None] = field(kw_only=True, default=lambda: None)
-    memory: Remembered | None = field(kw_only=True, default=None)
+    memory: Memory | None = field(kw_only=True, default=None)
     number: int = field(kw_only=True, default=0)
 
     def error(self, path: str) -> float:
-        """Returns the greatest absolute error of a column; 0.0: it is exact.
+        """Returns the greatest absolute error of a column; 0.0 if it is exact.
 
         Args:
             path: the column; of elements `<sequence>.<column>`.
@@ -218,15 +228,12 @@ class StoredTable(Table):
         return packed.error
 
     def zone(self, path: str) -> Zone | None:
-        """Returns what is known of a column without unpacking it; None where there is no such one.
-
-        `path` is as in `error`.
-        """
+        """Returns the zone of a column, as `error`; None if there is no such column."""
         packed = self.packed(path.rstrip("."))
         return None if packed is None else packed.zone
 
     def remember(self, what: str, make: Callable[[], V], size_of: Callable[[V], int]) -> V:
-        """Returns what `make` makes of all rows, once for the part; see `Table.remember`."""
+        """Returns what `make` returns, once for the part; see `Table.remember`."""
         if self.memory is None:
             return make()
         key = (self.number, f"={what}")
@@ -240,9 +247,12 @@ class StoredTable(Table):
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """A topic with its columns, and its definition.
+    """A stored topic.
 
-    `define` finds the definition, when it is first asked for: to parse one takes some 10 ms.
+    Attributes:
+        channel: its channel.
+        layout: its columns.
+        define: returns the definition of a channel; called late, since parsing takes some 10 ms.
     """
 
     channel: Channel
@@ -258,13 +268,13 @@ class Topic:
 def lazy_columns(
     layout: Layout, column: Callable[[str], Column], dropped: Collection[str], sequence: str = ""
 ) -> tuple[Mapping[str, Column], Mapping[str, Elements]]:
-    """Returns the columns and sequences of a table, each made when it is needed, and kept.
+    """Returns the columns and sequences of a table, each made when it is first used, and kept.
 
     Args:
         layout: of the table.
-        column: returns the column, or the owners, at a path of `Layout.slots`.
-        dropped: the paths of those that there are not.
-        sequence: the path of that whose elements they are of; "" for those of the messages.
+        column: returns the column at a path of `Layout.slots`.
+        dropped: the paths of the columns that were dropped.
+        sequence: the path of the sequence whose elements have the columns; "" for the messages.
     """
     columns, sequences = layout.levels[sequence]
 
@@ -273,23 +283,21 @@ def lazy_columns(
         owners = np.asarray(column(f"{path}#"), np.int64)
         return Elements(owners, *lazy_columns(layout, column, dropped, path))
 
-    kept: Collection[str] = columns
-    lists: Collection[str] = sequences
-    if dropped:
-        # Owners that are all equal take no bytes: they stay where the columns beside them go.
-        kept = [name for name, path in columns.items() if path not in dropped]
-        lists = [name for name, path in sequences.items() if f"{path}#" not in dropped]
-    return Lazily(kept, lambda name: column(columns[name])), Lazily(lists, elements)
+    # Owners that are all equal take no bytes, so they are never dropped.
+    kept = {name: path for name, path in columns.items() if path not in dropped}
+    lists = {name: path for name, path in sequences.items() if f"{path}#" not in dropped}
+    return LazyMapping(kept, lambda name: column(kept[name])), LazyMapping(lists, elements)
 
 
 class Totals(NamedTuple):
     """The finite numbers of a column.
 
     Attributes:
-        size: how many.
+        size: how many there are.
         total: their sum.
-        least: log times between which the first of the least ones is, inclusive; equal if known.
-        greatest: of the greatest ones likewise.
+        least: the log times (ns, inclusive) between which the first least number lies; both are
+            the same if its time is known.
+        greatest: the log times between which the first greatest number lies.
     """
 
     size: int
@@ -299,11 +307,11 @@ class Totals(NamedTuple):
 
 
 class Letters(NamedTuple):
-    """Which casefolded rows of letters are in the texts of a column.
+    """Which runs of letters are in which texts of a column.
 
     Attributes:
-        words: runs of letters, of which what is not ASCII is part.
-        has: for each of them, packed bits: which texts have it.
+        words: the runs, casefolded; what is not ASCII counts as a letter.
+        has: for each run, as packed bits, whether a text has it.
         size: how many texts there are.
     """
 
@@ -313,7 +321,7 @@ class Letters(NamedTuple):
 
     @classmethod
     def of(cls, texts: Texts) -> Letters | None:
-        """Returns the letters of texts; None where they are too many."""
+        """Returns the letters of texts; None if they have too many runs."""
         # Many texts differ in their numbers alone, and have the same words.
         word_sets, set_of = numbered(frozenset(words_of(caseless(text))) for text in texts.words)
         words = sorted(frozenset().union(*word_sets))
@@ -327,7 +335,7 @@ class Letters(NamedTuple):
         return cls(tuple(words), np.packbits(is_in_text, axis=1), len(texts))
 
     def may_have(self, text: str) -> Flags:
-        """Returns in which texts a casefolded text may be; surely, if it is one row of letters."""
+        """Returns which texts may contain a casefolded text; surely if it is one run of letters."""
         bits = np.full(self.has.shape[1], 0xFF, np.uint8)
         for letters in letters_of(text):
             containing = [nth for nth, word in enumerate(self.words) if letters in word]
@@ -336,13 +344,13 @@ class Letters(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """What is known of the columns of a part; of some of them nothing is.
+    """What is known of some columns of a part.
 
     Attributes:
-        paths: of columns of numbers.
-        sizes: how many finite numbers each has.
-        sums: what they add up to.
-        times: when the ends of each were, as of `Totals` (N x 4).
+        paths: of the columns of numbers.
+        sizes: `Totals.size` of each.
+        sums: `Totals.total` of each.
+        times: `Totals.least` and `Totals.greatest` of each (N x 4).
         letters: of columns of texts, by their paths.
     """
 
@@ -360,25 +368,30 @@ class Outline(NamedTuple):
         return cls([*totals], np.array(sizes, np.int64), np.array(sums, float), ends, letters)
 
     def totals(self, path: str) -> Totals | None:
-        """Returns what is known of a column of numbers; None: nothing."""
+        """Returns the totals of a column of numbers; None if they are not known."""
         if path not in self.paths:
             return None
         nth = self.paths.index(path)
-        first, second, third, fourth = self.times[nth].tolist()
+        least, least_until, greatest, greatest_until = self.times[nth].tolist()
         size, total = int(self.sizes[nth]), float(self.sums[nth])
-        return Totals(size, total, (first, second), (third, fourth))
+        return Totals(size, total, (least, least_until), (greatest, greatest_until))
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        texts = sum(
-            letters.has.nbytes + 100 * len(letters.words) for letters in self.letters.values()
-        )
-        return texts + _BYTES + 120 * len(self.paths)
+        size = _BYTES + 120 * len(self.paths)
+        for letters in self.letters.values():
+            size += letters.has.nbytes + 100 * len(letters.words)
+        return size
 
 
 def outline_of(table: Table, times: IntArray) -> Outline:
-    """Returns the outline of a part, all of whose columns are stored, and its log times."""
+    """Returns the outline of a part of which no column was dropped.
+
+    Args:
+        table: of the part.
+        times: its log times (ns).
+    """
     totals: dict[str, Totals] = {}
     letters: dict[str, Letters] = {}
     for path in table.columns:
@@ -387,7 +400,8 @@ def outline_of(table: Table, times: IntArray) -> Outline:
             continue
         if (zone.words or "").startswith(IN_PART):
             texts = table.columns[path]
-            if isinstance(texts, Texts) and (in_texts := Letters.of(texts)) is not None:
+            in_texts = Letters.of(texts) if isinstance(texts, Texts) else None
+            if in_texts is not None:
                 letters[path] = in_texts
         elif np.isfinite([zone.low, zone.high]).all():
             column = table.columns[path]
@@ -401,7 +415,7 @@ def _totals_of(column: Numbers, error: float, times: IntArray) -> Totals:
     if not is_finite.all():
         column, times = column[is_finite], times[is_finite]
     numbers = cast("Floats", column if error == 0.0 else column.astype(np.float64, copy=False))
-    with np.errstate(over="ignore", invalid="ignore"):  # not finite where no float holds it
+    with np.errstate(over="ignore", invalid="ignore"):  # the sum may be too large for a float
         total = float(numbers.sum(dtype=np.float64))
     if error == 0.0:
         least, greatest = int(times[numbers.argmin()]), int(times[numbers.argmax()])

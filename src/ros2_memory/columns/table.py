@@ -25,7 +25,7 @@ import math
 import re
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -43,9 +43,9 @@ Numbers: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 MAX_NUMBERS: Final = 9
 """Longer arrays of numbers (covariances of poses, scans, images) are no columns."""
 IN_PART: Final = "LETTERS"
-"""Begins the words of a zone that are no whole texts, but the rows of letters in them.
+"""Begins the words of a zone that has the runs of letters in its texts, not the whole texts.
 
-No casefolded text begins so."""
+No casefolded text begins like this, in capitals."""
 _SPACES: Final = bytes(code if code > 127 or chr(code).isalpha() else 32 for code in range(256))
 """For `bytes.translate`, which is faster than that of `str`."""
 _LETTERS: Final = re.compile(r"[^\W\d_]+")
@@ -56,16 +56,16 @@ MAX_RANGED_BYTES: Final = 4096
 
 
 class Zone(NamedTuple):
-    """What is known of a column without reading its values.
+    """What is known of a column without reading its values; `Zones` compares it with numbers.
 
     Attributes:
-        least: the least value that is not NaN, exact; None of texts and where there is none.
-            Infinities count; False is 0.
-        greatest: the greatest likewise.
-        nulls: how many values are NaN.
-        words: of texts, the casefolded distinct ones, joined by newlines: what is not in it is in
-            no text. Of texts that are too many or too long for that, `IN_PART` and the rows of
-            letters in them. None of numbers, and where these are too many, too: any may be there.
+        least: the least number, exact; None for texts and if all are NaN. Infinities count; False
+            is 0.
+        greatest: the greatest number.
+        nulls: how many numbers are NaN.
+        words: the distinct texts, casefolded and joined by newlines; or, if these are too many or
+            too long, `IN_PART` and the runs of letters in them. None for numbers, and if there are
+            too many runs: then any text may be there.
     """
 
     least: float | None = None
@@ -83,53 +83,33 @@ class Zone(NamedTuple):
         """The greatest value; minus infinity where there is none."""
         return -math.inf if self.greatest is None else self.greatest
 
-    def spans(self, number: float) -> bool:
-        """Returns whether a number may be a value."""
-        return self.low <= number <= self.high
-
-    def reaches(self, limit: float, *, above: bool) -> bool:
-        """Returns whether some value lies above a limit, or below it."""
-        return self.high > limit if above else self.low < limit
-
-    def may_be_near(self, place: float, distance: float) -> bool:
-        """Returns whether some value may be within a distance of a place."""
-        return as_float(self.low) - place <= distance and place - as_float(self.high) <= distance
-
-    def may_have(self, text: str) -> bool:
-        """Returns whether a casefolded text may be part of a value."""
-        return self.words is None or may_be_in(self.words, text)
-
-    @property
-    def may_be_json(self) -> bool:
-        """Whether a text may be a JSON array or object."""
-        return self.words is None or any(may_be_in(self.words, mark) for mark in "[{")
-
-    def divided(self, by: int) -> Zone:
-        """Returns the zone of the values divided by a positive number."""
-        return Zone(self.low / by, self.high / by, self.nulls)
-
 
 def letters_of(text: str) -> list[str]:
-    """Returns the rows of letters in a text, each as long as it goes on."""
+    """Returns the longest runs of letters in a text."""
     # The expression takes four times as long.
     return words_of(text) if text.isascii() else _LETTERS.findall(text)
 
 
 def words_of(text: str) -> list[str]:
-    """Returns what lies between spaces and what of ASCII is no letter."""
+    """Returns the runs of letters in a text; whatever is not ASCII counts as a letter."""
     spaced = text.encode("utf-8", "surrogatepass").translate(_SPACES)
     return spaced.decode("utf-8", "surrogatepass").split()
 
 
 def may_be_in(words: str, text: str) -> bool:
-    """Returns whether a casefolded text may be part of a value, by the words of a zone."""
+    """Returns whether a column may have a value that contains a casefolded text.
+
+    Args:
+        words: those of the column's zone.
+        text: what is looked for.
+    """
     if not words.startswith(IN_PART):
         return text in words
     return all(letters in words for letters in letters_of(text))
 
 
 def as_float(number: float) -> float:
-    """Returns the float nearest to a number; infinite where it is too large for one."""
+    """Returns the float nearest to a number; infinity if it is too large for one."""
     try:
         return float(number)
     except OverflowError:
@@ -150,7 +130,7 @@ class Texts:
 
     @classmethod
     def of(cls, values: Sequence[str]) -> Texts:
-        """Returns the column of these strings."""
+        """Returns the column with some strings."""
         words, codes = numbered(values)
         return cls(codes.astype(np.uint32), words)
 
@@ -164,15 +144,15 @@ class Texts:
         return [words[code] for code in self.codes.tolist()]
 
     def rows(self, positions: IntArray) -> Texts:
-        """Returns some rows, with the words that they have."""
+        """Returns some rows, without the words that none of them has."""
         codes = self.codes[positions]
         if len(self.words) <= 1:
             return Texts(codes, self.words if codes.size else ())
         used, first, nth = np.unique(codes, return_index=True, return_inverse=True)
         order = np.argsort(first)
-        new = np.empty(used.size, np.uint32)
-        new[order] = np.arange(used.size, dtype=np.uint32)
-        return Texts(new[nth], tuple(self.words[code] for code in used[order].tolist()))
+        new_codes = np.empty(used.size, np.uint32)
+        new_codes[order] = np.arange(used.size, dtype=np.uint32)
+        return Texts(new_codes[nth], tuple(self.words[code] for code in used[order].tolist()))
 
 
 def joined_texts(parts: Sequence[Texts]) -> Texts:
@@ -190,13 +170,12 @@ Column: TypeAlias = "Numbers | Texts"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Elements:
-    """The elements of a sequence, of all rows of a table (or of all elements around them).
+    """The elements that a sequence has in all rows of a table, or in all elements around it.
 
     Attributes:
-        owners: for each element the row that it belongs to, ascending; the elements of one row are
-            in the order of the message.
-        columns: by the dot-path inside the element; "" where an element is no message.
-        elements: the sequences inside the element.
+        owners: the row of each element, ascending; elements of one row are in the message's order.
+        columns: by the dot-path inside the element; "" if an element is no message.
+        elements: the sequences inside the element, by their dot-path.
     """
 
     owners: IntArray
@@ -204,7 +183,7 @@ class Elements:
     elements: Mapping[str, Elements] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Returns the number of elements, of all rows."""
+        """Returns the number of elements in all rows."""
         return self.owners.size
 
     def rows(self, positions: IntArray) -> Elements:
@@ -214,29 +193,29 @@ class Elements:
         taken = in_ranges(first, counts)
         return Elements(
             np.repeat(np.arange(positions.size), counts),
-            {path: _taken(column, taken) for path, column in self.columns.items()},
+            {path: _rows_of(column, taken) for path, column in self.columns.items()},
             {path: inner.rows(taken) for path, inner in self.elements.items()},
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """The messages of one topic under one type in a bag, in a part of it, or in some bags.
+    """Messages of one topic and type, from one bag or several.
 
-    Ordered by log time, ties by bag and place.
+    They are ordered by log time, those of one log time by bag and place.
 
     Attributes:
         channel: the first channel of this topic, type and definition.
-        log_times: ns.
-        publish_times: ns; those of a table without columns may be the log times.
-        places: the order in the file.
+        log_times: of each message (ns).
+        publish_times: of each message (ns); in a table without columns they may be the log times.
+        places: the place of each message in its file.
         columns: by the dot-path of the field.
         elements: by the dot-path of the sequence.
-        left_out: which fields have no column (or not in all rows), by dot-path, and why; "" stands
-            for the whole message, whose times are all there is.
-        payload_hashes: CRC-32 of each payload, or `UNHASHED`; None where none was asked for.
+        left_out: why a field has no column, or not in all rows, by its dot-path; "" stands for the
+            whole message, of which only the times are known.
+        payload_hashes: CRC-32 of each payload, or `UNHASHED`; None if no hash was asked for.
         define: returns the `definition`.
-        bags: of each row the number of its bag among those that were decoded together; None: 0.
+        bags: the number of each row's bag among those that were decoded together; None: all 0.
     """
 
     channel: Channel
@@ -261,11 +240,11 @@ class Table:
 
     @property
     def bag_numbers(self) -> IntArray:
-        """As `bags`, of each row."""
+        """The number of each row's bag; see `bags`."""
         return np.zeros(len(self), np.int64) if self.bags is None else self.bags
 
     def error(self, path: str) -> float:
-        """Returns the greatest absolute error of a column's values: 0.0, they are as decoded.
+        """Returns the greatest absolute error of a column's values; decoded ones are exact.
 
         Args:
             path: the column; of elements `<sequence>.<column>`.
@@ -274,16 +253,16 @@ class Table:
         return 0.0
 
     def zone(self, path: str) -> Zone | None:
-        """Returns what is known of a column without reading it: None, decoded ones are read."""
+        """Returns the zone of a column; a decoded one has none."""
         del path
         return None
 
     def remember(self, what: str, make: Callable[[], T], size_of: Callable[[T], int]) -> T:
-        """Returns what `make` makes of all rows; of a part that is stored it is remembered.
+        """Returns what `make` returns; a stored part remembers it.
 
         Args:
-            what: its name. Nothing else is made of a table under it.
-            make: makes it.
+            what: the name of what is made, used for nothing else.
+            make: makes it of all rows.
             size_of: returns about how much memory it takes.
         """
         del what, size_of
@@ -297,14 +276,18 @@ class Table:
             log_times=self.log_times[positions],
             publish_times=self.publish_times[positions],
             places=self.places[positions],
-            columns={path: _taken(column, positions) for path, column in self.columns.items()},
+            columns={path: _rows_of(column, positions) for path, column in self.columns.items()},
             elements={path: inner.rows(positions) for path, inner in self.elements.items()},
             payload_hashes=None if hashes is None else hashes[positions],
             bags=None if bags is None else bags[positions],
         )
 
     def without_columns(self, reason: str) -> Table:
-        """Returns the times of the rows alone, and why there is no more."""
+        """Returns the rows with their times alone.
+
+        Args:
+            reason: why they have no columns.
+        """
         return replace(self, columns={}, elements={}, left_out={"": reason})
 
     @property
@@ -314,7 +297,7 @@ class Table:
 
 
 def order_of(log_times: IntArray, bags: IntArray, places: IntArray) -> IntArray | None:
-    """Returns the positions by log time, ties by bag and place; None if that is the order."""
+    """Returns the positions by log time, then bag, then place; None if they are in order."""
     if (log_times[1:] > log_times[:-1]).all():
         return None
     order = np.lexsort((places, bags, log_times))
@@ -322,12 +305,10 @@ def order_of(log_times: IntArray, bags: IntArray, places: IntArray) -> IntArray 
 
 
 def joined(tables: Sequence[Table]) -> Table:
-    """Returns the rows of tables of one topic, type and definition as one table.
-
-    Tables without columns can be joined with each other only.
+    """Returns the rows of tables as one table.
 
     Args:
-        tables: at least one.
+        tables: at least one; of one topic, type and definition, all with columns or all without.
     """
     first = tables[0]
     if len(tables) == 1:
@@ -353,36 +334,34 @@ def _hashes(table: Table) -> IntArray:
     return np.full(len(table), UNHASHED) if hashes is None else hashes
 
 
-def _taken(column: Column, positions: IntArray) -> Column:
+def _rows_of(column: Column, positions: IntArray) -> Column:
     return column.rows(positions) if isinstance(column, Texts) else column[positions]
 
 
 def joined_column(parts: Sequence[Column]) -> Column:
-    """Returns columns of one kind one after the other."""
+    """Returns columns, all of texts or all of numbers, one after the other."""
     texts = [part for part in parts if isinstance(part, Texts)]
-    if len(texts) < len(parts):
-        return np.concatenate([part for part in parts if not isinstance(part, Texts)])
-    return joined_texts(texts)
+    return joined_texts(texts) if texts else np.concatenate(cast("Sequence[Numbers]", parts))
 
 
 def _joined_levels(
     parts: Sequence[Table] | Sequence[Elements],
 ) -> tuple[dict[str, Column], dict[str, Elements]]:
-    """Returns the columns and sequences of tables or elements one after the other.
+    """Returns the columns and the sequences of some tables or elements, joined.
 
-    They are of one topic, type and definition; there is at least one.
+    Args:
+        parts: at least one; of one topic, type and definition.
     """
-    before = np.cumsum([0, *map(len, parts)]).tolist()
-
-    def elements(path: str) -> Elements:
+    columns: dict[str, Column] = {}
+    for path in parts[0].columns:
+        columns[path] = joined_column([part.columns[path] for part in parts])
+    first_rows = np.cumsum([0, *map(len, parts)])[:-1].tolist()
+    elements: dict[str, Elements] = {}
+    for path in parts[0].elements:
         inner = [part.elements[path] for part in parts]
-        owners = [sequence.owners + rows for sequence, rows in zip(inner, before, strict=False)]
-        return Elements(np.concatenate(owners), *_joined_levels(inner))
-
-    columns = {
-        path: joined_column([part.columns[path] for part in parts]) for path in parts[0].columns
-    }
-    return columns, {path: elements(path) for path in parts[0].elements}
+        owners = [part.owners + row for part, row in zip(inner, first_rows, strict=True)]
+        elements[path] = Elements(np.concatenate(owners), *_joined_levels(inner))
+    return columns, elements
 
 
 def column_bytes(column: Column) -> int:
@@ -393,7 +372,7 @@ def column_bytes(column: Column) -> int:
 
 
 def _bytes(columns: Mapping[str, Column], elements: Mapping[str, Elements]) -> int:
-    inner = elements.values()
-    return sum(map(column_bytes, columns.values())) + sum(
-        sequence.owners.nbytes + _bytes(sequence.columns, sequence.elements) for sequence in inner
-    )
+    size = sum(map(column_bytes, columns.values()))
+    for inner in elements.values():
+        size += inner.owners.nbytes + _bytes(inner.columns, inner.elements)
+    return size

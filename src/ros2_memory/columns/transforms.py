@@ -1,8 +1,9 @@
-"""The transforms of a topic from its columns: as `SchemaExtractor.transforms` gives them."""
+"""Reads transforms from the columns of a table, as `SchemaExtractor.transforms` from a message."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -30,14 +31,14 @@ _ROTATION: Final = tuple(f"transform.rotation.{part}" for part in "xyzw")
 
 
 def edges_in(table: Table, times: IntArray, index: IntArray | None) -> Edges | None:
-    """Returns the transforms in some rows of a table; None where only its messages have them.
+    """Returns the transforms in some rows of a table; None if their messages have to be read.
 
-    Numbers are rounded as the store rounds them, so they are the same from a part and from a bag.
+    Numbers are rounded as the store rounds them, so that a part and a bag have the same ones.
 
     Args:
-        table: the table.
-        times: log times (ns) of the rows.
-        index: the positions of the rows, ascending; None: all.
+        table: has the rows.
+        times: the log times (ns) of the rows.
+        index: the positions of the rows in the table, ascending; None for all.
     """
     transforms = _transforms_of(table)
     if transforms is None:
@@ -72,47 +73,56 @@ def _bytes_of(edges: Edges) -> int:
 
 
 def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | None:
-    """Returns the parents and children of the transforms in some rows of a table.
+    """Returns the parents and children of the valid transforms in some rows of a table.
 
-    From their names alone, where no number is invalid. None where only the messages have them.
+    Returns None if the messages have to be read.
+
+    Args:
+        table: has the rows.
+        index: the positions of the rows, ascending; None for all.
     """
     transforms = _transforms_of(table)
     if transforms is None:
         return None
-    zones = [table.zone(f"{_LIST}.{path}") for path in (*_TRANSLATION, *_ROTATION)]
-    if index is None and all(
-        zone is not None and not zone.nulls and math.isfinite(zone.high - zone.low)
-        for zone in zones
-    ):
-        return frozenset(_coded_pairs(transforms)[0])
+    if index is None and _has_valid_numbers(table):
+        pairs, _ = _coded_pairs(transforms)
+        return frozenset(pairs)
     times = np.zeros(len(table) if index is None else index.size, np.int64)
     return frozenset(_edges_of(transforms, times, index))
 
 
-def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntArray | None:
-    """Returns when some transform differs from the one before of its child, in some rows.
+def _has_valid_numbers(table: Table) -> bool:
+    """Returns whether the numbers of all transforms are finite, by the zones of their columns."""
+    zones = [table.zone(f"{_LIST}.{path}") for path in (*_TRANSLATION, *_ROTATION)]
+    return all(zone and not zone.nulls and math.isfinite(zone.high - zone.low) for zone in zones)
 
-    None where only the messages have them. The arguments are as for `edges_in`.
+
+def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntArray | None:
+    """Returns the log times (ns) at which a transform differs from the previous one of its child.
+
+    Returns None if the messages have to be read. The arguments are as for `edges_in`.
     """
     edges = edges_in(table, times, index)
     if edges is None:
         return None
+    parents = Counter(child for _, child in edges)
     changes = [np.zeros(0, np.int64)]
-    for child in {child for _, child in edges}:
-        of_child = [edge for (_, other), edge in edges.items() if other == child]
-        for edge in of_child:
+    for (_, child), edge in edges.items():
+        is_new = np.ones(edge.log_times.size, np.bool_)
+        if parents[child] == 1:  # else its transforms may alternate between parents
             numbers = np.column_stack((edge.translation, edge.rotation))
-            new = np.append([True], (numbers[1:] != numbers[:-1]).any(axis=1))
-            # Those of several parents may alternate.
-            changes.append(edge.log_times[new] if len(of_child) == 1 else edge.log_times)
+            is_new[1:] = (numbers[1:] != numbers[:-1]).any(axis=1)
+        changes.append(edge.log_times[is_new])
     return np.unique(np.concatenate(changes))
 
 
 @dataclass(frozen=True, slots=True)
 class Statics:
-    """The static transforms of a part, in log-time order, that differ from those before.
+    """The static transforms of a part.
 
-    `recording` is that of the part, as `columns.store.relative` names its folder.
+    Attributes:
+        recording: the path of the recording's folder, as `columns.store.relative` returns it.
+        transforms: those that differ from the previous one of their child, in order of log time.
     """
 
     recording: str
@@ -133,9 +143,15 @@ STATICS: Final[FragmentKind[Statics]] = FragmentKind(
 def stamped_between(
     table: Table, index: IntArray | None, earliest: Ns, latest: Ns
 ) -> IntArray | None:
-    """Returns the positions, among some rows (None: all), with a transform stamped in a span.
+    """Returns the places in `index` of the rows that have a transform stamped in a span.
 
-    None where only the messages have them.
+    Returns None if the messages have to be read.
+
+    Args:
+        table: has the rows.
+        index: the positions of the rows, ascending; None for all.
+        earliest: stamp (ns), inclusive.
+        latest: stamp (ns), inclusive.
     """
     transforms = _transforms_of(table)
     if transforms is None:
@@ -146,29 +162,31 @@ def stamped_between(
 
 
 def _transforms_of(table: Table) -> Elements | None:
-    """Returns the transforms of a table, with all columns that they need; None without."""
+    """Returns the transforms of a table; None if it lacks one of their columns."""
     transforms = table.elements.get(_LIST)
     if transforms is None or any(not path or path.startswith(_LIST) for path in table.left_out):
         return None
-    held = transforms.columns.keys()
     needed = {_PARENT, _CHILD, _STAMP, *_TRANSLATION, *_ROTATION}
-    return transforms if needed <= held else None
+    return transforms if needed <= transforms.columns.keys() else None
 
 
 def _coded_pairs(transforms: Elements) -> tuple[list[Pair], IntArray]:
-    """Returns the edges that occur, and for each transform the place of its edge; -1: none."""
+    """Returns the distinct edges, and the place of each transform's edge among them.
+
+    The place is -1 if a transform has no child, or leads from a frame to itself.
+    """
     parents, children = transforms.columns[_PARENT], transforms.columns[_CHILD]
     if not isinstance(parents, Texts) or not isinstance(children, Texts):
         return [], np.full(len(transforms), -1)
-    several = max(len(children.words), 1)
+    child_count = max(len(children.words), 1)
     used, codes = np.unique(
-        parents.codes.astype(np.int64) * several + children.codes, return_inverse=True
+        parents.codes.astype(np.int64) * child_count + children.codes, return_inverse=True
     )
     place_of: dict[Pair, int] = {}
     places: list[int] = []
     for code in used.tolist():
-        parent = parents.words[code // several].removeprefix("/")
-        child = children.words[code % several].removeprefix("/")
+        parent = parents.words[code // child_count].removeprefix("/")
+        child = children.words[code % child_count].removeprefix("/")
         is_edge = bool(child) and parent != child
         places.append(place_of.setdefault((parent, child), len(place_of)) if is_edge else -1)
     return [*place_of], np.array(places, np.int64)[codes]

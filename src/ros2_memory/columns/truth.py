@@ -41,7 +41,7 @@ from ros2_memory.columns.values import (
     nowhere,
     unknown,
     within_limits,
-    zone_of,
+    zones_of,
 )
 from ros2_memory.core.text import looks_like_json
 from ros2_memory.messages.conversions import names_beside
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Numeric, ZoneOf
+    from ros2_memory.columns.values import Numeric, ZonesOf
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import Mask
@@ -129,7 +129,7 @@ class ColumnCondition:
             return True
         possible: list[Mask] = []
         for test in plan.whole:
-            may_pass = test.may_match(lambda leaf: zone_of(leaf, parts.zone))
+            may_pass = test.may_match(lambda leaf: zones_of(leaf, parts.zone))
             if may_pass is True:
                 return True
             possible.append(np.broadcast_to(may_pass, parts.numbers.size))
@@ -175,7 +175,7 @@ class _Plan(NamedTuple):
 
 def _possible(tests: Sequence[_Test], values: Values) -> list[_Test]:
     """Returns the tests that some row may pass, by the zones of the columns."""
-    return [test for test in tests if test.may_match(values.zone)]
+    return [test for test in tests if test.may_match(values.zones)]
 
 
 def _any_of(tests: Sequence[_Test], values: Values) -> TruthValues:
@@ -281,22 +281,22 @@ class _LeafTest(NamedTuple):
             return True
         return isinstance(self.test, Contains) and self.is_element and self.test.equal.passes(value)
 
-    def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
-        """Returns whether some value may pass, by the zone of the leaf."""
-        zone = zone_of(self.leaf)
-        if zone is None:
+    def may_match(self, zones_of: ZonesOf[Leaf]) -> bool | Mask:
+        """Returns which parts may have a value that passes; True if all may."""
+        zones = zones_of(self.leaf)
+        if zones is None:
             return True
         if self.leaf.kind is Kind.TEXT:
-            may_have = zone.may_have(self._folded or "")
-            return may_have | zone.may_be_json if self.leaf.json_depth else may_have
+            may_have = zones.may_have(self._folded or "")
+            return may_have | zones.may_be_json if self.leaf.json_depth else may_have
         if self.leaf.kind is not Kind.BOOLEAN and isinstance(self.test, Beyond):
-            return zone.reaches(self.test.limit, above=self.test.above)
+            return zones.reaches(self.test.limit, above=self.test.above)
         numbers: Sequence[float] = self.numbers
         if self.leaf.kind is Kind.BOOLEAN:
             numbers = [value for value in (False, True) if self.passes(value=value)]
         possible: bool | Mask = False
         for number in numbers:
-            possible = possible | zone.spans(number)
+            possible = possible | zones.spans(number)
         return possible
 
     def passing(self, values: Values) -> Iterator[_Passing]:
@@ -495,13 +495,14 @@ class _PlaceTest(NamedTuple):
     test: NearPosition
     leaves: Sequence[Leaf]
 
-    def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
-        """Returns whether some position may be near, by the zones of its leaves."""
+    def may_match(self, zones_of: ZonesOf[Leaf]) -> bool | Mask:
+        """Returns which parts may have a position that is near; True if all may."""
         reach = self.test.tolerance_m * (1 + _ROUNDING) + _TINY_M
         possible: bool | Mask = True
         for leaf, center in zip(self.leaves, self._center, strict=False):
-            zone = zone_of(leaf)
-            possible = possible if zone is None else possible & zone.may_be_near(center, reach)
+            zones = zones_of(leaf)
+            if zones is not None:
+                possible = possible & zones.may_be_near(center, reach)
         return possible
 
     def passing(self, values: Values) -> Iterator[_Passing]:

@@ -1,12 +1,11 @@
-"""The pieces that a scan is made of: the rows of a topic in a part, or in a bag; and copies.
+"""The rows of a topic in a part or in a bag, of which a scan is made; and copies of messages.
 
 Recordings overlap for some seconds while one takes over from the other. A message that is in both
-has the same publish time and payload in each, and log times that differ by little
-(`COPY_HORIZON_NS` at most); it counts once, at its earliest log time. Where one recording has it n
-times and another m times, it counts max(n, m) times. Inside one recording nothing is a copy,
-however alike two messages are.
+has the same publish time and payload in each, and log times that differ by at most
+`COPY_HORIZON_NS`. It counts once, at its earliest log time; if one recording has it n times and
+another m times, it counts max(n, m) times. Equal messages of one recording are no copies.
 
-A latched message is received again by each new recording: it counts at its earliest log time,
+A latched message is received again by each new recording. It counts at its earliest log time,
 however long ago that is.
 """
 
@@ -49,13 +48,13 @@ class Unit:
     Attributes:
         key: tells units of one scan apart.
         table: the rows, ordered by log time.
-        first: the earliest log time, inclusive.
-        last: the latest, inclusive.
-        load: returns one of the columns that every part may have; None where it has none.
-        numbers: of its bags of which rows count, as the part has them; at least one.
-        bag_of: returns the bag of such a number.
-        part: the number of the part; None where it is none, or may be replaced.
-        all_count: whether these are all of its bags.
+        first: the earliest log time (ns), inclusive.
+        last: the latest log time (ns), inclusive.
+        load: returns the column at a path such as `LOG_TIME`; None if the unit has no such column.
+        numbers: the numbers, in the unit, of the bags whose rows count; at least one.
+        bag_of: returns the bag with such a number.
+        part: the number of the part; None for a bag, and for a part that may be replaced.
+        all_count: whether the rows of all its bags count.
     """
 
     key: object
@@ -70,7 +69,7 @@ class Unit:
 
     @cached_property
     def first_bag(self) -> BagFile:
-        """The first bag of which rows count; all are of one recording."""
+        """The first bag whose rows count; all are of one recording."""
         return self.bag_of(int(self.numbers[0]))
 
     def times(self) -> IntArray:
@@ -78,16 +77,16 @@ class Unit:
         return self._column(LOG_TIME)
 
     def identities(self) -> tuple[IntArray, IntArray] | None:
-        """Returns publish times and hashes of payloads; None where they are not known."""
+        """Returns the publish times (ns) and payload hashes of the rows; None if not known."""
         delays, hashes = self.load(DELAY), self.load(PAYLOAD_HASH)
         return None if delays is None or hashes is None else (self.times() - delays, hashes)
 
     def bag_numbers(self) -> IntArray:
-        """Returns for each row the number of its bag."""
+        """Returns the number of each row's bag."""
         return self._column(BAG)
 
     def counting(self) -> Flags | None:
-        """Returns which rows are of bags that count; None: all are."""
+        """Returns which rows are of bags that count; None if all are."""
         return None if self.all_count else np.isin(self.bag_numbers(), self.numbers)
 
     def _column(self, path: str) -> IntArray:
@@ -108,12 +107,13 @@ class BagUnit(Unit):
             PAYLOAD_HASH: table.payload_hashes,
             BAG: zeros,
         }
-        key, span = (bag.file, nth), (int(times[0]), int(times[-1]))
-        super().__init__(key, table, *span, columns.get, zeros[:1], lambda _: bag)
+        first, last = int(times[0]), int(times[-1])
+        key = (bag.file, nth)
+        super().__init__(key, table, first, last, columns.get, zeros[:1], lambda _: bag)
 
     @cached_property
     def memory_bytes(self) -> int:
-        """As that of its table, counted once: that goes through all of its texts."""
+        """Its table's memory, computed once: that goes through all texts."""
         return self.table.memory_bytes
 
 
@@ -122,9 +122,9 @@ class Rows:
     """The rows of one table that count, ordered by log time.
 
     Attributes:
-        unit: has the table; not all of its rows need count.
-        find: returns which count, when it is first asked for; see `index`.
-        may_match: whether some may be wanted, as far as zones tell.
+        unit: has the table, and perhaps rows that do not count.
+        find: returns `index`; called when that is first used.
+        may_match: whether some rows may be wanted, by the zones of the part.
     """
 
     unit: Unit
@@ -133,7 +133,7 @@ class Rows:
 
     @classmethod
     def of(cls, unit: Unit, index: IntArray) -> Rows:
-        """Returns some rows of a unit."""
+        """Returns the rows of a unit at some ascending positions."""
         return cls(unit, lambda: index)
 
     @property
@@ -143,7 +143,7 @@ class Rows:
 
     @cached_property
     def index(self) -> IntArray | None:
-        """Which of the table's rows count, ascending; None: all."""
+        """The positions of the table's rows that count, ascending; None if all do."""
         return self.find()
 
     def __len__(self) -> int:
@@ -158,13 +158,15 @@ class Rows:
 
     @property
     def part(self) -> int | None:
-        """The number of the whole part of which all rows count; None where it is not so."""
+        """The number of the part, if it is whole and all of its rows count; else None."""
         return self.unit.part if self.index is None else None
 
     def part_between(self, start: Ns, stop: Ns) -> int | None:
-        """Returns the number of the whole part of which all rows at these log times count.
+        """Returns the number of the part if it is whole and all its rows in a span count.
 
-        Those from `start` until before `stop`. None where it is not so.
+        Args:
+            start: log time (ns), inclusive.
+            stop: log time (ns), exclusive.
         """
         if self.unit.part is None or self.index is None:
             return self.unit.part
@@ -179,7 +181,7 @@ class Rows:
 
     @property
     def order(self) -> tuple[str, str, Ns, Ns, tuple[Ns, Ns, str]]:
-        """Sorts tables whose rows have one log time: by recording, as copies, type and bag."""
+        """The key by which tables with rows of one log time are sorted: first by recording."""
         bag = self.unit.first_bag
         span = self.unit.first, self.unit.last
         return str(bag.recording), self.table.channel.type, *span, in_time(bag)
@@ -205,7 +207,8 @@ class Rows:
     def bag_rows(self, among: Container[str] | None = None) -> Iterator[tuple[BagFile, IntArray]]:
         """Yields each bag with the positions of its rows among those that count, ascending.
 
-        With `among` of these files alone.
+        Args:
+            among: the files of the bags that are wanted; None for all.
         """
         numbers = self.unit.bag_numbers()
         if self.index is not None:
@@ -217,7 +220,7 @@ class Rows:
 
     @property
     def ranks(self) -> IntArray:
-        """For each row that counts, how many rows of its bag have its log time and precede it."""
+        """How many rows with the same bag and log time precede each row that counts."""
         times, numbers = self.unit.times(), self.unit.bag_numbers()
         index = np.arange(times.size) if self.index is None else self.index
         # Rows of one log time follow each other: those of other times are not looked at.
@@ -234,7 +237,7 @@ class Rows:
         return ranks[index - begin]
 
     def some(self, positions: IntArray) -> Rows:
-        """Returns some of the rows, by their ascending positions among those that count."""
+        """Returns the rows at some ascending positions among those that count."""
         index = positions if self.index is None else self.index[positions]
         return Rows.of(self.unit, index)
 
@@ -248,13 +251,13 @@ class Rows:
 
 
 class Identities(NamedTuple):
-    """What tells messages apart, of messages of one topic.
+    """What tells messages of one topic apart.
 
     Attributes:
         log_times: ns.
         publish_times: ns.
         hashes: of the payloads.
-        recordings: a number for the recording of each.
+        recordings: a number for the recording of each message.
     """
 
     log_times: IntArray
@@ -263,39 +266,44 @@ class Identities(NamedTuple):
     recordings: IntArray
 
     def rows(self, positions: IntArray) -> Identities:
-        """Returns some of them."""
+        """Returns those of the messages at some positions."""
         return Identities(*(column[positions] for column in self))
 
 
 def copies_among(messages: Identities) -> Flags:
-    """Returns which of the messages repeat an earlier one of another recording.
+    """Returns which messages repeat an earlier one of another recording.
 
-    Of several of one log time that of the recording with the lowest number counts.
+    Of messages with one log time that of the recording with the lowest number counts.
     """
-    copies = np.zeros(messages.log_times.size, np.bool_)
+    is_copy = np.zeros(messages.log_times.size, np.bool_)
     suspects = _shared_by_recordings(messages)
     suspected = messages.rows(suspects)
     order = suspects[np.lexsort((suspected.recordings, suspected.log_times))]
+    # For each message how often each recording had it lately; and when one more of it counted.
     counts: dict[tuple[int, int], dict[int, int]] = {}
-    recent: deque[tuple[Ns, tuple[int, int]]] = deque()
+    counted: deque[tuple[Ns, tuple[int, int]]] = deque()
     columns = (column.tolist() for column in messages.rows(order))
     rows = zip(order.tolist(), *columns, strict=True)
     for row, time, published, payload, recording in rows:
-        while recent and recent[0][0] < time - COPY_HORIZON_NS:
-            counts.pop(recent.popleft()[1], None)
-        key = (published, payload)
-        by_recording = counts.setdefault(key, {})
+        while counted:
+            counted_at, message = counted[0]
+            if counted_at >= time - COPY_HORIZON_NS:
+                break
+            counted.popleft()
+            counts.pop(message, None)
+        message = (published, payload)
+        by_recording = counts.setdefault(message, {})
         most = max(by_recording.values(), default=0)
         by_recording[recording] = by_recording.get(recording, 0) + 1
         if by_recording[recording] > most:
-            recent.append((time, key))
+            counted.append((time, message))
         else:
-            copies[row] = True
-    return copies
+            is_copy[row] = True
+    return is_copy
 
 
 def repeated_among(messages: Identities) -> Flags:
-    """Returns which messages were received again: late, and before by another recording."""
+    """Returns which messages were received late, after another recording had received them."""
     order = np.lexsort(
         (messages.recordings, messages.log_times, messages.hashes, messages.publish_times)
     )

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-ZoneOf: TypeAlias = "Callable[[T], Zone | Zones | None]"
-"""Returns the zone of a column or leaf: that of one part, or those of several; None if unknown."""
+ZonesOf: TypeAlias = "Callable[[T], Zones | None]"
+"""Returns the zones of a column or leaf in one part or in several; None if they are unknown."""
 
 _EXACT_BELOW: Final = 2**53
 """Whole numbers below this are floats."""
@@ -277,9 +277,17 @@ class Values:
         return max(self.table.error(leaf.level.full(path)) for path in leaf.sources)
 
     def zone(self, leaf: Leaf) -> Zone | None:
-        """Returns the zone of a leaf; None if it is not known."""
-        zone = zone_of(leaf, self.table.zone)
-        return zone if isinstance(zone, Zone) else None
+        """Returns the zone of the first source of a leaf; None if it is not known."""
+        return self.table.zone(leaf.level.full(leaf.sources[0]))
+
+    def zones(self, leaf: Leaf) -> Zones | None:
+        """Returns the zone of a leaf, as that of a single part; None if it is not known."""
+
+        def of_column(path: str) -> Zones | None:
+            zone = self.table.zone(path)
+            return None if zone is None else Zones.of([0], [zone])
+
+        return zones_of(leaf, of_column)
 
     def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> LeafNumbers:
         """Returns one of the angles (degrees) of quaternions."""
@@ -314,39 +322,30 @@ def _exact_angles(quaternions: Sequence[Floats], positions: IntArray, name: str)
     return angles
 
 
-def zone_of(leaf: Leaf, zone: ZoneOf[str]) -> Zone | Zones | None:
-    """Returns the zone of a leaf by the zones of its sources; None if it is not known.
+def zones_of(leaf: Leaf, of_column: ZonesOf[str]) -> Zones | None:
+    """Returns the zones of a leaf by those of its sources; None if they are not known.
 
     Args:
         leaf: the leaf.
-        zone: returns the zone of a column by its path, or its zones in several parts.
+        of_column: returns the zones of a column by its path.
     """
     if leaf.conversion in _ANGLES:
-        most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
-        return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG)
-    source_zone = zone(leaf.level.full(leaf.sources[0]))
-    if source_zone is None:
+        most = (90.0 if leaf.conversion is Conversion.PITCH else 180.0) + _ROUNDING_DEG
+        return Zones.between(-most, most)
+    zones = of_column(leaf.level.full(leaf.sources[0]))
+    if zones is None:
         return None
     if leaf.is_of_array and leaf.level.parent is not None:
-        lengths = zone(leaf.level.parent.full(f"{leaf.level.name}.length"))
-        return None if lengths is None else _with_long_arrays(source_zone, lengths)
+        lengths = of_column(leaf.level.parent.full(f"{leaf.level.name}.length"))
+        if lengths is None:
+            return None
+        # Where some arrays are too long for the column, they may have any number.
+        are_long = lengths.reaches(MAX_NUMBERS, above=True)
+        low = np.where(are_long, -math.inf, zones.low)
+        return zones._replace(low=low, high=np.where(are_long, math.inf, zones.high))
     if leaf.conversion is Conversion.SECONDS:
-        return source_zone.divided(NS_PER_S)
-    return source_zone
-
-
-def _with_long_arrays(numbers: Zone | Zones, lengths: Zone | Zones) -> Zone | Zones | None:
-    """Returns the zone of arrays of all lengths: without bounds where some have no column.
-
-    Args:
-        numbers: the zone of the arrays that are short enough for a column.
-        lengths: the zone of the lengths of all arrays.
-    """
-    are_long = lengths.reaches(MAX_NUMBERS, above=True)
-    if isinstance(numbers, Zones):
-        low = np.where(are_long, -math.inf, numbers.low)
-        return numbers._replace(low=low, high=np.where(are_long, math.inf, numbers.high))
-    return None if are_long else numbers
+        return zones.divided(NS_PER_S)
+    return zones
 
 
 def seconds(times: Numeric) -> Floats:

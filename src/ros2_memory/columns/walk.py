@@ -1,10 +1,9 @@
 """Reads all messages of a batch at once, field after field, with numpy.
 
-Each message has a position; every step reads one field (or run of fields) of all messages there and
-moves the positions on. The reads of a step may go past the end of their message: what shows it is
-that the position behind them does, since positions never go back. Then, and wherever rosbags would
-or might refuse a message, nothing of the walk is used: `NotWalkedError` leaves the whole batch to
-the decoder, which decides message by message.
+Each message has a position. A step reads one field, or a run of fields, of all messages at their
+positions and moves these on. It may read past the end of a message; since positions never go back,
+the position behind the field shows it. Then, and wherever rosbags might refuse a message,
+`NotWalkedError` leaves the whole batch to the decoder, which decides message by message.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from ros2_memory.columns.table import (
 )
 from ros2_memory.core.arrays import gathered, in_ranges
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.storage.base import SEQUENCE, Batch, IntArray
+from ros2_memory.storage.base import SEQUENCE, Batch, IntArray, Mask
 
 _MANY: Final = 500
 _FEW_ROWS: Final = 24
-"""Of more than `_MANY` elements, in fewer rows on average, each is sooner decoded alone than nth by
-nth."""
+"""If sequences have more than `_MANY` elements, and on average fewer rows than this have an nth
+one, the decoder is faster than a walk by nth elements."""
 _MANY_ROWS: Final = 100
-"""The rows of one text are found together where so many have it."""
+"""The rows that have the same text are found together if they are so many."""
 MAX_COUNTED_BYTES: Final = 256 << 10
 """In a larger message the decoder counts strings and messages, and may refuse it."""
 _HEADER_BYTES: Final = 4
@@ -50,17 +49,30 @@ class NotWalkedError(Exception):
 
 @dataclass(slots=True)
 class LevelColumns:
-    """The columns of messages, or of the elements of one sequence, while they are read."""
+    """The columns of messages, or of the elements of one sequence, while they are read.
+
+    Attributes:
+        columns: as of a `Table`.
+        elements: as of a `Table`.
+        left_out: as of a `Table`.
+    """
 
     columns: dict[str, Column] = field(default_factory=dict)
     elements: dict[str, Elements] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
 
     def add_elements(self, path: str, counts: IntArray, inner: LevelColumns) -> None:
-        """Adds a sequence, of which each row has so many elements."""
+        """Adds a sequence.
+
+        Args:
+            path: of the sequence.
+            counts: how many elements each row has.
+            inner: the columns of the elements.
+        """
         owners = np.repeat(np.arange(counts.size), counts)
         self.elements[path] = Elements(owners, inner.columns, inner.elements)
-        self.left_out |= {f"{path}.{below}": why for below, why in inner.left_out.items()}
+        for inner_path, reason in inner.left_out.items():
+            self.left_out[f"{path}.{inner_path}"] = reason
 
 
 def walked(plan: Plan, batch: Batch) -> LevelColumns:
@@ -83,26 +95,29 @@ def walked(plan: Plan, batch: Batch) -> LevelColumns:
         end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
     except (IndexError, UnicodeDecodeError) as error:
         raise NotWalkedError from error
-    left = rows.sizes - end
-    if left.min() < 0 or left.max() > _MAX_PADDING:
+    padding = rows.sizes - end
+    if padding.min() < 0 or padding.max() > _MAX_PADDING:
         raise NotWalkedError
     return level
 
 
 class _Bodies(NamedTuple):
-    """The bodies that are walked: where each message's begins in the buffer, and its bytes.
+    """The payloads of messages behind their headers. Positions and alignment count from there.
 
-    Positions count from there, since alignment does.
+    Attributes:
+        origins: where each begins in the buffer.
+        sizes: how many bytes each has.
     """
 
     origins: IntArray
     sizes: IntArray
 
-    def of(self, rows: IntArray) -> _Bodies:
-        return _Bodies(self.origins[rows], self.sizes[rows])
+    def rows(self, positions: IntArray) -> _Bodies:
+        return _Bodies(self.origins[positions], self.sizes[positions])
 
 
 def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
+    """Returns positions moved up to multiples of `align`, then on by `skip` bytes."""
     if align > 1:
         positions = (positions + (align - 1)) & -align
     return positions + skip if skip else positions
@@ -113,13 +128,13 @@ class _Walk:
     buffer: bytes
 
     def read(self, plan: Plan, rows: _Bodies, at: IntArray, level: LevelColumns | None) -> IntArray:
-        """Goes through messages that begin at these positions; returns where they end.
+        """Reads messages, or elements of a sequence; returns where they end.
 
         Args:
             plan: of their type.
-            rows: the messages that they lie in.
+            rows: the message that each lies in.
             at: where each begins.
-            level: takes the columns; None to find out where they end.
+            level: gets the columns; None if only the ends are needed.
         """
         for step in plan.steps:
             if isinstance(step, Run):
@@ -140,14 +155,15 @@ class _Walk:
         block = gathered(self.buffer, run.dtype, places)
         for nth, entry in enumerate(run.fields):
             if isinstance(entry, Array):
-                values = block[str(nth)] if entry.is_ranged else None
-                add_array(columns, entry, places.size, values)
+                add_array(columns, entry, places.size, block[str(nth)] if entry.is_ranged else None)
                 continue
-            read = block[str(nth)]
+            values = block[str(nth)]
             if isinstance(entry, Time):
-                columns[entry.path] = read["f0"] * np.int64(NS_PER_S) + read["f1"]
+                columns[entry.path] = values["f0"] * np.int64(NS_PER_S) + values["f1"]
+            elif entry.is_bool:
+                columns[entry.path] = values != 0
             else:
-                columns[entry.path] = read != 0 if entry.is_bool else np.ascontiguousarray(read)
+                columns[entry.path] = np.ascontiguousarray(values)
 
     def _length(
         self, step: Text | NumberSequence | Sequence, rows: _Bodies, at: IntArray
@@ -171,25 +187,36 @@ class _Walk:
         return end
 
     def _texts(self, places: IntArray, sizes: IntArray) -> Texts:
-        buffer, codes, words = self.buffer, np.zeros(places.size, np.uint32), list[bytes]()
+        """Returns the strings at some places of the buffer.
+
+        As long as the text of the first row is that of many rows, numpy finds them all; then the
+        rows that are left are looked up one by one.
+        """
+        codes = np.zeros(places.size, np.uint32)
+        code_of: dict[bytes, int] = {}
         left = np.arange(places.size)
-        equal = left
-        while left.size and equal.size >= _MANY_ROWS:
-            begin, size = int(places[left[0]]), int(sizes[left[0]])
-            word, is_equal = buffer[begin : begin + size], sizes[left] == size
-            if size:
-                alike = gathered(buffer, np.dtype(f"V{size}"), places[left[is_equal]])
-                is_equal[is_equal] = alike == np.void(word)
+        is_frequent = left.size >= _MANY_ROWS
+        while left.size and is_frequent:
+            word, is_equal = self._rows_like_first(places[left], sizes[left])
             equal, left = left[is_equal], left[~is_equal]
-            codes[equal] = len(words)
-            words.append(word)
-        code_of = {word: code for code, word in enumerate(words)}
+            codes[equal] = len(code_of)
+            code_of[word] = len(code_of)
+            is_frequent = equal.size >= _MANY_ROWS
         ends = (places + sizes)[left].tolist()
         codes[left] = [
-            code_of.setdefault(buffer[begin:end], len(code_of))
+            code_of.setdefault(self.buffer[begin:end], len(code_of))
             for begin, end in zip(places[left].tolist(), ends, strict=True)
         ]
         return Texts(codes, tuple([word.decode() for word in code_of]))
+
+    def _rows_like_first(self, places: IntArray, sizes: IntArray) -> tuple[bytes, Mask]:
+        """Returns the first string, and which strings are equal to it."""
+        begin, size = int(places[0]), int(sizes[0])
+        word, is_equal = self.buffer[begin : begin + size], sizes == size
+        if size:
+            same_size = gathered(self.buffer, np.dtype(f"V{size}"), places[is_equal])
+            is_equal[is_equal] = same_size == np.void(word)
+        return word, is_equal
 
     def _read_numbers(
         self, step: NumberSequence, rows: _Bodies, at: IntArray, level: LevelColumns | None
@@ -206,7 +233,7 @@ class _Walk:
         return end
 
     def _values(self, step: NumberSequence, places: IntArray, counts: IntArray) -> Numbers:
-        """Returns the numbers of sequences, but of those that take too long to look at."""
+        """Returns the numbers of all sequences of at most `MAX_RANGED_BYTES`."""
         is_short = counts * step.size <= MAX_RANGED_BYTES
         if not is_short.all():
             places, counts = places[is_short], counts[is_short]
@@ -217,7 +244,7 @@ class _Walk:
             data = gathered(self.buffer, np.dtype(f"V{count * step.size}"), places).tobytes()
             return np.frombuffer(data, step.dtype)
         return gathered(
-            self.buffer, step.dtype, np.repeat(places, counts) + _within(counts) * step.size
+            self.buffer, step.dtype, np.repeat(places, counts) + _places_within(counts) * step.size
         )
 
     def _read_sequence(
@@ -231,21 +258,24 @@ class _Walk:
             raise NotWalkedError
         owners = np.repeat(np.arange(at.size), counts)
         if step.plan.ends:
-            begins, end = _steady(step.plan, at, counts, owners)
+            begins, end = _locate_fixed(step.plan, at, counts, owners)
         else:
-            begins, end = self._stepped(step.plan, rows, at, counts)
+            begins, end = self._locate_variable(step.plan, rows, at, counts)
         if (end > rows.sizes).any():
             raise NotWalkedError
         if level is not None:
             inner = LevelColumns()
-            self.read(step.plan, rows.of(owners), begins, inner)
+            self.read(step.plan, rows.rows(owners), begins, inner)
             level.add_elements(step.path, counts, inner)
         return end
 
-    def _stepped(
+    def _locate_variable(
         self, plan: Plan, rows: _Bodies, at: IntArray, counts: IntArray
     ) -> tuple[IntArray, IntArray]:
-        """Returns where elements of various sizes begin, and where their sequences end."""
+        """Returns where elements of various sizes begin, and where their sequences end.
+
+        The first elements of all sequences are read together, then the second ones, and so on.
+        """
         most, total = int(counts.max(initial=0)), int(counts.sum())
         if most > _MANY and total < _FEW_ROWS * most:
             raise NotWalkedError
@@ -255,42 +285,42 @@ class _Walk:
             left = np.flatnonzero(counts > nth)
             starts = _aligned(end[left], plan.align)
             begins[first[left] + nth] = starts
-            end[left] = self.read(plan, rows.of(left), starts, None)
+            end[left] = self.read(plan, rows.rows(left), starts, None)
         return begins, end
 
 
-def _steady(
+def _locate_fixed(
     plan: Plan, at: IntArray, counts: IntArray, owners: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Returns where elements of a fixed layout begin, and where their sequences end.
 
-    The first begins anywhere; behind it all are equally far apart, since the last field of the
-    strictest alignment puts whatever follows it at the same distance from a multiple.
+    From the second element on all are equally far apart, since the last field of the strictest
+    alignment puts whatever follows it at the same distance from a multiple.
     """
     unit, ends = plan.unit, np.array(plan.ends)
     first = _aligned(at, plan.align)
     rest = first % unit
     second = _aligned(first - rest + ends[rest], plan.align)
-    steady = second % unit
-    step = _aligned(ends[steady], plan.align) - steady
-    nth = _within(counts)
-    begins = np.where(nth == 0, first[owners], second[owners] + (nth - 1) * step[owners])
-    last = np.where(counts > 1, second + (counts - 2) * step, first)
+    rest = second % unit
+    distance = _aligned(ends[rest], plan.align) - rest
+    nth = _places_within(counts)
+    begins = np.where(nth == 0, first[owners], second[owners] + (nth - 1) * distance[owners])
+    last = np.where(counts > 1, second + (counts - 2) * distance, first)
     end = last - last % unit + ends[last % unit]
     return begins, np.where(counts > 0, end, at)
 
 
-def _within(counts: IntArray) -> IntArray:
+def _places_within(counts: IntArray) -> IntArray:
     """Returns the numbers from 0 up to each count, exclusive, one after the other."""
     return in_ranges(np.zeros_like(counts), counts)
 
 
 def entries_of_codes(entries: IntArray, codes: IntArray) -> tuple[IntArray, IntArray]:
-    """Returns how many entries each of some codes has, and their positions, one after the other.
+    """Returns how many entries have each code, and the positions of these entries.
 
     Args:
         entries: the code of each entry, ascending.
-        codes: may occur several times.
+        codes: the codes to look for; one may occur several times.
     """
     begins = np.searchsorted(entries, codes)
     counts = np.searchsorted(entries, codes, side="right") - begins
@@ -300,13 +330,13 @@ def entries_of_codes(entries: IntArray, codes: IntArray) -> tuple[IntArray, IntA
 def add_sequence(
     level: LevelColumns, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
 ) -> None:
-    """Adds the lengths, the ranges and the short arrays of a sequence of numbers.
+    """Adds the columns of a sequence of numbers: lengths, ranges and short arrays.
 
     Args:
-        level: takes it.
+        level: gets the columns.
         path: of the sequence.
-        counts: the numbers of each row.
-        values: those of the rows that take no more than `MAX_RANGED_BYTES`, in order.
+        counts: how many numbers each row has.
+        values: the numbers of the rows that take at most `MAX_RANGED_BYTES`, in order.
         is_bool: whether they are booleans.
     """
     if is_bool:
@@ -314,8 +344,8 @@ def add_sequence(
     is_ranged = counts * values.itemsize <= MAX_RANGED_BYTES
     add_ranges(level.columns, path, counts, np.where(is_ranged, counts, 0), values)
     is_short = counts <= MAX_NUMBERS
-    is_held = np.repeat(is_short[is_ranged], counts[is_ranged])
-    numbers = values if is_held.all() else values[is_held]
+    is_of_short = np.repeat(is_short[is_ranged], counts[is_ranged])
+    numbers = values if is_of_short.all() else values[is_of_short]
     owners = np.repeat(np.arange(counts.size), np.where(is_short, counts, 0))
     level.elements[path] = Elements(owners, {"": numbers.view(np.bool_) if is_bool else numbers})
     if not is_short.all():
@@ -323,7 +353,7 @@ def add_sequence(
 
 
 def add_array(columns: dict[str, Column], entry: Array, rows: int, values: Numbers | None) -> None:
-    """Adds the columns of a fixed array: its length, and the range of its numbers, if given."""
+    """Adds the columns of a fixed array: its length, and its range if `values` are given."""
     lengths = np.full(rows, entry.length)
     if values is None:
         columns[f"{entry.path}.length"] = lengths.astype(np.uint32)
@@ -337,9 +367,14 @@ def add_array(columns: dict[str, Column], entry: Array, rows: int, values: Numbe
 def add_ranges(
     columns: dict[str, Column], path: str, lengths: IntArray, counts: IntArray, values: Numbers
 ) -> None:
-    """Adds the lengths of arrays, and the least and greatest finite number of each.
+    """Adds the lengths of arrays, and the least and greatest finite number of each, or NaN.
 
-    Those are NaN where there is none; `counts` of the `values` are of each.
+    Args:
+        columns: gets the columns.
+        path: of the arrays.
+        lengths: of the arrays.
+        counts: how many of `values` each array has; 0 if it is too long to be looked at.
+        values: the numbers, array after array.
     """
     columns[f"{path}.length"] = lengths.astype(np.uint32)
     has_values = counts > 0

@@ -27,14 +27,14 @@ _ANY: Final = -1
 
 
 class Zones(NamedTuple):
-    """The zones of one column in several parts: what `Zone` is of one.
+    """The zones of one column in several parts.
 
     Attributes:
         parts: the numbers of the parts, ascending.
-        low: no value of the part is less; infinity where it has none.
-        high: no value is greater; minus infinity where it has none.
-        codes: which of `words` are those of the part; -1: any may be there.
-        words: the different ones, as `Zone.words`.
+        low: a bound that no value of the part is below; infinity if it has none.
+        high: a bound that no value of the part is above; minus infinity if it has none.
+        codes: the place in `words` of the part's words; -1 if any text may be there.
+        words: the distinct `Zone.words` of the parts.
     """
 
     parts: IntArray
@@ -45,7 +45,7 @@ class Zones(NamedTuple):
 
     @classmethod
     def of(cls, parts: Sequence[int], zones: Sequence[Zone]) -> Zones:
-        """Returns the zones of some parts, whose numbers ascend."""
+        """Returns the zones of parts, whose numbers ascend."""
         code_of: dict[str, int] = {}
         codes = [
             _ANY if zone.words is None else code_of.setdefault(zone.words, len(code_of))
@@ -59,11 +59,16 @@ class Zones(NamedTuple):
             tuple(code_of),
         )
 
+    @classmethod
+    def between(cls, low: float, high: float) -> Zones:
+        """Returns the zone of a column with known bounds, which is the same in all parts."""
+        return cls.of([0], [Zone(low, high)])
+
     def among(self, parts: IntArray) -> Zones:
-        """Returns the zones of some parts, in their order; of one that is not known, any value."""
+        """Returns the zones of some parts, in their order; unknown ones may have any value."""
         if not self.parts.size:
-            nothing = np.full(parts.size, math.inf)
-            return Zones(parts, -nothing, nothing, np.full(parts.size, _ANY))
+            infinities = np.full(parts.size, math.inf)
+            return Zones(parts, -infinities, infinities, np.full(parts.size, _ANY))
         at = np.minimum(np.searchsorted(self.parts, parts), self.parts.size - 1)
         is_known = self.parts[at] == parts
         return Zones(
@@ -75,10 +80,10 @@ class Zones(NamedTuple):
         )
 
     def joined(self, newer: Zones) -> Zones:
-        """Returns these and those of newer parts."""
+        """Returns these zones and those of newer parts."""
         code_of = {words: code for code, words in enumerate(self.words)}
         newer_codes = [code_of.setdefault(words, len(code_of)) for words in newer.words]
-        recoded = np.array([*newer_codes, _ANY], np.int64)  # the last stands for -1, too
+        recoded = np.array([*newer_codes, _ANY], np.int64)  # at the end, so for code -1: -1
         return Zones(
             np.concatenate((self.parts, newer.parts)),
             np.concatenate((self.low, newer.low)),
@@ -92,27 +97,27 @@ class Zones(NamedTuple):
         return self._replace(low=self.low / by, high=self.high / by)
 
     def spans(self, number: float) -> Flags:
-        """Returns in which parts a number may be a value."""
+        """Returns which parts may have a number as a value."""
         at = as_float(number)
         return (self.low <= at) & (at <= self.high)
 
     def reaches(self, limit: float, *, above: bool) -> Flags:
-        """Returns in which parts some value may lie above a limit, or below it."""
+        """Returns which parts may have a value above a limit, or else below it."""
         # An integer that no float reaches is below infinity all the same.
         at = min(max(as_float(limit), -sys.float_info.max), sys.float_info.max)
         return self.high > at if above else self.low < at
 
     def may_be_near(self, place: float, distance: float) -> Flags:
-        """Returns in which parts some value may be within a distance of a place."""
+        """Returns which parts may have a value within a distance of a place."""
         return (self.low - place <= distance) & (place - self.high <= distance)
 
     def may_have(self, text: str) -> Flags:
-        """Returns in which parts a casefolded text may be part of a value."""
+        """Returns which parts may have a value that contains a casefolded text."""
         return self._where(lambda words: may_be_in(words, text))
 
     @property
     def may_be_json(self) -> Flags:
-        """In which parts a text may be a JSON array or object."""
+        """Which parts may have a text that is a JSON array or object."""
         return self._where(lambda words: may_be_in(words, "[") or may_be_in(words, "{"))
 
     @property
@@ -121,7 +126,7 @@ class Zones(NamedTuple):
         return 32 * self.parts.size + sum(60 + len(words) for words in self.words)
 
     def _where(self, may_have: Callable[[str], bool]) -> Flags:
-        """Returns in which parts words may have something; these may be few of many."""
+        """Returns which parts have words of which `may_have` is true, or unknown words."""
         flags = np.ones(len(self.words) + 1, np.bool_)
         for code in np.unique(self.codes[self.codes != _ANY]).tolist():
             flags[code] = may_have(self.words[code])
@@ -129,12 +134,12 @@ class Zones(NamedTuple):
 
 
 class PartZones(NamedTuple):
-    """What is known of some parts of one topic without reading any.
+    """Some parts of one topic, of which only zones are read.
 
     Attributes:
-        topic: what they are of.
+        topic: the topic.
         numbers: of the parts.
-        zones: returns the zones of a column, by its path.
+        zones: returns the zones of a column by its path.
     """
 
     topic: Topic
@@ -153,7 +158,7 @@ class PartZones(NamedTuple):
 
     @property
     def left_out(self) -> Mapping[str, str]:
-        """Which fields have no column, as of a table."""
+        """Which fields have no column; see `Table.left_out`."""
         return self.topic.layout.left_out
 
     def zone(self, path: str) -> Zones:
@@ -162,7 +167,7 @@ class PartZones(NamedTuple):
 
 
 def _bounds(values: Sequence[float], away: float) -> Floats:
-    """Returns bounds as floats: where these are rounded, the next one farther out."""
+    """Returns bounds as floats; those that are rounded are moved one float farther away."""
     bounds = np.array([float(value) for value in values], np.float64)
     is_rounded = (np.abs(bounds) >= _EXACT_BELOW) & np.isfinite(bounds)
     with np.errstate(over="ignore"):  # beyond the greatest float lies infinity
