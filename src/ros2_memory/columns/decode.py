@@ -371,8 +371,8 @@ class Group:
 
     def _decoded(
         self, waiting: Sequence[_Undecoded], buffer: bytes, begins: Mapping[int, int]
-    ) -> Iterator[Table]:
-        """Yields the tables of batches of one topic and plan.
+    ) -> list[Table]:
+        """Returns the tables of batches of one topic and plan.
 
         The reader decodes messages that cannot be walked.
 
@@ -395,21 +395,20 @@ class Group:
             bags=bags,
         )
         if kind.plan is None:
-            yield table
-            return
-        with suppress(NotWalkedError):
-            yield _with_columns(table, walked(kind.plan, batch))
-            return
-        if len(waiting) > 1:
-            for undecoded in waiting:
-                yield from self._decoded([undecoded], buffer, begins)
-            return
+            return [table]
         try:
-            yield joined(
-                [*_one_by_one(self.reader, kind.plan, batch, table, skip=self.skip_undecodable)]
-            )
+            return [_with_columns(table, walked(kind.plan, batch))]
+        except NotWalkedError:
+            if len(waiting) > 1:  # other batches may be walked
+                tables: list[Table] = []
+                for undecoded in waiting:
+                    tables += self._decoded([undecoded], buffer, begins)
+                return tables
+        try:
+            pieces = _one_by_one(self.reader, kind.plan, batch, table, skip=self.skip_undecodable)
+            return [joined([*pieces])]
         except UndecodableError as error:
-            yield table.without_columns(f"some cannot be decoded: {error.reason}")
+            return [table.without_columns(f"some cannot be decoded: {error.reason}")]
 
 
 def _pieces_of(batch: Batch) -> Iterator[Batch]:

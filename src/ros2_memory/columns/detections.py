@@ -695,12 +695,12 @@ def _with_places(
         axes = [values.numbers(leaf).values[at] for leaf in point.axes]
         place = np.stack(axes, axis=1).astype(np.float64)
         # All zeros means that nobody filled it in.
-        is_given = np.isfinite(place).all(axis=1) & place.any(axis=1)
-        is_given &= np.isnan(places[:, 0])
-        places = np.where(is_given[:, None], place, places)
-        own = _frames_at(values, level, positions, point.frames)
-        codes = np.where(is_given, own.codes + 1, 0).astype(np.uint32)
-        frames = _texts_or(Texts(codes, ("", *own.words)), frames)
+        is_valid = np.isfinite(place).all(axis=1) & place.any(axis=1)
+        is_new = is_valid & np.isnan(places[:, 0])
+        places = np.where(is_new[:, None], place, places)
+        point_frames = _frames_at(values, level, positions, point.frames)
+        codes = np.where(is_new, point_frames.codes + 1, 0).astype(np.uint32)
+        frames = _texts_or(Texts(codes, ("", *point_frames.words)), frames)
     return detections._replace(places=places, frames=frames)
 
 

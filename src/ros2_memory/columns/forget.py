@@ -126,9 +126,10 @@ def _delete_unused(base: sqlite3.Connection) -> None:
 def _executed(base: sqlite3.Connection, statement: str) -> bool:
     """Executes a statement; returns False if another program holds a lock."""
     try:
-        row = base.execute(statement).fetchone()
+        rows = base.execute(statement).fetchall()
     except sqlite3.OperationalError as error:
         if not is_busy(error):
             raise
         return False
-    return row is None or not row[0]
+    # A checkpoint returns whether it was blocked, VACUUM nothing.
+    return not any(is_blocked for is_blocked, *_ in rows)

@@ -119,14 +119,10 @@ class Packed:
 def pack(column: Column, step: Step = EXACT) -> Packed:
     """Returns the column as bytes; floats are rounded to `step`."""
     if isinstance(column, Texts):
-        packed = _pack_texts(column)
-    elif not len(column):
+        return _pack_texts(column)
+    if not len(column):
         return Packed(f"{column.dtype.name} constant", 0, 0.0, Zone(), b"")
-    elif column.dtype.kind == "f":
-        packed = _pack_floats(column, step)
-    else:
-        packed = _pack_integers(column)
-    return _arranged(packed) if isinstance(packed, _Whole) else packed
+    return _pack_floats(column, step) if column.dtype.kind == "f" else _pack_integers(column)
 
 
 def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
@@ -199,38 +195,21 @@ def decompressed(data: bytes) -> bytes:
         raise ValueError(f"packed columns cannot be decompressed: {error}") from error
 
 
-class _Whole(NamedTuple):
-    """A column as whole numbers that are not arranged yet.
-
-    Attributes:
-        form: the first words of the codec.
-        error: as of `Packed`.
-        zone: as of `Packed`.
-        numbers: the whole numbers; the least of them is 0.
-        head: bytes before those of the numbers.
-    """
-
-    form: str
-    error: float
-    zone: Zone
-    numbers: IntArray
-    head: bytes = b""
-
-
-def _pack_integers(column: Numbers) -> Packed | _Whole:
+def _pack_integers(column: Numbers) -> Packed:
     name, least, greatest = column.dtype.name, int(column.min()), int(column.max())
     zone = Zone(least, greatest)
     if least == greatest:
         return Packed(f"{name} constant", len(column), 0.0, zone, b"")
     # Unsigned ones of 2**63 and more wrap around, here and back.
-    return _Whole(f"{name} whole", 0.0, zone, column.reshape(-1).astype(np.int64) - _wrapped(least))
+    numbers = column.reshape(-1).astype(np.int64) - _wrapped(least)
+    return _arranged(f"{name} whole", numbers, zone)
 
 
 # Floats
 
 
 @np.errstate(invalid="ignore")  # of signalling NaNs
-def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
+def _pack_floats(column: Numbers, step: Step) -> Packed:
     """Returns a column as multiples of its step, or with fewer bits, or else exactly."""
     values = column.astype(np.float64, copy=False)
     zone = _zone_of(values)
@@ -247,13 +226,13 @@ def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
         errors = np.abs(back.astype(np.float64, copy=False) - values)
         if not step.relative or _are_small(errors, values):
             whole = (multiples - multiples.min()).astype(np.int64)
-            return _Whole(f"{name} /{per_unit}", float(errors.max()), zone, whole)
+            return _arranged(f"{name} /{per_unit}", whole, zone, float(errors.max()))
     if step.relative:
         whole = _ordered(column, rounded=True)
         back = _from_ordered(whole, column.dtype, rounded=True)
         errors = np.abs(back.astype(np.float64, copy=False) - values)
         if _are_small(errors, values):
-            return _Whole(f"{name} rounded", float(errors.max()), zone, whole - whole.min())
+            return _arranged(f"{name} rounded", whole - whole.min(), zone, float(errors.max()))
     return _exactly(column, zone)  # tiny numbers have no bits to spare
 
 
@@ -269,9 +248,9 @@ def _are_small(errors: Floats, values: Floats) -> bool:
     return not (errors > MOST_RELATIVE * np.abs(values)).any()
 
 
-def _exactly(column: Numbers, zone: Zone) -> _Whole:
+def _exactly(column: Numbers, zone: Zone) -> Packed:
     whole = _ordered(column)
-    return _Whole(f"{column.dtype.name} bits", 0.0, zone, whole - whole.min())
+    return _arranged(f"{column.dtype.name} bits", whole - whole.min(), zone)
 
 
 def _zone_of(values: Floats) -> Zone:
@@ -323,10 +302,19 @@ def _from_ordered(
 # Whole numbers
 
 
-def _arranged(column: _Whole) -> Packed:
-    """Returns a column arranged flat or as differences, whichever takes fewer bits."""
-    flat = written = column.numbers
-    name, head = "flat", column.head
+def _arranged(
+    form: str, flat: IntArray, zone: Zone, error: float = 0.0, head: bytes = b""
+) -> Packed:
+    """Returns whole numbers arranged flat or as differences, whichever takes fewer bits.
+
+    Args:
+        form: the first words of the codec.
+        flat: the whole numbers; the least of them is 0.
+        zone: of the column.
+        error: of the column.
+        head: bytes before those of the numbers.
+    """
+    name, written = "flat", flat
     if int(flat.view(np.uint64).max()) < _FAR_APART:
         slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
         delta = np.diff(flat) - slope
@@ -337,8 +325,7 @@ def _arranged(column: _Whole) -> Packed:
     greatest = int(written.view(np.uint64).max(initial=0))
     width = (greatest.bit_length() + 7) // 8
     data = head + byte_planes(written, width)
-    codec = f"{column.form} {name} {width}"
-    return Packed(codec, len(flat), column.error, column.zone, data)
+    return Packed(f"{form} {name} {width}", len(flat), error, zone, data)
 
 
 def _bits_of(numbers: Numbers) -> float:
@@ -405,7 +392,7 @@ def from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
 # Texts
 
 
-def _pack_texts(column: Texts) -> Packed | _Whole:
+def _pack_texts(column: Texts) -> Packed:
     if not np.bincount(column.codes, minlength=len(column.words)).all():
         # Words of deleted rows must not stay in the file.
         column = column.rows(np.arange(len(column)))
@@ -418,7 +405,7 @@ def _pack_texts(column: Texts) -> Packed | _Whole:
     head = struct.pack("<II", len(words), len(text)) + lengths.tobytes() + text
     if len(words) == 1:
         return Packed("text constant", len(codes), 0.0, zone, head)
-    return _Whole("text", 0.0, zone, codes.astype(np.int64), head)
+    return _arranged("text", codes.astype(np.int64), zone, head=head)
 
 
 def folded(words: Collection[str]) -> str | None:

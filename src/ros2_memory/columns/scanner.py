@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
-    from ros2_memory.columns.store import ColumnStore, PartHead
+    from ros2_memory.columns.store import ColumnStore, PartHead, State
     from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
@@ -260,22 +260,27 @@ class Scanner:
         """Returns the parts of a topic that may have rows in a window."""
         if self.store is None:
             return []
-        state = coverage.state
         cached = self.caches.heads.get(topic)
         if cached is None or cached.coverage is not coverage:
             failures = self.store.failures
-            heads: list[PartHead] = []
-            if cached is not None and cached.coverage.state.deletion == state.deletion:
-                heads = [*cached.heads]
-            if cached is None or cached.coverage.state != state:
-                newest = max((head.number for head in heads), default=0)
-                heads += self.store.parts(topic, newest)
-                heads.sort(key=lambda head: (head.first, head.number))
+            heads = self._read_heads(self.store, topic, coverage.state)
             cached = _Heads.of(heads, coverage)
             if self.store.failures == failures:
                 size = sum(_HEAD_BYTES + head.bags.nbytes for head in heads)
                 self.caches.heads.put(topic, cached, 1000 + size)
         return cached.within(window)
+
+    def _read_heads(self, store: ColumnStore, topic: str, state: State) -> list[PartHead]:
+        """Returns the parts of a topic in a state; reads only those that are not in the cache."""
+        cached = self.caches.heads.get(topic)
+        heads: list[PartHead] = []
+        if cached is not None and cached.coverage.state.deletion == state.deletion:
+            heads += cached.heads
+            if cached.coverage.state == state:
+                return heads
+        newest = max((head.number for head in heads), default=0)
+        heads += store.parts(topic, newest)
+        return sorted(heads, key=lambda head: (head.first, head.number))
 
     def matching(
         self, heads: Sequence[PartHead], may_match: Callable[[PartZones], bool | Mask]

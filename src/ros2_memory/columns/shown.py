@@ -433,6 +433,7 @@ def leaves_of(node: Node, *, in_objects: bool = True) -> list[Leaf]:
     nodes = [*conditions.leaves(node, in_objects=in_objects)]
     if UNKNOWN in nodes:
         raise UnknownShapeError("it depends on the message")
+    # The last one comes first there.
     return [leaf for leaf in reversed(nodes) if isinstance(leaf, Leaf)]
 
 

@@ -287,14 +287,14 @@ class ColumnStore(Database):
 
     def numbers(self) -> IntArray:
         """Returns the numbers of all bags, unfinished ones included."""
-        none: list[int] = []
-        ids = self._select(lambda rows: [row for (row,) in rows], none, "SELECT id FROM bag")
-        return np.array(ids, np.int64) + self.offset
+        return (
+            np.array(self._select_column(list[int](), "SELECT id FROM bag"), np.int64) + self.offset
+        )
 
     def below(self, level: Level) -> frozenset[int]:
         """Returns the numbers of the bags that have parts below a level."""
-        return self._select(
-            lambda rows: frozenset(self.offset + row for (row,) in rows), frozenset(), BELOW, level
+        return frozenset(
+            self.offset + bag for bag in self._select_column(list[int](), BELOW, level)
         )
 
     def dropped(self) -> dict[str, Ns]:
@@ -307,8 +307,9 @@ class ColumnStore(Database):
 
     def oldest(self) -> Ns | None:
         """Returns the earliest log time (ns) of any bag; None without one."""
-        query, none = "SELECT min(first_ns) FROM bag", list[tuple[Ns | None]]()
-        return next((first for (first,) in self._select(list, none, query)), None)
+        return next(
+            iter(self._select_column(list[Ns | None](), "SELECT min(first_ns) FROM bag")), None
+        )
 
     def beginning_before(self, before: Ns) -> list[BagKey]:
         """Returns the bags whose first message is earlier than a log time (ns)."""
@@ -317,7 +318,7 @@ class ColumnStore(Database):
 
     def paths(self) -> list[str]:
         """Returns the paths of all bags, unfinished ones included."""
-        return self._select(lambda rows: [path for (path,) in rows], [], "SELECT path FROM bag")
+        return self._select_column([], "SELECT path FROM bag")
 
     def topics(self) -> dict[int, Topic]:
         """Returns all topics that were ever stored, by their numbers."""
@@ -407,13 +408,7 @@ class ColumnStore(Database):
             " LEFT JOIN part_column AS other ON other.part = own.part AND other.path = own.same"
             " WHERE own.part = ? AND own.path = ?"
         )
-        none: bytes | None = None
-        return self._select(
-            lambda rows: next((data for (data,) in rows), None),
-            none,
-            query,
-            *(part - self.offset, path),
-        )
+        return next(iter(self._select_column(list[bytes](), query, part - self.offset, path)), None)
 
     def fragments(
         self, kind: str, key: FragmentKey, also_before: Ns = 0
@@ -458,7 +453,7 @@ class ColumnStore(Database):
             " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
             " ORDER BY start_ns DESC"
         )
-        return self._select(lambda rows: [start for (start,) in rows], [], query, reading)
+        return self._select_column([], query, reading)
 
     def listings(self) -> dict[str, str]:
         """Returns what each `metadata.yaml` lists, by its folder's path as in a `BagKey`."""
@@ -469,6 +464,10 @@ class ColumnStore(Database):
     ) -> T:
         """Returns what is made of the rows of a query; `unknown` if the file cannot be read."""
         return self.read(lambda connection: make(connection.execute(query, given)), unknown)
+
+    def _select_column(self, nothing: list[T], query: str, *given: str | int) -> list[T]:
+        """Returns the one column of a query; `nothing` if the file cannot be read."""
+        return self._select(lambda rows: [value for (value,) in rows], nothing, query, *given)
 
     def _ids(self, parts: Iterable[int]) -> str:
         return json.dumps([part - self.offset for part in parts])

@@ -331,7 +331,7 @@ def zones_of(leaf: Leaf, of_column: ZonesOf[str]) -> Zones | None:
     """
     if leaf.conversion in _ANGLES:
         most = (90.0 if leaf.conversion is Conversion.PITCH else 180.0) + _ROUNDING_DEG
-        return Zones.between(-most, most)
+        return Zones.of([0], [Zone(-most, most)])  # the same for all parts
     zones = of_column(leaf.level.full(leaf.sources[0]))
     if zones is None:
         return None

@@ -59,11 +59,6 @@ class Zones(NamedTuple):
             tuple(code_of),
         )
 
-    @classmethod
-    def between(cls, low: float, high: float) -> Zones:
-        """Returns the zone of a column with known bounds, which is the same in all parts."""
-        return cls.of([0], [Zone(low, high)])
-
     def among(self, parts: IntArray) -> Zones:
         """Returns the zones of some parts, in their order; unknown ones may have any value."""
         if not self.parts.size:
