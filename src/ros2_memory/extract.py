@@ -403,7 +403,7 @@ class SchemaExtractor:
 
     def _whole(self, rendering: ExactJson, message: object, type_name: str) -> JsonValue:
         nodes = {
-            name: _converted(name, self._at(message, path))
+            name: _convert(name, self._at(message, path))
             for name, path in self.plan(type_name).fields.items()
         }
         absent = [name for name, node in nodes.items() if node is ABSENT]
@@ -423,7 +423,7 @@ class SchemaExtractor:
         segments = tuple(path.split("."))
         mapped, node = plan.fields.get(segments[0]), ABSENT
         if mapped is not None:
-            node = descend(_converted(segments[0], self._at(message, mapped)), segments[1:], view)
+            node = descend(_convert(segments[0], self._at(message, mapped)), segments[1:], view)
         elif not plan.fields:
             node = descend(message, segments, view)
         if node is ABSENT:
@@ -519,7 +519,7 @@ def _px4_frame(route: Route | None, message: object, names: Mapping[int, str]) -
     return "" if frame is None or not math.isfinite(frame) else names.get(int(frame), "")
 
 
-def _converted(name: str, node: object) -> object:
+def _convert(name: str, node: object) -> object:
     """Returns the value of a name of the schema map: an array becomes a point or a rotation."""
     if not isinstance(node, np.ndarray):
         return node

@@ -33,10 +33,16 @@ from ros2_memory.columns.table import (
     Numbers,
     Table,
     Texts,
-    joined,
+    join_tables,
     order_of,
 )
-from ros2_memory.columns.walk import LevelColumns, NotWalkedError, add_array, add_sequence, walked
+from ros2_memory.columns.walk import (
+    LevelColumns,
+    NotWalkedError,
+    add_array,
+    add_sequence,
+    read_columns,
+)
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
@@ -331,7 +337,7 @@ class Group:
         following = Group(self.reader, self.skip_undecodable)
         room = GROUP_BYTES // 4
         for key, parts in self._tables.items():
-            [table] = _joined_alike(parts)  # of one bag
+            [table] = _join_alike(parts)  # of one bag
             begin = int(np.searchsorted(table.log_times, table.log_times[-1]))
             last = table.rows(np.arange(begin, len(table)))
             if last.memory_bytes <= room:
@@ -349,7 +355,7 @@ class Group:
         tables: list[Table] = []
         while self._tables:
             _, parts = self._tables.popitem()
-            tables += _joined_alike(parts)[::-1]
+            tables += _join_alike(parts)[::-1]
         return [table for table in reversed(tables) if len(table)]
 
     def _decode(self) -> None:
@@ -364,12 +370,12 @@ class Group:
             key = (first.topic, first.encoding, first.latched, first.schema)
             alike[key, plan, reason].append(undecoded)
         for (key, _, _), of_topic in alike.items():
-            for table in self._decoded(of_topic, buffer, begins):
+            for table in self._decode_alike(of_topic, buffer, begins):
                 if len(table):  # else no message could be decoded
                     self.memory_bytes += table.memory_bytes
                     self._tables.setdefault(key, []).append(table)
 
-    def _decoded(
+    def _decode_alike(
         self, waiting: Sequence[_Undecoded], buffer: bytes, begins: Mapping[int, int]
     ) -> list[Table]:
         """Returns the tables of batches of one topic and plan.
@@ -397,16 +403,16 @@ class Group:
         if kind.plan is None:
             return [table]
         try:
-            return [_with_columns(table, walked(kind.plan, batch))]
+            return [_with_columns(table, read_columns(kind.plan, batch))]
         except NotWalkedError:
             if len(waiting) > 1:  # other batches may be walked
                 tables: list[Table] = []
                 for undecoded in waiting:
-                    tables += self._decoded([undecoded], buffer, begins)
+                    tables += self._decode_alike([undecoded], buffer, begins)
                 return tables
         try:
             pieces = _one_by_one(self.reader, kind.plan, batch, table, skip=self.skip_undecodable)
-            return [joined([*pieces])]
+            return [join_tables([*pieces])]
         except UndecodableError as error:
             return [table.without_columns(f"some cannot be decoded: {error.reason}")]
 
@@ -456,13 +462,13 @@ def _payload_hashes(batch: Batch, is_hashed: Mask) -> IntArray:
     return hashes
 
 
-def _joined_alike(parts: Sequence[Table]) -> list[Table]:
+def _join_alike(parts: Sequence[Table]) -> list[Table]:
     """Returns tables of one topic and definition, joined where they have the same columns.
 
     If some rows of a bag have no columns, the others lose theirs.
     """
     if len({part.left_out.get("") for part in parts}) == 1:
-        return [joined(parts)]
+        return [join_tables(parts)]
     reason_of: dict[int, str] = {}  # why a bag has no columns
     for part in parts:
         if "" in part.left_out:
@@ -474,7 +480,7 @@ def _joined_alike(parts: Sequence[Table]) -> list[Table]:
             rows = part.rows(np.flatnonzero(part.bag_numbers == number))
             reason = reason_of.get(number)
             by_reason[reason].append(rows if reason is None else rows.without_columns(reason))
-    return [*map(joined, by_reason.values())]
+    return [*map(join_tables, by_reason.values())]
 
 
 def _with_columns(table: Table, level: LevelColumns) -> Table:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.shown import UNKNOWN, ByType, Listing, Node, Shape, narrowed
+from ros2_memory.columns.shown import UNKNOWN, ByType, Listing, Node, Shape, with_limit
 from ros2_memory.columns.table import Table, Texts, joined_texts
 from ros2_memory.columns.values import (
     ROWS,
@@ -346,9 +346,9 @@ def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> 
 
     limit = Limit(labels.level, find_objects)
     if labels.is_best:
-        results = narrowed(node["results"], Limit(labels.scored.level, find_hypotheses))
+        results = with_limit(node["results"], Limit(labels.scored.level, find_hypotheses))
         node = {**node, "results": results}
-    return narrowed(node, limit)
+    return with_limit(node, limit)
 
 
 def _scored(fields: Mapping[str, Node]) -> Scored | None:

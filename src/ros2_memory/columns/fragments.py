@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlia
 
 import numpy as np
 
-from ros2_memory.columns.pack import compressed, decompressed, pack, unpack
+from ros2_memory.columns.pack import compress, decompress, pack, unpack
 from ros2_memory.columns.steps import EXACT, METRES
 from ros2_memory.core.logging_setup import get_logger
 
@@ -86,7 +86,7 @@ def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
     """
     writer = _Writer({cls: number for number, cls in enumerate(classes)})
     head = json.dumps(writer.json_of(fragment))
-    return compressed(b"".join((head.encode(), b"\n", *writer.data)))
+    return compress(b"".join((head.encode(), b"\n", *writer.data)))
 
 
 @dataclass(slots=True)
@@ -173,11 +173,11 @@ def from_bytes(data: bytes, classes: Sequence[type]) -> object:
     Raises:
         ValueError, TypeError, LookupError, struct.error: the bytes are no fragment.
     """
-    head, tail = decompressed(data).split(b"\n", 1)
-    return _restored(json.loads(head), classes, BytesIO(tail))
+    head, tail = decompress(data).split(b"\n", 1)
+    return _restore(json.loads(head), classes, BytesIO(tail))
 
 
-def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
+def _restore(value: object, classes: Sequence[type], tail: BytesIO) -> object:
     """Returns the value that `_Writer.json_of` turned into JSON.
 
     Args:
@@ -186,7 +186,7 @@ def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
         tail: the bytes of arrays; those of this value are next.
     """
     if isinstance(value, dict):
-        return {sys.intern(key): _restored(entry, classes, tail) for key, entry in value.items()}
+        return {sys.intern(key): _restore(entry, classes, tail) for key, entry in value.items()}
     if not isinstance(value, list):
         # Names of columns and labels are in thousands of fragments.
         return sys.intern(value) if isinstance(value, str) else value
@@ -201,7 +201,7 @@ def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
     parts = rest
     # Most are numbers: a call for each would take half of the time.
     if not _PLAIN.issuperset(map(type, rest)):
-        parts = [part if type(part) in _PLAIN else _restored(part, classes, tail) for part in rest]
+        parts = [part if type(part) in _PLAIN else _restore(part, classes, tail) for part in rest]
     if number == _ROWS:
         none_at, kind, *columns = cast("list[Sequence[object]]", parts)
         return _with_none(_rows(kind, columns, classes), cast("Sequence[int]", none_at))
@@ -320,7 +320,7 @@ class Fragments(Generic[T]):
             for other, data in self._store.fragments(self._name, key, also_before):
                 if self._remembered.get((self._kind.name, other)) is not None:
                     continue
-                restored = self._restored(data)
+                restored = self._restore(data)
                 if restored is not None:
                     self._remember(other, restored)
                     if other == key:
@@ -347,7 +347,7 @@ class Fragments(Generic[T]):
     def _remember(self, key: FragmentKey, fragment: T) -> None:
         self._remembered.put((self._kind.name, key), fragment, fragment.memory_bytes + _KEY_BYTES)
 
-    def _restored(self, data: bytes) -> T | None:
+    def _restore(self, data: bytes) -> T | None:
         try:
             return cast("T", from_bytes(data, self._kind.classes))
         except (ValueError, TypeError, LookupError, struct.error) as error:

@@ -170,7 +170,7 @@ class _Codecs(threading.local):
 _CODECS: Final = _Codecs()
 
 
-def compressed(data: bytes) -> bytes:
+def compress(data: bytes) -> bytes:
     """Returns the bytes as a zstd frame that states its size and has a checksum."""
     return _CODECS.compressor.compress(data)
 
@@ -183,7 +183,7 @@ def is_large(data: bytes) -> bool:
         return False
 
 
-def decompressed(data: bytes) -> bytes:
+def decompress(data: bytes) -> bytes:
     """Returns the content of a zstd frame.
 
     Raises:
@@ -202,7 +202,7 @@ def _pack_integers(column: Numbers) -> Packed:
         return Packed(f"{name} constant", len(column), 0.0, zone, b"")
     # Unsigned ones of 2**63 and more wrap around, here and back.
     numbers = column.reshape(-1).astype(np.int64) - _wrapped(least)
-    return _arranged(f"{name} whole", numbers, zone)
+    return _arrange(f"{name} whole", numbers, zone)
 
 
 # Floats
@@ -226,13 +226,13 @@ def _pack_floats(column: Numbers, step: Step) -> Packed:
         errors = np.abs(back.astype(np.float64, copy=False) - values)
         if not step.relative or _are_small(errors, values):
             whole = (multiples - multiples.min()).astype(np.int64)
-            return _arranged(f"{name} /{per_unit}", whole, zone, float(errors.max()))
+            return _arrange(f"{name} /{per_unit}", whole, zone, float(errors.max()))
     if step.relative:
         whole = _ordered(column, rounded=True)
         back = _from_ordered(whole, column.dtype, rounded=True)
         errors = np.abs(back.astype(np.float64, copy=False) - values)
         if _are_small(errors, values):
-            return _arranged(f"{name} rounded", whole - whole.min(), zone, float(errors.max()))
+            return _arrange(f"{name} rounded", whole - whole.min(), zone, float(errors.max()))
     return _exactly(column, zone)  # tiny numbers have no bits to spare
 
 
@@ -250,7 +250,7 @@ def _are_small(errors: Floats, values: Floats) -> bool:
 
 def _exactly(column: Numbers, zone: Zone) -> Packed:
     whole = _ordered(column)
-    return _arranged(f"{column.dtype.name} bits", whole - whole.min(), zone)
+    return _arrange(f"{column.dtype.name} bits", whole - whole.min(), zone)
 
 
 def _zone_of(values: Floats) -> Zone:
@@ -302,7 +302,7 @@ def _from_ordered(
 # Whole numbers
 
 
-def _arranged(
+def _arrange(
     form: str, flat: IntArray, zone: Zone, error: float = 0.0, head: bytes = b""
 ) -> Packed:
     """Returns whole numbers arranged flat or as differences, whichever takes fewer bits.
@@ -397,7 +397,7 @@ def _pack_texts(column: Texts) -> Packed:
         # Words of deleted rows must not stay in the file.
         column = column.rows(np.arange(len(column)))
     codes, words = column.codes, column.words
-    zone = Zone(words=folded(words))
+    zone = Zone(words=zone_words(words))
     if not words:
         return Packed("text constant", 0, 0.0, zone, b"")
     lengths = np.array([len(word) for word in words], "<u4")
@@ -405,10 +405,10 @@ def _pack_texts(column: Texts) -> Packed:
     head = struct.pack("<II", len(words), len(text)) + lengths.tobytes() + text
     if len(words) == 1:
         return Packed("text constant", len(codes), 0.0, zone, head)
-    return _arranged("text", codes.astype(np.int64), zone, head=head)
+    return _arrange("text", codes.astype(np.int64), zone, head=head)
 
 
-def folded(words: Collection[str]) -> str | None:
+def zone_words(words: Collection[str]) -> str | None:
     """Returns the words of a zone: whole ones, or the runs of letters in them, or else None.
 
     Letters alone serve for JSON with numbers, which differs each time but has few names.

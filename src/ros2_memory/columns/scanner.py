@@ -16,7 +16,7 @@ import numpy as np
 from ros2_memory.columns.coverage import Coverage, Covering
 from ros2_memory.columns.database import row_id
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, Sized
-from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
+from ros2_memory.columns.pack import Packed, decompress, is_large, unpack
 from ros2_memory.columns.stored import OUTLINE, StoredTable, lazy_columns, outline_of
 from ros2_memory.columns.table import Column, Table, Texts, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
@@ -440,7 +440,7 @@ class Scanner:
         is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
         stored = self._stored_bytes(part, path) if packed.count and not is_constant else b""
         try:
-            data = decompressed(stored) if stored else b""
+            data = decompress(stored) if stored else b""
             column = unpack(packed.codec, packed.count, packed.zone.least, data)
         except (ValueError, LookupError, struct.error) as error:
             # Else each question about the part would fail, for ever.

@@ -160,8 +160,7 @@ class Shape:
         if all(node is None for node in nodes.values()):
             return self._whole
         return {
-            name: NOTHING if node is None else _converted(name, node)
-            for name, node in nodes.items()
+            name: NOTHING if node is None else _convert(name, node) for name, node in nodes.items()
         }
 
     def find(self, path: str) -> Node | None:
@@ -174,7 +173,7 @@ class Shape:
         node: Node | None = None
         if name in self._fields:
             mapped = self.at(self._fields[name])
-            node = None if mapped is None else _descend(_converted(name, mapped), inner)
+            node = None if mapped is None else _descend(_convert(name, mapped), inner)
         elif not self._fields:
             node = _descend(self._whole, segments)
         if node is not None:
@@ -244,7 +243,7 @@ class Shape:
         if length == SEQUENCE:
             longer = where_longer(level, path, most, is_longer=True)
             shorter = where_longer(level, path, most, is_longer=False)
-            return Listing(element.level, narrowed(leaf, shorter), narrowed(summary, longer))
+            return Listing(element.level, with_limit(leaf, shorter), with_limit(summary, longer))
         size = length or 0
         if size > most:
             return summary
@@ -279,7 +278,7 @@ def _summary(type_name: str, fields: dict[str, Node], place: Place) -> Node:
     return UNKNOWN
 
 
-def _converted(name: str, node: Node) -> Node:
+def _convert(name: str, node: Node) -> Node:
     """Returns the value of a name of the schema map: an array becomes a point or a rotation."""
     count = 0
     if name in POINTS:
@@ -351,7 +350,7 @@ def _descend(node: Node, path: Sequence[str], *, parts: bool = False) -> Node | 
     for nth, segment in enumerate(path):
         if isinstance(node, Listing) and len(node) > 1:
             # A path leads into a long array, too, though the value only has a summary of it.
-            leaf = _changed(node.element, lambda leaf: leaf._replace(limits=()))
+            leaf = _map_leaves(node.element, lambda leaf: leaf._replace(limits=()))
             node = Listing(node.level, leaf)
         if node is NOTHING:
             return node
@@ -411,17 +410,18 @@ def _named_elements(array: list[Node], names: Leaf, name: str) -> list[Node]:
         raise UnknownShapeError(f"{name} is looked for in several lists of names")
     if not isinstance(array, Listing):
         return [
-            narrowed(element, at_name(ROWS, names, name, nth)) for nth, element in enumerate(array)
+            with_limit(element, at_name(ROWS, names, name, nth))
+            for nth, element in enumerate(array)
         ]
     sizes = [part[name] for part in array if isinstance(part, Summary) and name in part]
-    return [narrowed(array.element, at_name(array.level, names, name)), *sizes]
+    return [with_limit(array.element, at_name(array.level, names, name)), *sizes]
 
 
 def element_at(nodes: list[Node], index: int) -> list[Node]:
     """Returns the element of a list at a place, if there may be one."""
     if not isinstance(nodes, Listing):
         return conditions.element_at(nodes, index)
-    return [narrowed(nodes.element, at_place(nodes.level, index))]
+    return [with_limit(nodes.element, at_place(nodes.level, index))]
 
 
 def leaves_of(node: Node, *, in_objects: bool = True) -> list[Leaf]:
@@ -437,21 +437,21 @@ def leaves_of(node: Node, *, in_objects: bool = True) -> list[Leaf]:
     return [leaf for leaf in reversed(nodes) if isinstance(leaf, Leaf)]
 
 
-def narrowed(node: Node, limit: Limit) -> Node:
+def with_limit(node: Node, limit: Limit) -> Node:
     """Returns a node with a limit to the rows or elements that have it."""
-    return _changed(node, lambda leaf: leaf._replace(limits=(*leaf.limits, limit)))
+    return _map_leaves(node, lambda leaf: leaf._replace(limits=(*leaf.limits, limit)))
 
 
-def _changed(node: Node, change: Callable[[Leaf], Leaf]) -> Node:
+def _map_leaves(node: Node, change: Callable[[Leaf], Leaf]) -> Node:
     """Returns a node in which each leaf is replaced by what `change` returns for it."""
     if isinstance(node, Leaf):
         return change(node)
     if isinstance(node, Listing):
-        return Listing(node.level, *(_changed(part, change) for part in node))
+        return Listing(node.level, *(_map_leaves(part, change) for part in node))
     if isinstance(node, list):
-        return [_changed(part, change) for part in node]
+        return [_map_leaves(part, change) for part in node]
     if isinstance(node, dict):
-        return type(node)({name: _changed(part, change) for name, part in node.items()})
+        return type(node)({name: _map_leaves(part, change) for name, part in node.items()})
     return node
 
 

@@ -28,7 +28,7 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.columns.pack import byte_planes, compressed, decompressed, from_planes, signed
+from ros2_memory.columns.pack import byte_planes, compress, decompress, from_planes, signed
 from ros2_memory.core.arrays import Columns, Ints, begins_of, distinct_rows, in_ranges, narrowed
 from ros2_memory.core.timebase import NS_PER_US
 
@@ -62,7 +62,7 @@ _TIMES: Final[dict[_Kind, list[int]]] = {
 """The columns with times, of each table whose column 0 is a slice."""
 
 
-def packed(sights: Sights, rows: Ints | None = None) -> bytes:
+def pack_sights(sights: Sights, rows: Ints | None = None) -> bytes:
     """Returns the sights of some slices of the clock as bytes.
 
     Args:
@@ -79,7 +79,7 @@ def packed(sights: Sights, rows: Ints | None = None) -> bytes:
         widths.append((int(coded.max(initial=0)).bit_length() + 7) // 8)
         planes.append(byte_planes(coded, widths[-1]))
     head = json.dumps((sights.topics, sights.labels, in_tables, widths))
-    return compressed(b"".join((head.encode(), b"\n", *planes)))
+    return compress(b"".join((head.encode(), b"\n", *planes)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,13 +130,15 @@ class _Table:
         self.columns = [column[order] for column in self.columns]
 
 
-def joined(parts: Sequence[bytes], epochs: Sequence[int], sessions: Sequence[int]) -> JoinedSights:
+def join_sights(
+    parts: Sequence[bytes], epochs: Sequence[int], sessions: Sequence[int]
+) -> JoinedSights:
     """Returns the sights of packed parts as one.
 
     Fixes are in order of time for each session: at one time there may be several robots.
 
     Args:
-        parts: as `packed` returns them.
+        parts: as `pack_sights` returns them.
         epochs: the epoch of each of their sections.
         sessions: the session of each section.
     """
@@ -151,11 +153,13 @@ def joined(parts: Sequence[bytes], epochs: Sequence[int], sessions: Sequence[int
     return JoinedSights(topics, labels, epoch_of_slice, *columns)
 
 
-def united(parts: Sequence[bytes]) -> bytes:
+def unite_sights(parts: Sequence[bytes]) -> bytes:
     """Returns packed parts as one, with the sections of all."""
     names = _Names()
     tables, rows = _unpack(parts, names)
-    return packed(Sights((*names.topics,), (*names.labels,), *(table.T for table in tables)), rows)
+    return pack_sights(
+        Sights((*names.topics,), (*names.labels,), *(table.T for table in tables)), rows
+    )
 
 
 def _read_tables(parts: Sequence[bytes], names: _Names) -> tuple[dict[_Kind, _Table], int]:
@@ -196,13 +200,13 @@ def _unpack(parts: Sequence[bytes], names: _Names) -> tuple[list[Ints], Ints]:
     Each table has its columns one after the other.
 
     Args:
-        parts: as `packed` returns them.
+        parts: as `pack_sights` returns them.
         names: gets the names that it does not have yet; the tables have its numbers.
     """
     tables = [[np.empty((len(kind), 0), np.int64)] for kind in TABLES]
     rows = [np.empty((0, len(TABLES)), np.int64)]
     for part in parts:
-        head, data = decompressed(part).split(b"\n", 1)
+        head, data = decompress(part).split(b"\n", 1)
         topics, labels, in_tables, widths = json.loads(head)
         topic_numbers = _numbers_of(topics, names.topics)
         label_numbers = _numbers_of(labels, names.labels)

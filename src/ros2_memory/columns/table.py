@@ -304,7 +304,7 @@ def order_of(log_times: IntArray, bags: IntArray, places: IntArray) -> IntArray 
     return None if (order[1:] > order[:-1]).all() else order
 
 
-def joined(tables: Sequence[Table]) -> Table:
+def join_tables(tables: Sequence[Table]) -> Table:
     """Returns the rows of tables as one table.
 
     Args:

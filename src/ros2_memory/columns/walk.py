@@ -75,7 +75,7 @@ class LevelColumns:
             self.left_out[f"{path}.{inner_path}"] = reason
 
 
-def walked(plan: Plan, batch: Batch) -> LevelColumns:
+def read_columns(plan: Plan, batch: Batch) -> LevelColumns:
     """Returns the columns of a batch.
 
     Raises:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.pack import Packed, compressed, pack
+from ros2_memory.columns.pack import Packed, compress, pack
 from ros2_memory.columns.stored import Layout, columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -127,7 +127,7 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
         packed[path] = pack(column, layout.slots[path].step)
     for path, whole in packed.items():
         if whole.data:
-            packed[path] = replace(whole, data=compressed(whole.data))
+            packed[path] = replace(whole, data=compress(whole.data))
     first, last = int(table.log_times[0]), int(table.log_times[-1])
     return PackedPart(first, last, len(table), tuple(np.unique(bags).tolist()), packed)
 

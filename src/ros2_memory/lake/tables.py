@@ -39,7 +39,7 @@ from pyiceberg.schema import Schema as IcebergSchema
 from pyiceberg.table.sorting import SortField, SortOrder
 from pyiceberg.transforms import IdentityTransform
 
-from ros2_memory.columns.pack import byte_planes, compressed, decompressed, from_planes
+from ros2_memory.columns.pack import byte_planes, compress, decompress, from_planes
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S, NS_PER_US, Ns
 from ros2_memory.storage.base import Batch, Channel, IntArray
@@ -315,7 +315,7 @@ def packed_messages(
             rows = np.frombuffer(joined, np.uint8).reshape(len(sizes), -1)
             joined = rows.T.tobytes()
         parts += [byte_planes(sizes, 4), joined]
-    return compressed(b"".join(parts))
+    return compress(b"".join(parts))
 
 
 def unpacked_messages(data: bytes, channel: Channel) -> Batch:
@@ -324,7 +324,7 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
     Raises:
         ValueError: the bytes are damaged, or of a later format.
     """
-    content = decompressed(data)
+    content = decompress(data)
     try:
         form, has_payloads, count = _HEAD.unpack_from(content)
     except struct.error as error:

@@ -16,7 +16,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.columns.sights import joined
+from ros2_memory.columns.sights import join_sights
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -320,7 +320,7 @@ class _Loader:
                 raise _TakesTooLongError
 
         self._view.memory.large.acquire()
-        sights = joined(packed, epochs, sessions)
+        sights = join_sights(packed, epochs, sessions)
         things = estimate(sights, self._labels, self._min_score, go_on)
         since = self._read_from
         if crowded:

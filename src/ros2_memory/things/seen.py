@@ -20,7 +20,7 @@ from ros2_memory.analysis.sights import SLICE_NS
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, joining
 from ros2_memory.columns.scan import STRETCH_NS
-from ros2_memory.columns.sights import packed, united
+from ros2_memory.columns.sights import pack_sights, unite_sights
 from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -100,7 +100,7 @@ class TopicSights(NamedTuple):
     Attributes:
         topics: the topic; none for the sights with the fixes.
         detects: whether this stretch shows that the topic is a detector's. Others may show it.
-        packed: the sights as `columns.sights.joined` takes them.
+        packed: the sights as `columns.sights.join_sights` takes them.
     """
 
     topics: tuple[str, ...]
@@ -490,7 +490,7 @@ class SightReader:
                 TopicSights(
                     sights.topics,
                     not placed.detectors.isdisjoint(sights.topics),
-                    packed(sights),
+                    pack_sights(sights),
                 )
                 for sights in placed.sights
             )
@@ -518,7 +518,7 @@ def _united(
         TopicSights(
             of_topic[0].topics,
             any(sights.detects for sights in of_topic),
-            united([sights.packed for sights in of_topic]),
+            unite_sights([sights.packed for sights in of_topic]),
         )
         for of_topic in zip(*(stretch.sights for stretch in stretches), strict=True)
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.columns.pack import decompressed
+from ros2_memory.columns.pack import decompress
 from tests.support.program import Printed, Program, exits
 
 __all__ = ["exits"]
@@ -47,7 +47,7 @@ def columns_in(store: Path) -> Iterator[bytes]:
     """All that a store of columns packs, unpacked."""
     with closing(sqlite3.connect(store)) as base:
         columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
-    yield from (decompressed(blob) for (blob,) in columns)
+    yield from (decompress(blob) for (blob,) in columns)
 
 
 @contextmanager

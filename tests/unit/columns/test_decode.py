@@ -21,8 +21,8 @@ from rosbags.typesys.store import Typestore
 from ros2_memory.columns import decode
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.plan import Plan
-from ros2_memory.columns.table import Table, joined
-from ros2_memory.columns.walk import LevelColumns, NotWalkedError, walked
+from ros2_memory.columns.table import Table, join_tables
+from ros2_memory.columns.walk import LevelColumns, NotWalkedError, read_columns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.storage.base import BagReader, Batch, Record
 from ros2_memory.storage.mcap_reader import McapReader
@@ -191,7 +191,7 @@ def tables_of(reader: BagReader, path: Path) -> list[Table]:
     groups, _ = all_of(map(Group.tables, undecoded(reader, path, skip_undecodable=True)))
     for table in chain.from_iterable(groups):
         parts.setdefault((table.channel.topic, table.channel.schema), []).append(table)
-    return [joined(tables) for tables in parts.values()]
+    return [join_tables(tables) for tables in parts.values()]
 
 
 def decoded_alike(reader: BagReader, path: Path) -> None:
@@ -253,12 +253,12 @@ def fallbacks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def noting(plan: Plan, batch: Batch) -> LevelColumns:
         try:
-            return walked(plan, batch)
+            return read_columns(plan, batch)
         except NotWalkedError:
             topics.append(batch.channel.topic)
             raise
 
-    monkeypatch.setattr(decode, "walked", noting)
+    monkeypatch.setattr(decode, "read_columns", noting)
     return topics
 
 

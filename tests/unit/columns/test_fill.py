@@ -19,7 +19,7 @@ from ros2_memory.columns.fill import Progress, StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.plan import Plan
 from ros2_memory.columns.table import Table
-from ros2_memory.columns.walk import LevelColumns, walked
+from ros2_memory.columns.walk import LevelColumns, read_columns
 from ros2_memory.columns.writing import ReadBag
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S
@@ -64,10 +64,10 @@ def test_bags_that_cannot_be_stored_together_are_stored_alone_but_for_the_faulty
     def failing(plan: Plan, batch: Batch) -> LevelColumns:
         if (batch.log_times // (60 * S) == T0 // (60 * S) + 2).any():
             raise ValueError("of a test")
-        return walked(plan, batch)
+        return read_columns(plan, batch)
 
     with monkeypatch.context() as patched:
-        patched.setattr(decode, "walked", failing)
+        patched.setattr(decode, "read_columns", failing)
         world.fill()
     assert world.stored() == {f"rec/rec_{number}.mcap" for number in (0, 1, 3)}
     check_all(world)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ros2_memory.columns import scan
 from ros2_memory.columns.fragments import FragmentKind, from_bytes, to_bytes
-from ros2_memory.columns.pack import compressed
+from ros2_memory.columns.pack import compress
 from ros2_memory.columns.scan import Stretch
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -135,7 +135,7 @@ def test_arrays_in_rows_are_the_same_once_they_were_stored(sizes: list[int | Non
 def test_a_damaged_fragment_is_made_again_and_takes_its_place(world: World, tmp_path: Path) -> None:
     world.store.close()
     before = counted(tmp_path, "1")
-    for data in (b"\0", compressed(b"[]\n"), compressed(b"[0]"), b""):
+    for data in (b"\0", compress(b"[]\n"), compress(b"[0]"), b""):
         with closing(sqlite3.connect(store_file(tmp_path), isolation_level=None)) as base:
             base.execute("UPDATE fragment SET data = ?", (data,))
         damaged = "kind LIKE 'path %' AND data = ?"

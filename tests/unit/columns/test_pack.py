@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ros2_memory.columns.pack import Packed, compressed, decompressed, pack, unpack
+from ros2_memory.columns.pack import Packed, compress, decompress, pack, unpack
 from ros2_memory.columns.steps import (
     DEGREES,
     EXACT,
@@ -173,14 +173,14 @@ def test_a_zone_rules_out_only_texts_that_are_in_no_value(values: list[str], tex
 
 def test_damaged_bytes_are_refused() -> None:
     with pytest.raises(ValueError, match="cannot be decompressed"):
-        decompressed(b"no frame at all")
+        decompress(b"no frame at all")
     data = np.random.default_rng(3).integers(0, 200, 300).astype(np.uint8).tobytes()
-    frame = compressed(data)
+    frame = compress(data)
     for bit in range(8 * len(frame)):
         damaged = bytearray(frame)
         damaged[bit // 8] ^= 1 << bit % 8
         with suppress(ValueError):  # but for bits that say nothing
-            assert decompressed(bytes(damaged)) == data
+            assert decompress(bytes(damaged)) == data
     with pytest.raises(ValueError, match="arranged"):
         unpack("int64 whole curve 1", 3, 0, bytes(20))
 

@@ -22,7 +22,7 @@ from ros2_memory.columns import forget as forgetting
 from ros2_memory.columns.database import TABLES
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
-from ros2_memory.columns.pack import FORMAT, decompressed
+from ros2_memory.columns.pack import FORMAT, decompress
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.units import GoneError
@@ -116,7 +116,7 @@ def stored_rows(file: Path) -> str:
         for table, columns in tables.items():
             for row in base.execute(f"SELECT {columns} FROM {table} ORDER BY 1, 2"):  # noqa: S608
                 values = [
-                    decompressed(value)
+                    decompress(value)
                     if isinstance(value, bytes) and value.startswith(ZSTD)
                     else value
                     for value in row
@@ -301,7 +301,7 @@ def bytes_of(folder: Path) -> bytes:
 
 def all_unpacked(file: Path) -> bytes:
     """All that is all_packed, all_unpacked."""
-    return b"".join(map(decompressed, all_packed(file)))
+    return b"".join(map(decompress, all_packed(file)))
 
 
 DERIVED = {

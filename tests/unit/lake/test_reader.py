@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
-from ros2_memory.columns.pack import decompressed
+from ros2_memory.columns.pack import decompress
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -138,8 +138,8 @@ def test_messages_of_one_log_time_keep_the_order_of_the_file(tmp_path: Path) -> 
             assert found == [*bags.reader.records(bag.path, topics, EVERYTHING, **how)]
     # Where no channel shares a log time with another, no place is stored.
     rows = {row["topic"]: row["packed"] for row in lake_rows(tmp_path / "lake", "channels")}
-    assert decompressed(rows["/alone"])[0] == 1
-    assert decompressed(rows["/said"])[0] == 2
+    assert decompress(rows["/alone"])[0] == 1
+    assert decompress(rows["/said"])[0] == 2
 
 
 def test_damaged_and_later_bytes_are_refused() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.analysis.sights import DetectorMessages, Sights, fixes_of, sights_of
-from ros2_memory.columns.sights import JoinedSights, joined, packed
+from ros2_memory.columns.sights import JoinedSights, join_sights, pack_sights
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.model import Vector3
 from ros2_memory.things.estimation import estimate
@@ -52,7 +52,7 @@ def bag_of(*messages: Seen, start: int = 0) -> Sights:
 def whole(parts: Sequence[Sights]) -> JoinedSights:
     """The sights of all parts, which are in one coordinate system."""
     zeros = [0] * len(parts)
-    return joined([packed(part) for part in parts], zeros, zeros)
+    return join_sights([pack_sights(part) for part in parts], zeros, zeros)
 
 
 def seen_at(x: float, y: float) -> list[PlacedDetection]:

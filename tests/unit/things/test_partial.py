@@ -10,7 +10,7 @@ from typing import TypeVar
 import pytest
 
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.sights import joined
+from ros2_memory.columns.sights import join_sights
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
@@ -151,4 +151,4 @@ def test_a_bag_of_odd_times_has_the_sights_of_its_messages_alone(
     ]
     parts = [part.packed for stretch in stretches for part in stretch.sights]
     sections = [0 for stretch in stretches for _ in stretch.sights for _ in stretch.sessions]
-    assert joined(parts, sections, sections).labels == ("cup", "mug")
+    assert join_sights(parts, sections, sections).labels == ("cup", "mug")
