@@ -11,10 +11,10 @@ while the store is filled, and remains when columns are dropped.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.pack import Packed
     from ros2_memory.core.timebase import Span
     from ros2_memory.storage.base import Channel, Definition, IntArray
-    from ros2_memory.storage.cache import ByteLru
 
     Floats = NDArray[np.float64]
 
@@ -161,6 +160,16 @@ def _kind_of(column: Column, path: str, definition: Definition | None) -> Column
     return ColumnKind(name, step_of(path, definition) if column.dtype.kind == "f" else EXACT)
 
 
+class Memory(Protocol):
+    """A cache that forgets values when it is full."""
+
+    def get(self, key: Hashable) -> object | None:
+        """Returns the value of a key; None if it was forgotten."""
+
+    def put(self, key: Hashable, value: object, size: int) -> None:
+        """Remembers a value of about `size` bytes."""
+
+
 class LazyMapping(Mapping[str, V]):
     """A mapping whose values are made when they are first used, and kept."""
 
@@ -201,7 +210,7 @@ class StoredTable(Table):
 
     packed: Callable[[str], Packed | None] = field(kw_only=True)
     outline: Callable[[], Outline | None] = field(kw_only=True)
-    memory: ByteLru[object] = field(kw_only=True)
+    memory: Memory = field(kw_only=True)
     number: int = field(kw_only=True)
 
     def error(self, path: str) -> float:
