@@ -12,6 +12,7 @@ detection there; then the limits say that they do not know.
 from __future__ import annotations
 
 import math
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -409,15 +410,17 @@ def _position_at(
 
 def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
     """Returns whether one of these texts looks like JSON, or has no column."""
-    for leaf in texts:
-        zones = values.zones(leaf)
-        if zones is None or zones.may_be_json:
-            try:
-                if any(map(looks_like_json, values.texts(leaf).words)):
-                    return True
-            except UnknownShapeError:
-                return True
-    return False
+    return any(_leaf_may_be_json(values, leaf) for leaf in texts)
+
+
+def _leaf_may_be_json(values: Values, leaf: Leaf) -> bool:
+    zones = values.zones(leaf)
+    if zones is not None and not zones.may_be_json:
+        return False
+    try:
+        return any(map(looks_like_json, values.texts(leaf).words))
+    except UnknownShapeError:
+        return True
 
 
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
@@ -636,10 +639,9 @@ def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
     positions, named = source.read(values)
     is_named = np.flatnonzero(named.is_named)
     if is_named.size < values.size(source.level):
-        for inner in source.inner:
-            for detections in detections_in(values, inner, places=False):
-                if detections.rows.size:
-                    raise UnknownShapeError("some objects are detections, others have some inside")
+        inside = chain(*(detections_in(values, inner, places=False) for inner in source.inner))
+        if any(detections.rows.size for detections in inside):
+            raise UnknownShapeError("some objects are detections, others have some inside")
     positions = positions[is_named]
     detections = _detections_at(values, source.scored.level, positions, named.at(is_named))
     return _with_places(values, source, positions, detections) if places else detections

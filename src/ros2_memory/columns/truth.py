@@ -211,11 +211,12 @@ class _Passing(NamedTuple):
         """Returns which rows have an element that passes."""
         if self.level is ROWS and not self.limits:
             return self.truth
+        certain, possible = map(np.flatnonzero, self.truth)
+        _, surely = within_limits(values, self.level, certain, self.limits, surely=True)
+        _, perhaps = within_limits(values, self.level, possible, self.limits, surely=False)
         rows = nowhere(values.rows)
-        for surely, has_passing, passes in zip((True, False), rows, self.truth, strict=True):
-            positions = np.flatnonzero(passes)
-            _, owners = within_limits(values, self.level, positions, self.limits, surely=surely)
-            has_passing[owners] = True
+        rows.surely[surely] = True
+        rows.perhaps[perhaps] = True
         return rows
 
 

@@ -415,24 +415,22 @@ class Layouts:
     """Remembers layouts by schema and by the fields that are left out, which determine them."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[Schema, tuple[tuple[str, str], ...]], tuple[Layout, str]] = {}
+        self._known: dict[tuple[Schema, tuple[tuple[str, str], ...]], Layout] = {}
 
-    def of(self, table: Table) -> tuple[Layout, str]:
-        """Returns the layout of a table, and its JSON."""
+    def of(self, table: Table) -> Layout:
+        """Returns the layout of a table."""
         key = (table.channel.schema, tuple(sorted(table.left_out.items())))
-        layout, text = self._known.get(key, (None, ""))
+        layout = self._known.get(key)
         if layout is None or not layout.fits(table):
-            layout = Layout.of(table, table.definition)
-            text = layout.to_json()
-            self._known[key] = (layout, text)
+            layout = self._known[key] = Layout.of(table, table.definition)
             if len(self._known) > _MOST_LAYOUTS:
                 del self._known[next(iter(self._known))]
-        return layout, text
+        return layout
 
 
 def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:
     """Returns the id of a table's topic, which is inserted if it is new, and its layout."""
-    channel, (layout, layout_json) = table.channel, layouts.of(table)
+    channel, layout = table.channel, layouts.of(table)
     schema = channel.schema
     definition = _find_or_insert(
         connection, "definition", type=schema.name, encoding=schema.encoding, text=schema.text
@@ -444,7 +442,7 @@ def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> 
         encoding=channel.encoding,
         latched=channel.latched,
         definition=definition,
-        layout=layout_json,
+        layout=layout.to_json(),
     )
     return topic, layout
 
