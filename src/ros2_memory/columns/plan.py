@@ -46,7 +46,7 @@ _DTYPES: Final = {
 _LENGTH_BYTES: Final = 4
 _TIMES: Final = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"})
 _TIME_FIELDS: Final = (Field("sec", "int32"), Field("nanosec", "uint32"))
-_FILLER: Final = "structure_needs_at_least_one_member"
+FILLER: Final = "structure_needs_at_least_one_member"
 
 
 class UnplannedError(Exception):
@@ -236,7 +236,7 @@ class _Planner:
         if length is not None and length > _MOST_ELEMENTS:
             raise UnplannedError(f"{path} is an array of {length} elements, more than a bag holds")
         self._spend(1)
-        if entry.name == _FILLER:
+        if entry.name == FILLER:
             self._pass(1, 1)
         elif length is None and isinstance(kind, Definition):
             if is_time(kind):

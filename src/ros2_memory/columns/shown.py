@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from ros2_memory.analysis import conditions
+from ros2_memory.columns.plan import FILLER
 from ros2_memory.columns.table import MAX_NUMBERS, Table, Texts
 from ros2_memory.columns.values import (
     NUMBERS,
@@ -64,7 +65,6 @@ _LARGEST_INT64: Final = 2**63 - 1
 _MAX_PARTS: Final = 5_000
 """Of one value: nested definitions of some lines can spell out more than memory holds."""
 
-_FILLER: Final = "structure_needs_at_least_one_member"
 _BYTES: Final = frozenset({"uint8", "char"})
 """What rosbags decodes to uint8, whose long arrays are shown as their length."""
 _TURNS: Final = (Conversion.ROLL, Conversion.PITCH, Conversion.YAW)
@@ -122,7 +122,7 @@ class Place(NamedTuple):
         return {
             field.name: Place(level, dotted(path, field.name), field.kind, field.length, depth + 1)
             for field in definition.fields
-            if field.name != _FILLER
+            if field.name != FILLER
         }
 
     def element(self) -> Place:

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.core.arrays import in_ranges, numbered
+from ros2_memory.core.arrays import in_ranges, joined_codes, numbered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -157,12 +157,8 @@ class Texts:
 
 def joined_texts(parts: Sequence[Texts]) -> Texts:
     """Returns columns of texts one after the other."""
-    code_of: dict[str, int] = {}
-    codes = [np.empty(0, np.uint32)]
-    for part in parts:
-        recoded = [code_of.setdefault(word, len(code_of)) for word in part.words]
-        codes.append(np.array(recoded, np.uint32)[part.codes])
-    return Texts(np.concatenate(codes), tuple(code_of))
+    codes, words = joined_codes((part.codes, part.words) for part in parts)
+    return Texts(codes.astype(np.uint32), words)
 
 
 Column: TypeAlias = "Numbers | Texts"
