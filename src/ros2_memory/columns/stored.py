@@ -204,14 +204,14 @@ class StoredTable(Table):
         packed: returns how the column at a path of `Layout.slots` is packed, without its data; None
             if there is no such column.
         outline: returns the outline of the part; None if it was not made.
-        memory: remembers what is made of the part.
+        memory: remembers what is made of the part; None to remember nothing.
         number: of the part.
     """
 
     packed: Callable[[str], Packed | None] = field(kw_only=True)
-    outline: Callable[[], Outline | None] = field(kw_only=True)
-    memory: Memory = field(kw_only=True)
-    number: int = field(kw_only=True)
+    outline: Callable[[], Outline | None] = field(kw_only=True, default=lambda: None)
+    memory: Memory | None = field(kw_only=True, default=None)
+    number: int = field(kw_only=True, default=0)
 
     def error(self, path: str) -> float:
         """Returns the greatest absolute error of a column; 0.0 if it is exact.
@@ -234,6 +234,8 @@ class StoredTable(Table):
 
     def remember(self, what: str, make: Callable[[], V], size_of: Callable[[V], int]) -> V:
         """Returns what `make` returns, once for the part; see `Table.remember`."""
+        if self.memory is None:
+            return make()
         key = (self.number, f"={what}")
         cached = self.memory.get(key)
         if cached is not None:
