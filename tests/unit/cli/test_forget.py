@@ -200,8 +200,17 @@ def test_a_bag_that_took_the_place_of_another_while_it_was_asked_is_kept(
         (bag_dir / "copy").rename(bag_dir / "rec_1")
 
     monkeypatch.setattr("typer.confirm", meanwhile)
-    forget(0, 40, 100, "")
+    assert "stays: rec_1/rec_2.mcap: it has changed meanwhile" in forget(1, 40, 100, "").out
     assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
+
+
+def test_a_bag_that_was_compressed_while_it_was_asked_is_said_to_stay(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    bag = bag_dir / "rec_1" / "rec_2.mcap"
+    monkeypatch.setattr("typer.confirm", lambda *_, **__: bag.rename(f"{bag}.zstd"))
+    said = forget(1, 39, 55, "").out
+    assert "stays: rec_1/rec_2.mcap: it has changed meanwhile; forget again" in said
 
 
 def test_a_file_that_cannot_be_read_is_named_wherever_its_mtime_allows_messages(

@@ -385,13 +385,8 @@ class _Forget:
         """
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             snapshot = self._memory.index.refresh()
-            present = {_stamp(bag) for bag in self._bags_as_on_disk(snapshot)}
-            bags = [
-                bag
-                for bag in planned
-                if _stamp(bag) in present and (self._own is None or self._own.owns_bag(bag.path))
-            ]
-            kept, carried, paths = list[str](), None, {bag.path for bag in bags}
+            bags, kept = self._unchanged(planned, snapshot)
+            carried, paths = None, {bag.path for bag in bags}
             if recorder is None:
                 carried = self._carrier.carry(snapshot, paths, _with_other_links(bags))
             else:  # it carries latched messages itself, and two programs must not do so at a time
@@ -421,6 +416,23 @@ class _Forget:
         self._print_kept(kept)
         for note in notes:
             print_line(note)
+
+    def _unchanged(
+        self, planned: Sequence[BagFile], snapshot: Snapshot
+    ) -> tuple[list[BagFile], list[str]]:
+        """Returns the planned bags that are as they were, and a line on each that has changed.
+
+        A bag that is gone has no line: another program has deleted it meanwhile.
+        """
+        present = {_stamp(bag) for bag in self._bags_as_on_disk(snapshot)}
+        bags, changed = list[BagFile](), list[str]()
+        for bag in planned:
+            is_own = self._own is None or self._own.owns_bag(bag.path)
+            if _stamp(bag) in present and is_own:
+                bags.append(bag)
+            elif bag.path.exists() or Path(other_form(bag.file)).exists():
+                changed.append(f"{self._name(bag)}: it has changed meanwhile; forget again")
+        return bags, changed
 
     def _ask_lake(self, bags: Sequence[BagFile]) -> list[str]:
         """Asks the lake to forget what it has of bags; returns a line on each thing that stays."""
