@@ -29,7 +29,15 @@ from ros2_memory.analysis.sights import (
     Unplaced,
 )
 from ros2_memory.columns.pack import byte_planes, compress, decompress, from_planes, signed
-from ros2_memory.core.arrays import Columns, Ints, begins_of, distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import (
+    Columns,
+    Ints,
+    begins_of,
+    distinct_rows,
+    in_ranges,
+    narrowed,
+    run_starts,
+)
 from ros2_memory.core.timebase import NS_PER_US
 
 if TYPE_CHECKING:
@@ -265,7 +273,7 @@ def _number_slices(tables: Mapping[_Kind, _Table], epoch_of_section: Ints) -> In
     """Numbers the slices in order of time; returns the epoch of each."""
     timed = [tables[kind] for kind in _TIMES]
     # Many rows of one slice follow each other: one of each run is compared.
-    runs = [_run_begins(table.columns[0], table.section) for table in timed]
+    runs = [run_starts(table.columns[0], table.section) for table in timed]
     slices, epochs = [], []
     for table, begins in zip(timed, runs, strict=True):
         slices.append(table.columns[0][begins])
@@ -296,16 +304,9 @@ def _sort_tables(tables: Mapping[_Kind, _Table], session_of_section: Ints) -> No
         table.sort(_order(table.columns[:1]))
 
 
-def _run_begins(*columns: Ints) -> Ints:
-    """Returns the rows that differ from the one before, and the first."""
-    is_other = np.ones(len(columns[0]), np.bool_)
-    is_other[1:] = np.any([np.diff(column) != 0 for column in columns], axis=0)
-    return np.flatnonzero(is_other)
-
-
 def _order(keys: Sequence[Ints]) -> Ints:
     """Returns the rows in the order of some columns; equal ones stay in their order."""
-    begins = _run_begins(*keys)  # many rows that are alike follow each other
+    begins = run_starts(*keys)  # many rows that are alike follow each other
     order = np.argsort(distinct_rows([key[begins] for key in keys])[1], kind="stable")
     return in_ranges(begins[order], np.diff(begins, append=len(keys[0]))[order])
 
@@ -323,4 +324,4 @@ def _distinct_fixes(columns: Sequence[Ints], session: Ints) -> Ints:
     Two stretches of the clock that meet have the fix at their common edge both.
     """
     order = np.lexsort((*reversed(columns[Fix.TIME :]), session))  # the last is the first key
-    return order[_run_begins(*(column[order] for column in (*columns, session)))]
+    return order[run_starts(*(column[order] for column in (*columns, session)))]

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.columns.writing import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
-from ros2_memory.core.arrays import Flags, Groups, distinct_rows, in_ranges
+from ros2_memory.core.arrays import Flags, Groups, distinct_rows, in_ranges, run_starts
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.index.segment import in_time
@@ -308,9 +308,8 @@ def repeated_among(messages: Identities) -> Flags:
         (messages.recordings, messages.log_times, messages.hashes, messages.publish_times)
     )
     ordered = messages.rows(order)
-    is_first = np.ones(order.size, np.bool_)
-    is_first[1:] = (np.diff(ordered.publish_times) != 0) | (np.diff(ordered.hashes) != 0)
-    first = np.maximum.accumulate(np.where(is_first, np.arange(order.size), 0))
+    begins = run_starts(ordered.publish_times, ordered.hashes)
+    first = np.repeat(begins, np.diff(begins, append=order.size))
     is_late = ordered.log_times - ordered.publish_times > REPEATED_NS
     is_again = (
         is_late

@@ -22,6 +22,7 @@ import numpy as np
 from ros2_memory.columns.pack import Packed, compress, pack
 from ros2_memory.columns.stored import Layout, columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Zone
+from ros2_memory.core.arrays import run_starts
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -296,8 +297,8 @@ def _note_deletion(connection: sqlite3.Connection) -> None:
 
 
 def _split_by_hour(table: Table) -> Iterator[Table]:
-    edges = np.flatnonzero(np.diff(table.log_times // PART_NS)) + 1
-    for rows in np.split(np.arange(len(table)), edges):
+    begins = run_starts(table.log_times // PART_NS)
+    for rows in np.split(np.arange(len(table)), begins[1:]):
         yield table.rows(rows)
 
 

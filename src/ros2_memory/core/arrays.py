@@ -99,9 +99,11 @@ def rows_by(group: Ints, groups: int) -> list[Ints]:
     return np.split(np.argsort(group, kind="stable"), begins_of(group, groups)[1:])[:-1]
 
 
-def run_starts(numbers: Ints) -> Ints:
-    """Returns where each run of equal numbers begins."""
-    return np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
+def run_starts(*columns: Ints) -> Ints:
+    """Returns where each run of equal rows begins; the columns are of one length."""
+    is_other = np.ones(len(columns[0]), np.bool_)
+    is_other[1:] = np.any([column[1:] != column[:-1] for column in columns], axis=0)
+    return np.flatnonzero(is_other)
 
 
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:

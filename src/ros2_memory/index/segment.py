@@ -16,6 +16,7 @@ import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Pacing, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
+from ros2_memory.core.arrays import run_starts
 from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import enclosing
@@ -473,7 +474,7 @@ def _spacings(counts: Ints, spans: Ints) -> list[dict[int, Spacing]]:
     keys = topics * _OCTAVES + octaves
     sums = np.zeros((3, len(counts) * _OCTAVES), np.int64)
     # Mostly the next part has the same key: adding runs first is quicker.
-    begins = np.flatnonzero(np.diff(keys, prepend=-1))
+    begins = run_starts(keys)
     for total, values in zip(sums, (np.ones_like(spans), spans, intervals), strict=True):
         np.add.at(total, keys[begins], np.add.reduceat(values, begins))
     spacings: list[dict[int, Spacing]] = [{} for _ in counts]

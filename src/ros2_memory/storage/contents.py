@@ -170,8 +170,7 @@ class Tally:
         self._by_chunk.append(by_chunk)
         order = np.argsort(numbers, kind="stable")
         numbers, times, chunks = numbers[order], times[order], chunks[order]
-        is_other = (numbers[1:] != numbers[:-1]) | (chunks[1:] != chunks[:-1])
-        begins = np.append(0, np.flatnonzero(is_other) + 1)
+        begins = run_starts(numbers, chunks)
         by_channel = _Spans.split_at(begins, numbers, times, SHORTEST_SILENCE_NS)
         self._by_channel.append(by_channel)
         # `contents` compares the spans with each other, and this the messages inside one.
