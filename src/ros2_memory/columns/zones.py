@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.columns.table import Zone, as_float, may_be_in
+from ros2_memory.core.arrays import places_among
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -61,16 +62,13 @@ class Zones(NamedTuple):
 
     def among(self, parts: IntArray) -> Zones:
         """Returns the zones of some parts, in their order; unknown ones may have any value."""
-        if not self.parts.size:
-            infinities = np.full(parts.size, math.inf)
-            return Zones(parts, -infinities, infinities, np.full(parts.size, _ANY))
-        at = np.minimum(np.searchsorted(self.parts, parts), self.parts.size - 1)
-        is_known = self.parts[at] == parts
+        places, is_known = places_among(parts, self.parts)
+        at = np.where(is_known, places, -1)
         return Zones(
             parts,
-            np.where(is_known, self.low[at], -math.inf),
-            np.where(is_known, self.high[at], math.inf),
-            np.where(is_known, self.codes[at], _ANY),
+            np.append(self.low, -math.inf)[at],
+            np.append(self.high, math.inf)[at],
+            np.append(self.codes, _ANY)[at],
             self.words,
         )
 
