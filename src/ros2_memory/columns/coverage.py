@@ -104,7 +104,7 @@ class Coverage:
         """Yields what `Timeline.extents` yields, of the bags that are not stored."""
         for covered in self.segments:
             bags, is_missing = covered.segment.bags, covered.is_missing
-            is_missing &= (bags.starts < window.stop) & (bags.ends >= window.start)
+            is_missing &= window.overlapping(bags.starts, bags.ends)
             if is_missing.any():
                 yield from covered.segment.extents(topic, window, is_missing)
 

@@ -480,8 +480,7 @@ class Scan:
         """Finds the copies in a window of a shared span."""
 
         def are_copies(messages: Identities) -> Mask:
-            times = messages.log_times
-            return copies_among(messages) & (times >= window.start) & (times < window.stop)
+            return copies_among(messages) & window.holding(messages.log_times)
 
         around = window.widened(2 * COPY_HORIZON_NS).intersect(span)
         for unit, rows in self._compare_recordings(around, are_copies):
@@ -589,8 +588,7 @@ class Scan:
 
 def _in_window(unit: Unit, window: TimeWindow) -> Mask:
     """Returns which rows of a unit are in a window, and of bags that count."""
-    times, is_counted = unit.times(), unit.counting()
-    is_inside: Mask = (times >= window.start) & (times < window.stop)
+    is_inside, is_counted = window.holding(unit.times()), unit.counting()
     return is_inside if is_counted is None else is_inside & is_counted
 
 

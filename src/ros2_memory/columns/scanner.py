@@ -85,8 +85,7 @@ class _Heads(NamedTuple):
 
     def within(self, window: TimeWindow) -> list[PartHead]:
         """Returns the parts that may have rows in a window."""
-        is_within = (self.firsts < window.stop) & (self.lasts >= window.start)
-        is_within &= self.counting_bags > 0
+        is_within = window.overlapping(self.firsts, self.lasts) & (self.counting_bags > 0)
         return [self.heads[nth] for nth in np.flatnonzero(is_within).tolist()]
 
 

@@ -25,6 +25,7 @@ from ros2_memory.core.timebase import (
 )
 
 if TYPE_CHECKING:
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.bag_summary import BagSummary
 
 PLAIN_KINDS: Final = (".mcap", ".db3")
@@ -115,6 +116,14 @@ class TimeWindow:
     def overlaps(self, first: Ns, last: Ns) -> bool:
         """Returns whether any time of the inclusive span `[first, last]` lies inside."""
         return first < self.stop and last >= self.start
+
+    def holding(self, times: Ints) -> Flags:
+        """Returns which times lie inside."""
+        return (times >= self.start) & (times < self.stop)
+
+    def overlapping(self, firsts: Ints, lasts: Ints) -> Flags:
+        """Returns which inclusive spans overlap the window, as `overlaps`."""
+        return (firsts < self.stop) & (lasts >= self.start)
 
     def covers(self, first: Ns, last: Ns) -> bool:
         """Returns whether all of the inclusive span `[first, last]` lies inside."""

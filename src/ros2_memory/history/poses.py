@@ -164,7 +164,7 @@ class PoseReader:
     def _counting(self, rows: Rows) -> Rows:
         """Returns the rows without those at whose time another recording counts."""
         for pair in self._overruling(rows):
-            is_overruled = (rows.times >= pair.span.start) & (rows.times < pair.span.stop)
+            is_overruled = pair.span.holding(rows.times)
             if pair.bags:
                 is_of_bags = np.zeros(len(rows), np.bool_)
                 for bag, positions in rows.bag_rows():

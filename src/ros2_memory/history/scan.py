@@ -304,7 +304,7 @@ def messages_at(view: View, rows: Rows) -> Iterator[tuple[int, StoredMessage]]:
 
 def positions_in(times: Ints, window: TimeWindow) -> Ints:
     """Returns the positions of the times that are in a window."""
-    return np.flatnonzero((times >= window.start) & (times < window.stop))
+    return np.flatnonzero(window.holding(times))
 
 
 class Counted(NamedTuple):
@@ -350,7 +350,7 @@ def count_messages(
             continue
         bags, firsts, lasts, messages = column
         pieces = np.searchsorted(edges, firsts, side="right")
-        is_in_window = (firsts < window.stop) & (lasts >= window.start)
+        is_in_window = window.overlapping(firsts, lasts)
         must_be_read = _must_be_read(column, window, edges, shared_ends) | is_repeated
         is_known = is_in_window & ~must_be_read
         counted.add(pieces[is_known], messages[is_known], firsts[is_known], lasts[is_known])

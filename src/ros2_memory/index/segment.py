@@ -155,7 +155,7 @@ class Segment:
 
     def overlapping(self, window: TimeWindow) -> Iterator[BagFile]:
         """Yields the bags whose span overlaps a window, in order."""
-        return self.bags.at((self.bags.starts < window.stop) & (self.bags.ends >= window.start))
+        return self.bags.at(window.overlapping(self.bags.starts, self.bags.ends))
 
     @cached_property
     def recorded(self) -> Segment | None:
@@ -294,7 +294,7 @@ class Segment:
         column = self.column(topic)
         if column is None:
             return
-        is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
+        is_inside = window.overlapping(column.firsts, column.lasts)
         if among is not None:
             is_inside &= among[column.bags]
         rows, firsts, lasts, _ = (values[is_inside] for values in column)

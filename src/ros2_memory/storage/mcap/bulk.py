@@ -275,7 +275,7 @@ def _batch_by_channel(
 def _by_channel(messages: MessageTable, window: TimeWindow) -> IntArray:
     """Returns the rows of the messages inside a window, channel by channel."""
     order: IntArray = np.argsort(messages.channels, kind="stable")
-    is_inside = (messages.times >= window.start) & (messages.times < window.stop)
+    is_inside = window.holding(messages.times)
     return order if is_inside.all() else order[is_inside[order]]
 
 
