@@ -173,15 +173,19 @@ class SizeLimit(NamedTuple):
     max_bytes: int
     take_turn: Callable[[], None] = lambda: None
 
+    def require(self, what: str, size: int) -> None:
+        """Checks that something is not larger.
+
+        Raises:
+            UnreadableError: it is.
+        """
+        if size > self.max_bytes:
+            raise UnreadableError(
+                f"{what} is larger than the {self.max_bytes >> 20} MiB allowed; if that is right,"
+                " raise reader.max_chunk_mb"
+            )
+
 
 def max_decompressed_bytes(compressed: int) -> int:
     """Returns how many bytes these compressed bytes may decompress to at most."""
     return _ALWAYS_ALLOWED + MAX_COMPRESSION_RATIO * compressed
-
-
-def too_large(what: str, max_bytes: int) -> str:
-    """Returns the reason why something is not read."""
-    return (
-        f"{what} is larger than the {max_bytes >> 20} MiB allowed; if that is right, raise"
-        " reader.max_chunk_mb"
-    )

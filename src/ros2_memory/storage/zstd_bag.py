@@ -17,7 +17,6 @@ from ros2_memory.storage.errors import (
     SizeLimit,
     UnreadableError,
     max_decompressed_bytes,
-    too_large,
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 
@@ -126,8 +125,7 @@ def decompress_zstd(compressed: bytes | memoryview, limit: SizeLimit) -> bytes:
             decompress to.
     """
     stated = zstandard.frame_content_size(compressed)  # negative where the frame does not state it
-    if stated > limit.max_bytes:
-        raise UnreadableError(too_large("compressed data", limit.max_bytes))
+    limit.require("compressed data", stated)
     # zstandard allocates the stated size, so it must be possible: no block takes fewer bytes, or
     # decompresses to more (RFC 8878, 3.1.1.2).
     if stated > (len(compressed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
@@ -137,8 +135,7 @@ def decompress_zstd(compressed: bytes | memoryview, limit: SizeLimit) -> bytes:
             limit.take_turn()
         return _THREAD.decompressor.decompress(compressed)
     data = decompress_front(partial(zstd_front, compressed), limit)
-    if len(data) > limit.max_bytes:
-        raise UnreadableError(too_large("compressed data", limit.max_bytes))
+    limit.require("compressed data", len(data))
     return data
 
 

@@ -30,7 +30,6 @@ from ros2_memory.storage.errors import (
     UnreadableError,
     as_unreadable,
     max_decompressed_bytes,
-    too_large,
 )
 from ros2_memory.storage.mcap.records import (
     CHUNK,
@@ -363,8 +362,7 @@ def decompressed_chunk(body: bytes, limit: SizeLimit, *, is_whole: bool = True) 
     """
     head = chunk_head(body)
     compressed = memoryview(body)[head.data_at : head.data_at + head.data_size]
-    if head.data_size > limit.max_bytes:
-        raise UnreadableError(too_large("a chunk", limit.max_bytes))
+    limit.require("a chunk", head.data_size)
     if not is_whole:
         if head.compression == "zstd":
             data = decompress_front(partial(zstd_front, compressed), limit)
@@ -374,8 +372,7 @@ def decompressed_chunk(body: bytes, limit: SizeLimit, *, is_whole: bool = True) 
     if len(compressed) != head.data_size:
         raise UnreadableError("damaged: a chunk is shorter than it states")
     data = _decompress(head.compression, compressed, limit)
-    if len(data) > limit.max_bytes:
-        raise UnreadableError(too_large("a chunk", limit.max_bytes))
+    limit.require("a chunk", len(data))
     if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableError("damaged: a chunk does not match its checksum")
     return data

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from ros2_memory.core.text import counted
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.contents import Tally
-from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
+from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, MessageTable
 from ros2_memory.storage.mcap.index import OTHER_DECLARED, McapIndex, disagreements
 from ros2_memory.storage.mcap.records import (
@@ -53,7 +53,7 @@ def index_by_scan(file: OpenFile, limit: SizeLimit, note: str = "") -> McapIndex
     Raises:
         UnreadableError: the file is not MCAP, or is empty.
     """
-    scan = _Scan(file, limit.max_bytes, ChunkOpener(file, limit))
+    scan = _Scan(file, limit, ChunkOpener(file, limit))
     for record in file_records(file):
         scan.add(record)
     return scan.index(note)
@@ -76,7 +76,7 @@ class _Scan:
 
     Attributes:
         file: the open file.
-        max_bytes: the size up to which a message outside chunks is read.
+        limit: up to which a message outside chunks is read.
         opener: decompresses the chunks.
         read_to: where the last readable record ends.
         data_ended: whether the data section is over, so that the summary section follows.
@@ -94,7 +94,7 @@ class _Scan:
     """
 
     file: OpenFile
-    max_bytes: int
+    limit: SizeLimit
     opener: ChunkOpener
     read_to: int = MAGIC_SIZE
     data_ended: bool = False
@@ -131,8 +131,7 @@ class _Scan:
         self.read_to = record.end
 
     def _add_message(self, record: FileRecord) -> None:
-        if record.end - record.offset > self.max_bytes:
-            raise UnreadableError(too_large("a message", self.max_bytes))
+        self.limit.require("a message", record.end - record.offset)
         if not self.unchunked.times or record.end > self.unchunked.begin + _UNCHUNKED_BYTES:
             self._close_unchunked()
             self.unchunked = _Unchunked(record.offset)
