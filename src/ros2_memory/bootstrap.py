@@ -449,10 +449,8 @@ class SharedParts(NamedTuple):
     caches: Caches
 
 
-def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedParts:
+def shared_parts(settings: Settings) -> SharedParts:
     """Returns the parts that read and decode the bags of one memory, or of several.
-
-    `cache_mb` is the size of each cache, of chunks and of columns; None as configured.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
@@ -461,8 +459,8 @@ def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedPa
 
     extractor = _extractor_of(settings)
     large = LargeReads()
-    reader = build_reader(settings, cache_mb=cache_mb, large=large)
-    caches = Caches.of(cache_mb or settings.store.cache_mb)
+    reader = build_reader(settings, large=large)
+    caches = Caches.of(settings.store.cache_mb)
     return SharedParts(reader, large, extractor, caches)
 
 
