@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.arrays import places_among
+from ros2_memory.core.arrays import concatenated, places_among
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.index.bag_rows import Bags
 
@@ -60,8 +60,7 @@ class Coverage:
     def __init__(self, state: State, segments: Sequence[CoveredSegment]) -> None:
         self.state = state
         self.segments = tuple(segments)
-        numbers = [covered.numbers for covered in segments]
-        all_numbers = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
+        all_numbers = concatenated(covered.numbers for covered in segments)
         order = np.argsort(all_numbers, kind="stable")
         self._of_parts: dict[int, IntArray] = {}
         self._bags = Bags(covered.segment.bags for covered in segments)

@@ -30,6 +30,7 @@ from ros2_memory.columns.units import (
     repeated_among,
 )
 from ros2_memory.columns.writing import DELAY, PUBLISH_TIME
+from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
@@ -474,7 +475,7 @@ class Scan:
         copies = self._copies.get(unit.key, [])
         if self.repeats_latched:
             copies = [*copies, self._received_again(unit)]
-        return np.concatenate(copies) if copies else np.empty(0, np.int64)
+        return concatenated(copies)
 
     def _find_copies(self, window: TimeWindow, span: TimeWindow) -> None:
         """Finds the copies in a window of a shared span."""

@@ -14,6 +14,7 @@ from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
 from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.steps import METRES, QUATERNION, Step
 from ros2_memory.columns.table import Elements, Table, Texts
+from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.model import StampedTransform, Transform
 
 if TYPE_CHECKING:
@@ -106,14 +107,14 @@ def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntAr
     if edges is None:
         return None
     parents = Counter(child for _, child in edges)
-    changes = [np.zeros(0, np.int64)]
+    changes: list[IntArray] = []
     for (_, child), edge in edges.items():
         is_new = np.ones(edge.log_times.size, np.bool_)
         if parents[child] == 1:  # else its transforms may alternate between parents
             numbers = np.column_stack((edge.translation, edge.rotation))
             is_new[1:] = (numbers[1:] != numbers[:-1]).any(axis=1)
         changes.append(edge.log_times[is_new])
-    return np.unique(np.concatenate(changes))
+    return np.unique(concatenated(changes))
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,6 +46,11 @@ def gathered(
     return elements[places].view(dtype)
 
 
+def concatenated(parts: Iterable[Ints]) -> Ints:
+    """Returns arrays of integers one after the other; an empty one if there are none."""
+    return np.concatenate([np.empty(0, np.int64), *parts])
+
+
 def row_sums(rows: NDArray[np.float64]) -> Floats:
     """Returns the sum of each row, added from left to right.
 

@@ -17,6 +17,7 @@ from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, Siz
 from ros2_memory.columns.scan import Scan, Stretch
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.units import BagUnit, Rows
+from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import united
@@ -419,7 +420,7 @@ def _nth_messages(
         rows.some(positions_in(rows.times, part)) for rows in _in_order([*opened.rows(among=part)])
     ]
     begins = np.cumsum([0, *map(len, tables)])
-    times = np.concatenate([np.empty(0, np.int64), *(rows.times for rows in tables)])
+    times = concatenated(rows.times for rows in tables)
     order = np.argsort(times, kind="stable")
     for row in order[numbers[numbers < times.size]].tolist():  # a bag may be deleted since
         table = int(np.searchsorted(begins, row, side="right")) - 1

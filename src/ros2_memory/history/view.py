@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from ros2_memory.analysis.intervals import THINNED_NS
+from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -130,13 +129,10 @@ class View:
 
     def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
         """Returns the first and last log times of a topic in each bag of a window, or near it."""
-        firsts, lasts = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-        for segment in self.timeline.segments_in(window):
-            column = segment.column(topic)
-            if column is not None:
-                firsts.append(column.firsts)
-                lasts.append(column.lasts)
-        return np.concatenate(firsts), np.concatenate(lasts)
+        in_segments = (segment.column(topic) for segment in self.timeline.segments_in(window))
+        columns = [column for column in in_segments if column is not None]
+        firsts = concatenated(column.firsts for column in columns)
+        return firsts, concatenated(column.lasts for column in columns)
 
     def note_thinned(self, window: TimeWindow) -> None:
         """Records for the reply if a window that was read lies partly in thinned days."""

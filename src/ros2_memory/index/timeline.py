@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
-from ros2_memory.core.arrays import Ints, joined_codes, run_starts
+from ros2_memory.core.arrays import Ints, concatenated, joined_codes, run_starts
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import (
@@ -151,8 +151,7 @@ class Timeline:
     @property
     def starts(self) -> Ints:
         """Log time of the first message in each bag."""
-        starts = (segment.bags.starts for segment in self.segments)
-        return np.concatenate([np.empty(0, np.int64), *starts])
+        return concatenated(segment.bags.starts for segment in self.segments)
 
     @property
     def latest(self) -> Ns:
@@ -162,8 +161,7 @@ class Timeline:
     @property
     def ends(self) -> Ints:
         """Log time of the last message in each bag."""
-        ends = (segment.bags.ends for segment in self.segments)
-        return np.concatenate([np.empty(0, np.int64), *ends])
+        return concatenated(segment.bags.ends for segment in self.segments)
 
     @property
     def folder_numbers(self) -> Ints:
