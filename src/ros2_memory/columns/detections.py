@@ -68,12 +68,11 @@ class NamedScores(NamedTuple):
     @property
     def is_named(self) -> Mask:
         """Which objects have a name."""
-        return np.array([bool(word.strip()) for word in self.name.words], np.bool_)[self.name.codes]
+        return self.name.are(str.strip)
 
     def at(self, positions: IntArray) -> NamedScores:
         """Returns the names and scores of the objects at some positions."""
-        name, score, error = self
-        return NamedScores(Texts(name.codes[positions], name.words), score[positions], error)
+        return NamedScores(self.name.at(positions), self.score[positions], self.error)
 
 
 class Scored(NamedTuple):
@@ -457,10 +456,10 @@ class Detections(NamedTuple):
         rows, labels, scores, places, frames = self
         return Detections(
             rows[which],
-            Texts(labels.codes[which], labels.words),
+            labels.at(which),
             scores[which],
             places[which],
-            Texts(frames.codes[which], frames.words),
+            frames.at(which),
         )
 
 
@@ -564,7 +563,7 @@ def _read_stamped(table: Table, plan: _Plan) -> StampedDetections:
         [part for source in plan.sources for part in detections_in(values, source, places=True)]
     )
     frames = _frames_at(values, ROWS, np.arange(values.rows), plan.frames)
-    header_frames = Texts(frames.codes[detections.rows], frames.words)
+    header_frames = frames.at(detections.rows)
     return StampedDetections(
         detections._replace(frames=_texts_or(detections.frames, header_frames)),
         None if plan.stamp is None else values.numbers(plan.stamp).values.astype(np.int64),
@@ -628,8 +627,7 @@ def detections_in(values: Values, source: Source, *, places: bool) -> Iterator[D
 def _in_labels(values: Values, leaf: Leaf) -> Detections:
     """Returns the texts of lists of labels, but for empty ones, without a score."""
     texts = values.texts(leaf)
-    is_label = np.array([bool(word) for word in texts.words], np.bool_)
-    positions = np.flatnonzero(is_label[texts.codes])
+    positions = np.flatnonzero(texts.are(bool))
     named = NamedScores(texts, np.full(len(texts), math.nan), 0.0)
     return _detections_at(values, leaf.level, positions, named.at(positions))
 
@@ -710,9 +708,8 @@ def _frames_at(values: Values, level: Level, positions: IntArray, leaves: Sequen
     """Returns the frame at some positions of a level: the one that the innermost object names."""
     frames = _no_frames(positions.size)
     for leaf in leaves:
-        texts = values.texts(leaf)
-        codes = texts.codes[_owners_at(values, level, positions, leaf.level)]
-        frames = _texts_or(Texts(codes, texts.words), frames)
+        texts = values.texts(leaf).at(_owners_at(values, level, positions, leaf.level))
+        frames = _texts_or(texts, frames)
     return frames
 
 

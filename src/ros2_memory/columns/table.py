@@ -34,7 +34,7 @@ from ros2_memory.core.arrays import in_ranges, joined_codes, numbered
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from ros2_memory.storage.base import Channel, Definition, IntArray
+    from ros2_memory.storage.base import Channel, Definition, IntArray, Mask
 
 T = TypeVar("T")
 
@@ -142,6 +142,14 @@ class Texts:
         """Returns the string of each row."""
         words = self.words
         return [words[code] for code in self.codes.tolist()]
+
+    def are(self, wanted: Callable[[str], object]) -> Mask:
+        """Returns which rows have a word that is wanted; each word is asked about once."""
+        return np.array([bool(wanted(word)) for word in self.words], np.bool_)[self.codes]
+
+    def at(self, positions: IntArray | Mask) -> Texts:
+        """Returns some rows, with all words."""
+        return Texts(self.codes[positions], self.words)
 
     def rows(self, positions: IntArray) -> Texts:
         """Returns some rows, without the words that none of them has."""

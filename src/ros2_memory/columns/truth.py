@@ -111,9 +111,9 @@ class ColumnCondition:
         if plan is not None and plan.names is not None:
             with suppress(UnknownShapeError):
                 names, owners = values.texts(plan.names), values.elements(plan.names.level).owners
-                is_asked = np.array([word == plan.element for word in names.words], np.bool_)
                 counts = np.bincount(owners, minlength=values.rows)
-                asked = np.bincount(owners[is_asked[names.codes]], minlength=values.rows)
+                is_asked = names.are(lambda word: word == plan.element)
+                asked = np.bincount(owners[is_asked], minlength=values.rows)
                 has_others_alone: Mask = (counts > 0) & (asked == 0)
                 return has_others_alone
         return np.zeros(values.rows, np.bool_)

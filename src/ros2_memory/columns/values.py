@@ -490,7 +490,7 @@ def at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Lim
 
     def find(values: Values, positions: IntArray) -> TruthValues:
         texts, owners = values.texts(names), values.elements(names.level).owners
-        has_name = np.array([word == name for word in texts.words], np.bool_)[texts.codes]
+        has_name = texts.are(lambda word: word == name)
         named = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
         place_in_row = np.full(values.rows, -1)
         place_in_row[owners[named]] = values.places(names.level, named, from_end=False)
