@@ -15,7 +15,7 @@ import numpy as np
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.decode import Group, undecoded
-from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore, relative
+from ros2_memory.columns.store import LONG_NS, BagKey, relative
 from ros2_memory.columns.writing import PART_NS, Level, ReadBag
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.large_reads import LargeReads
@@ -116,9 +116,10 @@ class Filling:
         large: LargeReads | None = None,
     ) -> None:
         self._large = large or LargeReads()
-        if scanner.store is None:
+        if scanner.covering is None:
             raise ValueError("a scanner without a store has nothing to fill")
-        self.store: ColumnStore = scanner.store
+        self._covering = scanner.covering
+        self.store = scanner.covering.store
         self._scanner = scanner
         self._reader = reader
         self._bag_dir = bag_dir
@@ -135,9 +136,7 @@ class Filling:
 
         They include stored bags that have no hashes, and beside which another recording lies now.
         """
-        coverage = self._scanner.coverage(timeline)
-        if coverage is None:
-            return []
+        coverage = self._covering.of(timeline)
         bags = [*coverage.to_store]
         bags += [bag for bag in coverage.unhashed() if self._is_shared(bag, timeline)]
         bags = [bag for bag in bags if not self._is_refused(self._key(bag))]
@@ -145,8 +144,7 @@ class Filling:
 
     def progress(self, timeline: Timeline) -> Progress:
         """Returns how much is stored. Any thread may ask."""
-        coverage = self._scanner.coverage(timeline)
-        missing = () if coverage is None else coverage.missing
+        missing = self._covering.of(timeline).missing
         return Progress(
             timeline.closed,
             timeline.closed - sum(bag.state is BagState.CLOSED for bag in missing),
@@ -160,9 +158,7 @@ class Filling:
         A bag is stored alone until its ten minutes are over, then together with the bags of these,
         and together with the bags of its hour once that is over.
         """
-        coverage = self._scanner.coverage(timeline)
-        if coverage is None:
-            return []
+        coverage = self._covering.of(timeline)
         waiting = self.waiting(timeline)
         stored_alone = {*self._below(Level.TEN_MINUTES, coverage)}
         of_ten_minutes = stored_alone.union(waiting)
@@ -227,8 +223,8 @@ class Filling:
 
     def count_gone(self, timeline: Timeline) -> tuple[int, int]:
         """Returns how many stored bags are gone or have changed, and how many there are."""
-        coverage, stored = self._scanner.coverage(timeline), self.store.numbers().size
-        return stored - (0 if coverage is None else coverage.stored), stored
+        coverage, stored = self._covering.of(timeline), self.store.numbers().size
+        return stored - coverage.stored, stored
 
     def prune(self, timeline: Timeline) -> None:
         """Deletes the bags whose files are gone.

@@ -172,6 +172,7 @@ class Scanner:
 
     Attributes:
         store: as given.
+        covering: says which bags are stored; None without a store.
         caches: the part of the caches that is its own.
     """
 
@@ -185,7 +186,7 @@ class Scanner:
     ) -> None:
         self.store = store
         self._large = large or LargeReads()
-        self._covering = None if store is None else Covering(store, bag_dir)
+        self.covering = None if store is None else Covering(store, bag_dir)
         self.caches = Caches.of() if caches is None else caches.namespace()
         self._reading = reading
         self._damaged: dict[tuple[str | Ns, ...], str] = {}
@@ -246,7 +247,7 @@ class Scanner:
 
     def coverage(self, timeline: Timeline) -> Coverage | None:
         """Returns which bags of a timeline are stored; None without a store."""
-        return None if self._covering is None else self._covering.of(timeline)
+        return None if self.covering is None else self.covering.of(timeline)
 
     def channels(self, timeline: Timeline, bag: BagFile) -> list[Channel]:
         """Returns the channels of all topics ever stored; none if `bag` is not stored."""
