@@ -32,8 +32,7 @@ from ros2_memory.columns.values import (
     unknown,
     zones_of,
 )
-from ros2_memory.columns.walk import entries_of_codes
-from ros2_memory.core.arrays import Floats, places_among
+from ros2_memory.core.arrays import Floats, entries_of_codes, places_among
 from ros2_memory.core.text import LISTS_OF_LABELS, looks_like_json
 from ros2_memory.messages.detections import (
     MAX_DEPTH,

@@ -38,7 +38,7 @@ from ros2_memory.analysis.facts import (
 from ros2_memory.columns.detections import Source, detections_in, sources_in
 from ros2_memory.columns.shown import UNKNOWN, ByType, Node, Shape, at_field, leaves_of
 from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, within_limits
-from ros2_memory.columns.walk import entries_of_codes
+from ros2_memory.core.arrays import entries_of_codes
 from ros2_memory.core.text import dotted
 
 if TYPE_CHECKING:

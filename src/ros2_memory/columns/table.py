@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.core.arrays import in_ranges, joined_codes, numbered
+from ros2_memory.core.arrays import entries_of_codes, joined_codes, numbered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -192,9 +192,7 @@ class Elements:
 
     def rows(self, positions: IntArray) -> Elements:
         """Returns the elements of some rows, which become the rows 0, 1, 2 and so on."""
-        first = np.searchsorted(self.owners, positions, "left")
-        counts = np.searchsorted(self.owners, positions, "right") - first
-        taken = in_ranges(first, counts)
+        counts, taken = entries_of_codes(self.owners, positions)
         return Elements(
             np.repeat(np.arange(positions.size), counts),
             {path: _rows_of(column, taken) for path, column in self.columns.items()},

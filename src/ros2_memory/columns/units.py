@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.columns.writing import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
-from ros2_memory.core.arrays import Flags, Groups, distinct_rows, in_ranges, run_starts
+from ros2_memory.core.arrays import Flags, Groups, distinct_rows, places_within, run_starts
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.index.segment import in_time
@@ -233,7 +233,7 @@ class Rows:
             return np.zeros(index.size, np.int64)
         groups = Groups.of(distinct_rows((numbers, times))[1])
         ranks = np.empty_like(groups.order)
-        ranks[groups.order] = in_ranges(np.zeros_like(groups.sizes), groups.sizes)
+        ranks[groups.order] = places_within(groups.sizes)
         return ranks[index - begin]
 
     def some(self, positions: IntArray) -> Rows:

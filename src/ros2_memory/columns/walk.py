@@ -22,7 +22,7 @@ from ros2_memory.columns.table import (
     Numbers,
     Texts,
 )
-from ros2_memory.core.arrays import gathered, in_ranges
+from ros2_memory.core.arrays import gathered, places_within
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import SEQUENCE, Batch, IntArray, Mask
 
@@ -244,7 +244,7 @@ class _Walk:
             data = gathered(self.buffer, np.dtype(f"V{count * step.size}"), places).tobytes()
             return np.frombuffer(data, step.dtype)
         return gathered(
-            self.buffer, step.dtype, np.repeat(places, counts) + _places_within(counts) * step.size
+            self.buffer, step.dtype, np.repeat(places, counts) + places_within(counts) * step.size
         )
 
     def _read_sequence(
@@ -303,28 +303,11 @@ def _locate_fixed(
     second = _aligned(first - rest + ends[rest], plan.align)
     rest = second % unit
     distance = _aligned(ends[rest], plan.align) - rest
-    nth = _places_within(counts)
+    nth = places_within(counts)
     begins = np.where(nth == 0, first[owners], second[owners] + (nth - 1) * distance[owners])
     last = np.where(counts > 1, second + (counts - 2) * distance, first)
     end = last - last % unit + ends[last % unit]
     return begins, np.where(counts > 0, end, at)
-
-
-def _places_within(counts: IntArray) -> IntArray:
-    """Returns the numbers from 0 up to each count, exclusive, one after the other."""
-    return in_ranges(np.zeros_like(counts), counts)
-
-
-def entries_of_codes(entries: IntArray, codes: IntArray) -> tuple[IntArray, IntArray]:
-    """Returns how many entries have each code, and the positions of these entries.
-
-    Args:
-        entries: the code of each entry, ascending.
-        codes: the codes to look for; one may occur several times.
-    """
-    begins = np.searchsorted(entries, codes)
-    counts = np.searchsorted(entries, codes, side="right") - begins
-    return counts, in_ranges(begins, counts)
 
 
 def add_sequence(

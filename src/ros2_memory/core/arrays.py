@@ -77,6 +77,23 @@ def in_ranges(starts: Ints, sizes: Ints) -> Ints:
     return numbers
 
 
+def places_within(counts: Ints) -> Ints:
+    """Returns the numbers from 0 up to each count, exclusive, one after the other."""
+    return in_ranges(np.zeros_like(counts), counts)
+
+
+def entries_of_codes(entries: Ints, codes: Ints) -> tuple[Ints, Ints]:
+    """Returns how many entries have each code, and the positions of these entries.
+
+    Args:
+        entries: the code of each entry, ascending.
+        codes: the codes to look for; one may occur several times.
+    """
+    begins = np.searchsorted(entries, codes)
+    counts = np.searchsorted(entries, codes, side="right") - begins
+    return counts, in_ranges(begins, counts)
+
+
 def places_among(numbers: Ints, ascending: Ints) -> tuple[Ints, Flags]:
     """Looks up numbers in an ascending array; returns their positions, and which are in it.
 

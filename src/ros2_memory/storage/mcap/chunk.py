@@ -16,7 +16,7 @@ import lz4.frame  # type: ignore[import-untyped]  # has no types
 import numpy as np
 from mcap.opcode import Opcode
 
-from ros2_memory.core.arrays import gathered
+from ros2_memory.core.arrays import gathered, places_within
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.errors import (
@@ -154,7 +154,7 @@ def read_indexes(
     if wanted is not None:
         is_wanted &= np.isin(channels, np.array(sorted(wanted), np.int64), kind="sort")
     counts = counts[is_wanted]
-    nth = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    nth = places_within(counts)
     places = np.repeat(entries_at[is_wanted], counts) + nth * _ENTRY.itemsize
     entries = gathered(region, _ENTRY, places)
     messages = MessageTable(
