@@ -123,8 +123,10 @@ def rows_by(group: Ints, groups: int) -> list[Ints]:
 
 def run_starts(*columns: Ints) -> Ints:
     """Returns where each run of equal rows begins; the columns are of one length."""
-    is_other = np.ones(len(columns[0]), np.bool_)
-    is_other[1:] = np.any([column[1:] != column[:-1] for column in columns], axis=0)
+    is_other = np.zeros(len(columns[0]), np.bool_)
+    is_other[:1] = True
+    for column in columns:
+        is_other[1:] |= column[1:] != column[:-1]
     return np.flatnonzero(is_other)
 
 
