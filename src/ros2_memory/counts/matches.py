@@ -62,7 +62,7 @@ from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
-from ros2_memory.insights.sightings import held_spans, read_sightings
+from ros2_memory.insights.sightings import SightingSpans, held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back, flags_before
 from ros2_memory.places.where import Scope, Where, WhileCondition, heard_times, parse_where
 from ros2_memory.results import Bins
@@ -72,7 +72,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue
 
 _TRUTHS = {"true": True, "false": False}
@@ -87,18 +86,6 @@ class _HeldSpan(NamedTuple):
     start: Ns
     stop: Ns
     is_begun: bool
-
-
-class _HeldTimes(NamedTuple):
-    """When a condition held.
-
-    Attributes:
-        spans: the times, as `held_spans` returns them.
-        since: log time from which on they are known, if time ran out; else None.
-    """
-
-    spans: Ints
-    since: Ns | None
 
 
 def count_matches(
@@ -150,12 +137,10 @@ def count_matches(
     binned = BinnedWindow(view, asked, by, topics, places)
     note_robots_on(view, topics, binned.counted)
     scope = Scope(view, binned.counted, where, during)
-    too_many = ""
     held = _held_by_events(binned, topics, condition, value, scope)
     if held is None:
-        spans, since, too_many = read_sightings(view, topic, condition, scope)
-        held = _HeldTimes(spans, since)
-    binned.count_since(held.since, too_many)
+        held = read_sightings(view, topic, condition, scope)
+    binned.count_since(held.since, held.too_many)
     binned.add_heard("topic_s", topics)
     binned.add_unknown(scope.unknown)
     binned.add_held(held.spans)
@@ -195,7 +180,7 @@ def _held_by_events(
     condition: Condition,
     value: JsonValue,
     scope: Scope,
-) -> _HeldTimes | None:
+) -> SightingSpans | None:
     """Returns when a boolean or a label held in a scope; None if the condition is on neither."""
     types = {name for topic in topics for name in binned.view.timeline.types_of(topic)}
     if not isinstance(condition.test, Contains | Equals) or not any(map(has_events, types)):
@@ -214,7 +199,7 @@ def _held_by_events(
 
 def _boolean_held(
     binned: BinnedWindow, topic: str, condition: Condition, scope: Scope, *, wanted: bool
-) -> _HeldTimes | None:
+) -> SightingSpans | None:
     """Returns when a boolean of a topic held; None if it is not clear which one is meant."""
     view = binned.view
     # Booleans in lists are no events.
@@ -236,7 +221,7 @@ def _boolean_held(
         if not in_scope:
             raise
         since = min(span.start for span in in_scope)
-    return _HeldTimes(held_spans(sorted(in_scope)), since)
+    return SightingSpans(held_spans(sorted(in_scope)), since)
 
 
 def _has_lists(view: View, topic: str) -> bool:
@@ -277,7 +262,7 @@ def _note_uncounted(view: View, topic: str, parts: Sequence[TopicEvents]) -> Non
 
 def _label_held(
     binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
-) -> _HeldTimes | None:
+) -> SightingSpans | None:
     """Returns when a thing was in view whose label meets a condition; None if no label does."""
     view, matches = binned.view, Condition(condition.test).matches
     if scope.is_bounded or condition.min_score or len(topics) > 1:
@@ -299,7 +284,7 @@ def _label_held(
     spans = united(
         ((interval.first, interval.last) for interval in visible.intervals()), FLICKER_NS
     )
-    return _HeldTimes(held_spans((first, last, True) for first, last in spans), since)
+    return SightingSpans(held_spans((first, last, True) for first, last in spans), since)
 
 
 def _visible_by_events(
