@@ -25,6 +25,7 @@ from ros2_memory.analysis.silences import length_in
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import (
@@ -547,6 +548,5 @@ class BinnedWindow:
             if not has_values:
                 spans.append(f"{first} to {later[-1]}" if later else first)
         if spans:
-            more = len(spans) - _MOST_SPANS
-            shown = ", ".join(spans[:_MOST_SPANS]) + (f" and {more} more" if more > 0 else "")
+            shown = listed(spans, at_most=_MOST_SPANS)
             self.view.notes.add(f"no rows for times in which nothing was recorded: {shown}")
