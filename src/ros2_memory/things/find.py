@@ -347,7 +347,8 @@ class _Finder:
     def describe(self, found: _FoundThing) -> Thing:
         """Returns a thing as replies show it."""
         estimate, thing, rows = self.known.estimate, found.thing, found.rows
-        frame, spots = self.known.frames[thing.epoch], estimate.spots[rows]
+        frame = self.known.frames[thing.epoch]
+        seen = self.known.describe_stay(rows, found.place, frame, self.places)
         best, median = self._scores(rows)
         shown = Thing(
             label=found.label,
@@ -355,10 +356,10 @@ class _Finder:
             place=found.place,
             spread_m=int(estimate.spots[found.newest[0], Spot.DEV]) / _MM,
             frame_id=frame,
-            inside=places_at(self.places, frame, *found.place[:2]),
-            first=int(spots[:, Spot.FIRST].min()),
+            inside=seen.inside,
+            first=seen.start,
             last=found.last,
-            count=int(estimate.counts[rows].sum()),
+            count=seen.count,
             best=best,
             median=median,
             robot=estimate.seen_from(found.newest),
