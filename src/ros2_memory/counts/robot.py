@@ -6,7 +6,6 @@ So the metres of all bins add up to the metres of the window.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -122,7 +121,7 @@ def count_visits(
         NoDataError: nothing is recorded in the window, or no poses.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    place = asked_place(memory.limits, (x, y), radius_m, where)
+    place = asked_place(memory.limits, (x, y), radius_m, where, frame_id)
     if by == "place" and x is not None:
         raise InvalidArgumentsError(
             "by place counts the places of where, or all named ones: give where in place of x and y"
@@ -133,11 +132,7 @@ def count_visits(
     asked = clamped(view, window)
     topic = resolve_path_topic(view)
     mixed_spans = note_robots(view, topic, asked)
-    named_frame = None if place is None else place.frame_id
-    asked_frame = frame_id if named_frame is None else named_frame
-    placement = map_placement(view, topic, asked_frame)
-    if place is not None:
-        place = replace(place, frame_id=asked_frame)
+    placement = map_placement(view, topic, frame_id if place is None else place.frame_id)
     binned = BinnedWindow(view, asked, by, (topic,), place)
     # `count_since` narrows what is counted. The call remembers the track of this wider window.
     window = binned.counted
@@ -149,7 +144,7 @@ def count_visits(
     binned.add_unknown(unknown)
     if place is not None and by != "place":
         stays = _stays(view, placement.frame_id, place.region, window)
-        if not stays and asked_frame is None:
+        if not stays:
             ask = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, ask)
         _add_visits(binned, stays)

@@ -92,13 +92,12 @@ def visits(
         NoDataError: nothing is recorded, or no poses.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    place = asked_place(memory.limits, (x, y), radius_m, where)
+    place = asked_place(memory.limits, (x, y), radius_m, where, frame_id)
     view, now, window = open_search(memory, call, TimeRange(start_s, end_s))
     require_recorded(view, window)
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
-    asked_frame = frame_id if place is None or place.frame_id is None else place.frame_id
-    placement = map_placement(view, topic, asked_frame)
+    placement = map_placement(view, topic, frame_id if place is None else place.frame_id)
     if place is None:
         return _visits_of_places(view, window, placement, mixed, now)
     confirmed = ConfirmedStays(view, placement.frame_id, place.region, window)
@@ -110,7 +109,7 @@ def visits(
     )
     if not placement.is_map:
         shown = _with_restarts(view, topic, shown, now)
-    if not confirmed.visits and asked_frame is None:
+    if not confirmed.visits:
         ask = f'ask with frame_id "{placement.pose_frame}"'
         note_other_frame(view, place, placement, window, ask)
     view.notes.retract_outside(window)
@@ -187,6 +186,7 @@ def asked_place(
     point: tuple[float | None, float | None],
     radius_m: float | None,
     where: JsonValue,
+    frame_id: str | None,
 ) -> Where | None:
     """Returns the place that the arguments of a tool name; None for all named places.
 
@@ -195,6 +195,7 @@ def asked_place(
         point: the middle x and y (m) of a circle, if they are given.
         radius_m: the radius of a circle; None for the position tolerance.
         where: the argument `where`, if it is given.
+        frame_id: the frame of a place that names none; None for the map.
 
     Raises:
         InvalidArgumentsError: the arguments are invalid, name two places, or name none although no
@@ -207,9 +208,10 @@ def asked_place(
     if where is not None:
         if point != (None, None):
             raise InvalidArgumentsError("give either where or x and y")
-        return parse_where(limits, where, radius)
+        place = parse_where(limits, where, radius)
+        return place if place.frame_id is not None else replace(place, frame_id=frame_id)
     if x is not None and y is not None:
-        return Where(Circle(x, y, radius))
+        return Where(Circle(x, y, radius), frame_id)
     if point != (None, None):
         raise InvalidArgumentsError("x and y must both be given, or neither")
     if not limits.places:
