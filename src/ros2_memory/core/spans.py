@@ -12,10 +12,17 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from ros2_memory.core.arrays import Ints
+
 COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
 """How far apart the log times of one message in two recordings are at most."""
 Spans: TypeAlias = list[Span]
 """Sorted and apart, where functions return them."""
+
+
+def spans_of(starts: Ints, stops: Ints) -> list[Span]:
+    """Returns the spans from each start to its stop, as they come."""
+    return [*zip(starts.tolist(), stops.tolist(), strict=True)]
 
 
 def united(spans: Iterable[Span], apart: Ns = 0) -> Spans:

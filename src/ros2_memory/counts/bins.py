@@ -24,7 +24,7 @@ from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
@@ -360,8 +360,7 @@ class BinnedWindow:
         """Adds how long topics had messages, without gaps and pauses of more than two splits."""
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
         firsts, lasts = pieces_of(*self.bounds(topics), pause)
-        heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
-        self.add_lengths(column, "duration", without(heard, self.gaps))
+        self.add_lengths(column, "duration", without(spans_of(firsts, lasts), self.gaps))
 
     def bounds(self, topics: Sequence[str]) -> tuple[Ints, Ints]:
         """Returns the first and the last log times (ns) of each topic in each counted bag."""
@@ -401,7 +400,7 @@ class BinnedWindow:
         begins = starts[begun[inside] > 0]
         self.add_counts("count", begins)
         is_long = starts < stops
-        lasting = united(zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True))
+        lasting = united(spans_of(starts[is_long], stops[is_long]))
         self.add_lengths("seconds", "duration", without(lasting, self.gaps))
         self.add_first("first", begins)
         self.add_last(self._last_held(starts, stops), max(stops.tolist(), default=None))

@@ -34,7 +34,7 @@ from ros2_memory.analysis.intervals import (
 from ros2_memory.analysis.topic_events import TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.text import Quoted, counted, listed, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import HELD_COLUMNS, BinnedWindow, By
@@ -384,7 +384,7 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     following = np.searchsorted(lasts[order], ends)
     earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
     heard_again = np.append(earliest, MIN_NS)[following].clip(ends)
-    return [*zip(begins.tolist(), heard_again.tolist(), strict=True)]
+    return spans_of(begins, heard_again)
 
 
 def _without_gaps(span: _HeldSpan, gaps: Sequence[Span]) -> list[_HeldSpan]:

@@ -30,7 +30,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import Place, names_by_size, places_at
-from ros2_memory.core.spans import Spans, without
+from ros2_memory.core.spans import Spans, spans_of, without
 from ros2_memory.core.text import abbreviate, counted
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.coverage import unix_text
@@ -390,7 +390,7 @@ def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
     Not in the spans `mixed`, in which several robots were recorded.
     """
     starts, stops = track.pieces
-    return without(zip(starts.tolist(), (stops + 1).tolist(), strict=True), mixed)
+    return without(spans_of(starts, stops + 1), mixed)
 
 
 def make_tracks(view: View, window: TimeWindow) -> Iterator[Ns]:

@@ -21,7 +21,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
-from ros2_memory.core.spans import Spans, lies_inside, united, without
+from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
 from ros2_memory.core.text import abbreviate, caseless
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.coverage import unknown_times
@@ -524,10 +524,10 @@ def heard_times(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
         starts.append(firsts[~is_long])
         stops.append(lasts[~is_long])
         if is_long.any():
-            long = zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
+            long = spans_of(firsts[is_long], lasts[is_long] + 1)
             for rows in scan(view, topic, window, columns=False, within=united(long)):
                 piece_starts, piece_stops = pieces_of(rows.times, rows.times)
                 starts.append(piece_starts)
                 stops.append(piece_stops)
     heard_from, heard_to = pieces_of(np.concatenate(starts), np.concatenate(stops))
-    return list(zip(heard_from.tolist(), (heard_to + 1).tolist(), strict=True))
+    return spans_of(heard_from, heard_to + 1)

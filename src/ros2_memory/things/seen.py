@@ -23,6 +23,7 @@ from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.sights import pack_sights, unite_sights
 from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import spans_of
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import open_scan, remembered, scan
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer
@@ -277,7 +278,7 @@ class SightReader:
         sizes = last - first + 1
         is_odd = sizes > _MANY
         numbers = [in_ranges(first[~is_odd], sizes[~is_odd])]
-        for start, end in zip(starts[is_odd].tolist(), ends[is_odd].tolist(), strict=True):
+        for start, end in spans_of(starts[is_odd], ends[is_odd]):
             # Centuries may lie between two messages of such a bag: look which stretches have any.
             window = TimeWindow(start, end).widened(1)
             for topic in self._topics:
