@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import Flags, Ints, joined_codes
+from ros2_memory.core.arrays import Flags, Ints, joined_codes, range_numbers
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
@@ -258,7 +258,7 @@ def _merge_tables(tables: Sequence[IntervalTable], follows: Flags) -> IntervalTa
     rows = np.frombuffer(b"".join([table.rows for table in tables]), ROW)
     if not rows.size:
         return IntervalTable()
-    part = np.repeat(np.arange(len(tables)), [table.size for table in tables])
+    part = range_numbers([table.size for table in tables])
     codes, words = joined_codes((table._array["label"], table.labels) for table in tables)
     labels = tuple(sorted(words))
     place = {label: at for at, label in enumerate(labels)}

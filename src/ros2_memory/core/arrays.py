@@ -94,6 +94,11 @@ def entries_of_codes(entries: Ints, codes: Ints) -> tuple[Ints, Ints]:
     return counts, in_ranges(begins, counts)
 
 
+def range_numbers(sizes: Ints | Sequence[int]) -> Ints:
+    """Returns the number of its range for each number of `in_ranges`: sizes 2, 1 give 0, 0, 1."""
+    return np.repeat(np.arange(len(sizes)), sizes)
+
+
 def places_among(numbers: Ints, ascending: Ints) -> tuple[Ints, Flags]:
     """Looks up numbers in an ascending array; returns their positions, and which are in it.
 

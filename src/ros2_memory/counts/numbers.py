@@ -20,6 +20,7 @@ from ros2_memory.columns.shown import FieldNumbers, column_of, numbers
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows
+from ros2_memory.core.arrays import range_numbers
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -449,7 +450,7 @@ def _numbers_of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
     values = np.array([number for sample in samples for number in sample])
     if values.dtype.kind not in "iu":
         values = values.astype(np.float64)
-    return FieldNumbers(np.repeat(np.arange(len(samples)), [*map(len, samples)]), values, 0.0)
+    return FieldNumbers(range_numbers([*map(len, samples)]), values, 0.0)
 
 
 def numbers_in(value: JsonValue) -> Iterator[float]:

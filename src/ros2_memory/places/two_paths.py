@@ -12,7 +12,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, cut_track, jumps
-from ros2_memory.core.arrays import Flags, Groups, Ints, distinct_rows
+from ros2_memory.core.arrays import Flags, Groups, Ints, distinct_rows, range_numbers
 from ros2_memory.core.regions import Region, Steps
 from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.results import FarFromOther, Pair, StandstillPlace
@@ -123,7 +123,7 @@ def _sampled(steps: _TrackSteps) -> tuple[Floats, Times]:
     lengths = np.hypot(*(steps.end - steps.begin).T)
     step_m = max(_STEP_M, float(lengths.sum()) / _MOST_SAMPLES)
     parts = np.ceil(lengths / step_m).astype(np.int64) + 1
-    row = np.repeat(np.arange(len(parts)), parts)
+    row = range_numbers(parts)
     nth = np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)
     share = nth / np.maximum(parts[row] - 1, 1)
     points = steps.begin[row] + share[:, None] * (steps.end - steps.begin)[row]

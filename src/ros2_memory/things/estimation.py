@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.sights import STOREY_MM, Score, Spot
-from ros2_memory.core.arrays import Flags, Ints, distinct_rows, in_ranges, rows_by
+from ros2_memory.core.arrays import Flags, Ints, distinct_rows, in_ranges, range_numbers, rows_by
 from ros2_memory.things.instances import (
     Estimate,
     Instance,
@@ -162,7 +162,7 @@ def _add_places(groups: Sequence[LabelGroup], observed: Observations) -> None:
                 single.append((group, rows))
     if not single:
         return
-    thing = np.repeat(np.arange(len(single)), [len(rows) for _, rows in single])
+    thing = range_numbers([len(rows) for _, rows in single])
     steps = stays_in(observed.sightings(np.concatenate([rows for _, rows in single])), thing)
     for (group, rows), step in zip(single, steps, strict=True):
         group.places += [rows[step == number] for number in range(int(step.max()) + 1)]
@@ -215,8 +215,8 @@ def _add_stays(groups: Sequence[LabelGroup], observed: Observations) -> None:
     if not spots_of_places:
         return
     spots, rows = observed.sights.spots, np.concatenate(spots_of_places)
-    place = np.repeat(np.arange(len(spots_of_places)), [len(there) for there in spots_of_places])
-    group_of = np.repeat(np.arange(len(groups)), [len(group.places) for group in groups])
+    place = range_numbers([len(there) for there in spots_of_places])
+    group_of = range_numbers([len(group.places) for group in groups])
     n = observed.counts[rows]
     sums = [np.bincount(place, n * spots[rows, column]) for column in (Spot.X, Spot.Y)]
     centres = np.stack(sums, axis=1) / np.bincount(place, n)[:, None]

@@ -30,7 +30,15 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
 from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Look, Spot
-from ros2_memory.core.arrays import Flags, Ints, distinct_rows, numbered, places_among, run_starts
+from ros2_memory.core.arrays import (
+    Flags,
+    Ints,
+    distinct_rows,
+    numbered,
+    places_among,
+    range_numbers,
+    run_starts,
+)
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 
@@ -328,7 +336,7 @@ def _are_moved(series: _Series, variance: Floats) -> Flags:
             spans.append((start, stop))
             size += stop - start
         rows = np.concatenate([np.arange(*span) for span in spans])
-        number = np.repeat(np.arange(len(spans)), [stop - start for start, stop in spans])
+        number = range_numbers([stop - start for start, stop in spans])
         batch = _Series(series.columns[:, rows], series.n[rows], series.visit[rows], number)
         for span, row in _likeliest_steps(batch, variance[series.thing[rows]]):
             start, stop = spans[span]

@@ -35,6 +35,7 @@ from ros2_memory.core.arrays import (
     in_ranges,
     narrowed,
     places_among,
+    range_numbers,
 )
 
 if TYPE_CHECKING:
@@ -454,7 +455,7 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     by_slice = _slice_evidence(cells, evidence)
     slices, odds = by_slice.slices, by_slice.odds
     start, stop = _runs_of_presence(odds, _place(slices))
-    run, rows = np.repeat(np.arange(len(start)), stop - start), in_ranges(start, stop - start)
+    run, rows = range_numbers(stop - start), in_ranges(start, stop - start)
     has_hits = by_slice.hits[rows] > 0
     run, rows = run[has_hits], rows[has_hits]
     if not len(rows):

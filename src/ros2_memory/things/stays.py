@@ -23,7 +23,15 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.core.arrays import Flags, Ints, distinct_rows, in_ranges, numbered, rows_by
+from ros2_memory.core.arrays import (
+    Flags,
+    Ints,
+    distinct_rows,
+    in_ranges,
+    numbered,
+    range_numbers,
+    rows_by,
+)
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.instances import PlacedStay, Tally, count_labels
 from ros2_memory.things.places import Sightings, poorly_localised
@@ -180,7 +188,7 @@ def placed_stays(
     if not stays:
         return []
     spots, n = observed.sights.spots[rows], observed.counts[rows]
-    begins, stay_of = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(stays)), sizes)
+    begins, stay_of = np.cumsum(sizes) - sizes, range_numbers(sizes)
     count = np.add.reduceat(n, begins)
     x, y, z = (
         np.add.reduceat(n * spots[:, axis], begins) / count for axis in (Spot.X, Spot.Y, Spot.Z)
@@ -274,7 +282,7 @@ class _HostSearch:
         # Each spot's stay and slice as one number, in order; and how many detections are before it.
         sizes = [len(stay.spots) for stay in placed]
         self._rows = np.concatenate([np.zeros(0, np.int64), *(stay.spots for stay in placed)])
-        self._stay_of = np.repeat(np.arange(len(stays)), sizes)
+        self._stay_of = range_numbers(sizes)
         spots = observed.sights.spots[self._rows]
         self._width = len(observed.sights.epochs) + 1
         self._slices = self._stay_of * self._width + spots[:, Spot.SLICE]

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.arrays import run_starts
+from ros2_memory.core.arrays import range_numbers, run_starts
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def joined_tracks(
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
     columns = map(np.concatenate, zip(*(part.columns for part in parts_in_order), strict=True))
     whole = PartialTrack._make((*columns, 0, ""))
-    numbers = np.repeat(np.arange(len(recordings)), sizes)
+    numbers = range_numbers(sizes)
     order = np.lexsort((whole.times, numbers))
     order = order[slot_ends(whole.times[order], numbers[order])]
     whole, numbers = whole.vertices(order), numbers[order]

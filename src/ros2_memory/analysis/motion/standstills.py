@@ -48,6 +48,7 @@ from ros2_memory.core.arrays import (
     Ints,
     Vectors,
     narrowed,
+    range_numbers,
     row_sums,
     rows_of,
     run_starts,
@@ -355,7 +356,7 @@ class _Slots:
         differences inside of it count.
         """
         bends = self.positions[:-2] - 2 * self.positions[1:-1] + self.positions[2:]
-        slot = np.repeat(np.arange(len(self)), self.counts)
+        slot = range_numbers(self.counts)
         is_inside = slot[2:] == slot[:-2]
         is_short = self.times[2:] - self.times[:-2] <= _SPARSE_NS
         is_counted = is_inside | (is_short & (self.counts[slot[1:-1]] < _OWN_BENDS))
