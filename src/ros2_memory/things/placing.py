@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import FrameTree, Rotations
-from ros2_memory.analysis.motion.odometry import FARTHEST_M
+from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
 from ros2_memory.analysis.sights import (
     AHEAD_MM,
@@ -195,7 +195,7 @@ class Placer:
             return poses
         # Poses of one topic nearly always have one frame: those in other frames are left out.
         frame = int(np.bincount(poses.frames.codes).argmax())
-        is_place = (np.abs(poses.positions) < FARTHEST_M).all(axis=1)
+        is_place = are_places(poses.positions)
         poses = poses.rows(np.flatnonzero((poses.frames.codes == frame) & is_place))
         codes, words = poses.frames.codes * 0, poses.frames.words[frame : frame + 1]
         return replace(poses, frames=poses.frames._replace(codes=codes, words=words))
