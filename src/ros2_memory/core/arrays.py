@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from _typeshed import DataclassInstance
 
+    from ros2_memory.core.timebase import Span
+
 T = TypeVar("T", bound="DataclassInstance")
 Scalar = TypeVar("Scalar", bound="np.generic[object]")
 Word = TypeVar("Word", bound="Hashable")
@@ -92,6 +94,11 @@ def entries_of_codes(entries: Ints, codes: Ints) -> tuple[Ints, Ints]:
     begins = np.searchsorted(entries, codes)
     counts = np.searchsorted(entries, codes, side="right") - begins
     return counts, in_ranges(begins, counts)
+
+
+def bounds_of(spans: Iterable[Span]) -> Ints:
+    """Returns the starts and the stops of spans: two rows."""
+    return np.array([*spans], np.int64).reshape(-1, 2).T
 
 
 def range_numbers(sizes: Ints | Sequence[int]) -> Ints:

@@ -22,6 +22,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.analysis.silences import length_in
+from ros2_memory.core.arrays import bounds_of
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, spans_of, united, without
@@ -281,7 +282,7 @@ def _edges_at_spans(window: TimeWindow, span_lists: Sequence[Sequence[Span]]) ->
 
 def _lies_in_spans(edges: Ints, spans: Sequence[Span]) -> Flags:
     """Returns, for each piece between two edges, whether it lies in one of the half-open spans."""
-    starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
+    starts, stops = bounds_of(spans)
     begun = np.searchsorted(starts, edges[:-1], side="right")
     ended = np.searchsorted(stops, edges[:-1], side="right")
     return begun > ended
@@ -480,7 +481,7 @@ class BinnedWindow:
 
     def _time_in_pieces(self, spans: Sequence[Span]) -> Ints:
         """Returns the time (ns) of half-open spans that passed in each piece, and is counted."""
-        starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._counted_bounds)
+        starts, stops = bounds_of(spans).clip(*self._counted_bounds)
         lengths = self.bins.lengths(starts, stops)
         for skipped in self.elapsed.skipped:
             lengths -= self.bins.lengths(starts.clip(*skipped), stops.clip(*skipped))

@@ -32,6 +32,7 @@ from ros2_memory.analysis.intervals import (
     join_parts,
 )
 from ros2_memory.analysis.topic_events import TopicEvents, joined_events
+from ros2_memory.core.arrays import bounds_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, spans_of, united, without
@@ -378,7 +379,7 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
         return binned.gaps
     firsts, lasts = binned.bounds([topic])
     order = np.argsort(lasts)
-    begins, ends = np.array(binned.gaps, np.int64).reshape(-1, 2).T
+    begins, ends = bounds_of(binned.gaps)
     # The topic is heard again in the bags that end after the gap. If one of them begins before the
     # gap, or if there are none, the gap is not prolonged.
     following = np.searchsorted(lasts[order], ends)

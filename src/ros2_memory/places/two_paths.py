@@ -12,7 +12,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, cut_track, jumps
-from ros2_memory.core.arrays import Flags, Groups, Ints, distinct_rows, range_numbers
+from ros2_memory.core.arrays import Flags, Groups, Ints, bounds_of, distinct_rows, range_numbers
 from ros2_memory.core.regions import Region, Steps
 from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.results import FarFromOther, Pair, StandstillPlace
@@ -150,7 +150,7 @@ def placed_standstills(
 
     Standstills outside of the track's pieces are left out.
     """
-    ends = np.array([*spans], np.int64).reshape(-1, 2)
+    ends = bounds_of(spans).T
     if not len(track.times) or not len(ends):
         return
     times = np.linspace(ends[:, 0], ends[:, 1], _SAMPLES_OF_STAND, axis=1).astype(np.int64)

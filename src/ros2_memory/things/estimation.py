@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.sights import STOREY_MM, Score, Spot
-from ros2_memory.core.arrays import Flags, Ints, distinct_rows, in_ranges, range_numbers, rows_by
+from ros2_memory.core.arrays import (
+    Flags,
+    Ints,
+    bounds_of,
+    distinct_rows,
+    in_ranges,
+    range_numbers,
+    rows_by,
+)
 from ros2_memory.things.instances import (
     Estimate,
     Instance,
@@ -240,7 +248,7 @@ def _add_stays(groups: Sequence[LabelGroup], observed: Observations) -> None:
         (number * width + stay.first_slice, number * width + stay.last_slice + 1)
         for number, stay in stays
     ]
-    begin, end = np.searchsorted(keys, np.array(bounds, np.int64).reshape(-1, 2)).T
+    begin, end = np.searchsorted(keys, bounds_of(bounds))
     for group in groups:
         group.evidence = evidence
     for stay in placed_stays(observed, stays, rows[in_ranges(begin, end - begin)], end - begin):

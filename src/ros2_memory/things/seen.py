@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, joining
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.sights import pack_sights, unite_sights
-from ros2_memory.core.arrays import in_ranges
+from ros2_memory.core.arrays import bounds_of, in_ranges
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import spans_of
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -310,7 +310,7 @@ class SightReader:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         files = {bag.file for bag in bags}
-        spans = np.array([(bag.start, bag.end) for bag in bags], np.int64).reshape(-1, 2).T
+        spans = bounds_of((bag.start, bag.end) for bag in bags)
         for number in self._numbers_of(*spans):
             window = _stretch_window(number)
             units_by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
