@@ -35,9 +35,14 @@ class Steps(NamedTuple):
     to_x: Floats
     to_y: Floats
 
+    @property
+    def moved(self) -> tuple[Floats, Floats]:
+        """How far each step leads along x and y."""
+        return self.to_x - self.x, self.to_y - self.y
+
     def nearest_to(self, x: float, y: float) -> tuple[Floats, Floats]:
         """Returns the share of each step that is nearest to a point, and its distance (m)."""
-        along_x, along_y = self.to_x - self.x, self.to_y - self.y
+        along_x, along_y = self.moved
         squared = along_x * along_x + along_y * along_y
         share = (x - self.x) * along_x + (y - self.y) * along_y
         share = (share / np.where(squared > 0, squared, 1.0)).clip(0.0, 1.0)
@@ -75,7 +80,7 @@ class Circle:
 
         A point at share s of a step is on the circle where a s^2 + 2 b s + c = 0.
         """
-        dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
+        dx, dy = steps.moved
         px, py = steps.x - self.x, steps.y - self.y
         a = dx * dx + dy * dy
         b = px * dx + py * dy
@@ -147,7 +152,7 @@ class Polygon:
     def clipped(self, steps: Steps) -> ClippedSteps:
         """Returns the parts of steps inside: those between two crossings whose middle is inside."""
         cuts = self._cuts(steps)
-        dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
+        dx, dy = steps.moved
         middle = (cuts[1:] + cuts[:-1]) / 2
         inside = _inside(self.corners, steps.x + dx * middle, steps.y + dy * middle)
         inside &= cuts[1:] > cuts[:-1]
@@ -166,7 +171,7 @@ class Polygon:
         The share is 1 for a side that the step does not cross.
         """
         count = len(steps.x)
-        dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
+        dx, dy = steps.moved
         cuts = [np.zeros(count), np.ones(count)]
         for (ax, ay), (bx, by) in pairwise((*self.corners, self.corners[0])):
             side_x, side_y = bx - ax, by - ay
