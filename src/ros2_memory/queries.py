@@ -404,7 +404,7 @@ def find_last_match(
 
     def show(view: View, match: StoredMessage) -> results.Match:
         note_robots_near(view, match)
-        note_unread(view, _searched_window(view, match, until, now), search=True)
+        _note_unsearched(view, match, until, now)
         # The view may show some days of long ago only.
         newest_known = memory.index.published or view.snapshot
         counted_from = memory.now(now, newest_known.latest, call)
@@ -443,7 +443,7 @@ def value_when(
     name = resolve_topic(view, value_topic)
 
     def show(view: View, match: StoredMessage) -> results.ValueWhen:
-        note_unread(view, _searched_window(view, match, until, now), search=True)
+        _note_unsearched(view, match, until, now)
         note_robots_near(view, match)
         matched = _as_value(view, match, (), None)
         until_match = TimeWindow.until(match.time)
@@ -672,10 +672,10 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
         yield f"the path is within {path.waypoint_error_m:.2f} m of the waypoints' line"
 
 
-def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
-    """Returns the window from a match to the end of its search, or to now."""
+def _note_unsearched(view: View, match: StoredMessage, until: Ns, now: Ns) -> None:
+    """Notes what was not read from a match to the end of its search, or to now."""
     stop = until if view.limits.now == "latest" else min(until, now + 1)
-    return TimeWindow(stored.time, max(stop, stored.time + 1))
+    note_unread(view, TimeWindow(match.time, max(stop, match.time + 1)), search=True)
 
 
 class _Search(NamedTuple):
