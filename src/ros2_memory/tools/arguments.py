@@ -260,6 +260,12 @@ _Moment: TypeAlias = Annotated[
 ]
 _Start: TypeAlias = Annotated[_Time | None, Field(alias="start", description=FORMS_OF_TIME)]
 _End: TypeAlias = Annotated[_Until | None, Field(alias="end", description=_INCLUSIVE)]
+_FirstTime: TypeAlias = Annotated[
+    _Time, Field(alias="start", description=FORMS_OF_TIME, examples=[1784023200])
+]
+_LastTime: TypeAlias = Annotated[
+    _Until, Field(alias="end", description=_INCLUSIVE, examples=[1784023260])
+]
 _Before: TypeAlias = Annotated[_Until | None, Field(alias="before", description="Up to this time.")]
 _Times: TypeAlias = Annotated[tuple[_Moment, ...], BeforeValidator(_as_times)]
 _Topic: TypeAlias = Annotated[_Name, Field(description="E.g. /odom.", examples=["/odom"])]
@@ -429,10 +435,8 @@ class Between(TimeArgument):
 
     replaces = "span"
     text = "between two times"
-    start_s: Annotated[
-        _Time, Field(examples=[1784023200], alias="start", description=FORMS_OF_TIME)
-    ]
-    end_s: Annotated[_Until, Field(examples=[1784023260], alias="end", description=_INCLUSIVE)]
+    start_s: _FirstTime
+    end_s: _LastTime
 
 
 class RecapTime(TimeArgument):
@@ -442,12 +446,8 @@ class RecapTime(TimeArgument):
     text = "in the last_s, between two times, or around a moment"
     either = ("last_s", "start", "around")
     last_s: Annotated[_Positive, Field(description="Up to now.", examples=[60])] | None = None
-    start_s: _Time | None = Field(
-        default=None, alias="start", description=FORMS_OF_TIME, examples=[1784023200]
-    )
-    end_s: _Until | None = Field(
-        default=None, alias="end", description=_INCLUSIVE, examples=[1784023260]
-    )
+    start_s: _Start = Field(default=None, examples=[1784023200])
+    end_s: _End = Field(default=None, examples=[1784023260])
     around_s: _Until | None = Field(
         default=None,
         alias="around",
@@ -708,10 +708,8 @@ class ThingsArguments(Arguments):
 class CompareArguments(Arguments):
     """Two windows to compare."""
 
-    start_s: Annotated[
-        _Time, Field(alias="start", description=FORMS_OF_TIME, examples=[1784023200])
-    ]
-    end_s: Annotated[_Until, Field(alias="end", description=_INCLUSIVE, examples=[1784023260])]
+    start_s: _FirstTime
+    end_s: _LastTime
     with_start_s: Annotated[
         _Time, Field(alias="with_start", description=_OTHER_WINDOW, examples=[1783936800])
     ]
