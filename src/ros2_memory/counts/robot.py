@@ -166,7 +166,7 @@ def count_visits(
         )
     for name, stays in named_stays:
         binned.add_counts(f"{name}.entries", _entry_times(stays))
-        binned.add_lengths(f"{name}.minutes", "minutes", _stay_spans(stays))
+        binned.add_lengths(f"{name}.minutes", "minutes", [stay.span for stay in stays])
     return binned.answer()
 
 
@@ -181,7 +181,7 @@ def _add_visits(binned: BinnedWindow, stays: Sequence[Stay]) -> None:
     exits = np.array([stay.stop for stay in stays if stay.left], np.int64)
     binned.add_counts("entries", entries)
     binned.add_counts("exits", exits)
-    binned.add_lengths("minutes", "minutes", _stay_spans(stays))
+    binned.add_lengths("minutes", "minutes", [stay.span for stay in stays])
     binned.add_first("first_entry", entries)
     binned.add_first("first_exit", exits)
     binned.usual = binned.usual_of(entries)
@@ -192,7 +192,7 @@ def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequenc
     """Adds the columns of visits for bins of places; there are no visits to "(elsewhere)"."""
     entries = [len(_entry_times(stays)) for stays in stays_of_places]
     exits = [len([stay for stay in stays if stay.left]) for stays in stays_of_places]
-    lengths = [binned.elapsed.among(_stay_spans(stays)) for stays in stays_of_places]
+    lengths = [binned.elapsed.among(stay.span for stay in stays) for stays in stays_of_places]
     no_visits: list[None] = [None] * (len(binned.bins.names) - len(stays_of_places))
     binned.add("entries", "count", [*entries, *no_visits], sum(entries))
     binned.add("exits", "count", [*exits, *no_visits], sum(exits))
@@ -201,7 +201,3 @@ def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequenc
 
 def _entry_times(stays: Sequence[Stay]) -> Ints:
     return np.array([stay.start for stay in stays if stay.entered], np.int64)
-
-
-def _stay_spans(stays: Sequence[Stay]) -> list[tuple[int, int]]:
-    return [(stay.start, stay.stop) for stay in stays]

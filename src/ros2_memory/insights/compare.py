@@ -494,8 +494,7 @@ def _minutes_in_places(
             ]
         minutes: dict[str, float | None] = {}
         for name, region, track in asked:
-            stays = ((stay.start, stay.stop) for stay in track.inside(region, window))
-            lasted = drive.elapsed.among(stays)
+            lasted = drive.elapsed.among(stay.span for stay in track.inside(region, window))
             minutes[name] = unix_from_ns(lasted) / 60 if track.reaches(window) else None
             if minutes[name]:
                 visited.add(name)

@@ -290,7 +290,7 @@ def _with_path_in_region(answer: Recap, drive: Drive, region_stays: _RegionStays
         max_speed=None if driven is None else driven.max_speed,
         stood=None if answer.stood is None else region_stays.standing_time(drive.standstills),
         visits=len(stays),
-        inside=drive.elapsed.among((stay.start, stay.stop) for stay in stays),
+        inside=drive.elapsed.among(stay.span for stay in stays),
     )
 
 
@@ -401,7 +401,7 @@ def _things_in_view(
         things = things.without(throughout)
     else:
         throughout = set()
-        things = things.during([(stay.start, stay.stop) for stay in region_stays.stays])
+        things = things.during([stay.span for stay in region_stays.stays])
     events = [
         Event(
             "thing",

@@ -109,7 +109,7 @@ def driven_inside(
         _with_measured_heading(view, name, path.line, waypoint)
         for waypoint in _way_inside(path.line, stays, max_waypoints)
     )
-    spans = [(stay.start, stay.stop) for stay in stays]
+    spans = [stay.span for stay in stays]
     duration = elapsed_in(view, window).among(spans)
     average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
@@ -151,7 +151,7 @@ def totals_inside(line: Line, stays: Sequence[Stay]) -> InsideTotals:
     if not stays:
         return InsideTotals(0.0, 0.0)
     distance_m, speeds = 0.0, []
-    for start, stop in united((stay.start, stay.stop) for stay in stays):
+    for start, stop in united(stay.span for stay in stays):
         first_m, last_m = line.metres_at(np.array([start, stop])).tolist()
         distance_m += last_m - first_m
         max_speed = _max_speed(line, start, stop, last_m - first_m)

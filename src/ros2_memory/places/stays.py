@@ -15,7 +15,7 @@ from ros2_memory.core.regions import ClippedSteps, Region, Steps, clipped
 if TYPE_CHECKING:
     from ros2_memory.analysis.frames import Mask
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.core.timebase import Ns, Span
 
 
 class Stay(NamedTuple):
@@ -28,6 +28,11 @@ class Stay(NamedTuple):
     stop: Ns
     entered: bool
     left: bool
+
+    @property
+    def span(self) -> Span:
+        """Its first and last log time."""
+        return self.start, self.stop
 
     def within(self, window: TimeWindow) -> Stay:
         """Returns the part of the stay in a window that overlaps it."""
