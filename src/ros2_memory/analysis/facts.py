@@ -23,6 +23,7 @@ from ros2_memory.core.arrays import (
     merged_times,
     numbered,
     places_among,
+    stable_order,
 )
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
@@ -307,7 +308,7 @@ def joined_facts(parts: Sequence[Facts]) -> Facts:
         return parts[0] if parts else NOTHING
     codes, words = joined_codes((part.codes, part.words) for part in parts)
     rows = np.concatenate([part.rows for part in parts])
-    order = np.argsort(rows, kind="stable")
+    order = stable_order(rows)
     values = np.concatenate([part.values for part in parts])
     return Facts(rows[order], codes[order], values[order], words)
 

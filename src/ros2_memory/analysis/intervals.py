@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import Flags, Ints, joined_codes, range_numbers
+from ros2_memory.core.arrays import Flags, Ints, joined_codes, range_numbers, stable_order
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def pieces_of(starts: Ints, stops: Ints, silence_ns: Ns = SILENCE_NS) -> tuple[I
 
     Without spans, both are empty.
     """
-    order = np.argsort(starts, kind="stable")
+    order = stable_order(starts)
     starts, stops = starts[order], stops[order]
     reached = np.maximum.accumulate(stops)
     new = starts[1:] - reached[:-1] > silence_ns
@@ -181,7 +181,7 @@ class IntervalTable(NamedTuple):
     def _by_length(self) -> NDArray[np.intp]:
         """Returns the indices of rows, the longest interval first; of equal ones the earliest."""
         rows = self._array
-        return np.argsort(rows["first"] - rows["last"], kind="stable")
+        return stable_order(rows["first"] - rows["last"])
 
 
 class IntervalPart(NamedTuple):
@@ -300,7 +300,7 @@ def running_end(label: NDArray[np.intp], last: Ints) -> Ints:
     """Returns, for each row, the latest end so far of its label; rows are sorted by label."""
     if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
         return last
-    by_time = np.argsort(last, kind="stable")
+    by_time = stable_order(last)
     rank = np.empty(len(last), np.intp)
     rank[by_time] = np.arange(len(last))
     # Ranks of a later label are all higher, so the running maximum starts again at each label.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.arrays import Floats, Vectors, joined_codes
+from ros2_memory.core.arrays import Floats, Vectors, joined_codes, stable_order
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def joined_poses(parts: Sequence[Poses]) -> Poses:
     )
     if (whole.times[1:] >= whole.times[:-1]).all():
         return whole
-    return whole.rows(np.argsort(whole.times, kind="stable"))
+    return whole.rows(stable_order(whole.times))
 
 
 def headings(turns: Vectors) -> Floats:

@@ -22,7 +22,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ros2_memory.core.arrays import Flags, Groups, Ints, distinct_rows, rows_of, run_starts
+from ros2_memory.core.arrays import (
+    Flags,
+    Groups,
+    Ints,
+    distinct_rows,
+    rows_of,
+    run_starts,
+    stable_order,
+)
 from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, NS_PER_US
 
@@ -187,7 +195,7 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     detections, labels = _detections(seen, slices)
     group, together = _label_groups(detections)
     rows = np.flatnonzero(detections.is_placed)
-    rows = rows[np.argsort(group[rows], kind="stable")]
+    rows = rows[stable_order(group[rows])]
     cluster = np.full(len(detections.message), -1, np.int64)
     cluster[rows] = _clusters(
         group[rows], detections.message[rows], detections.x[rows], detections.y[rows]

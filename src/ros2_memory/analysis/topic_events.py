@@ -15,7 +15,7 @@ import numpy as np
 
 from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES, Stated
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, join_parts, visible_in
-from ros2_memory.core.arrays import joined_codes
+from ros2_memory.core.arrays import joined_codes, stable_order
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -224,7 +224,7 @@ def _new_states(stated: Stated) -> Iterator[KnownState]:
     """Yields each state when a message first has it, and when its value differs, in order."""
     facts = stated.facts.of_kinds(STATES)
     names, _ = joined_codes([(facts.codes, [word[:2] for word in facts.words])])
-    order = np.argsort(names, kind="stable")
+    order = stable_order(names)
     values = facts.values.astype(np.int64)
     is_new = (np.diff(names[order], prepend=-1) != 0) | (np.diff(values[order], prepend=0) != 0)
     new = np.sort(order[is_new])

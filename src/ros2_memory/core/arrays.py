@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
@@ -96,6 +96,11 @@ def entries_of_codes(entries: Ints, codes: Ints) -> tuple[Ints, Ints]:
     return counts, in_ranges(begins, counts)
 
 
+def stable_order(values: ArrayLike) -> Ints:
+    """Returns the order that sorts values; equal values stay as they come."""
+    return np.argsort(values, kind="stable")
+
+
 def bounds_of(spans: Iterable[Span]) -> Ints:
     """Returns the starts and the stops of spans: two rows."""
     return np.array([*spans], np.int64).reshape(-1, 2).T
@@ -130,7 +135,7 @@ def begins_of(group: Ints, groups: int) -> Ints:
 
 def rows_by(group: Ints, groups: int) -> list[Ints]:
     """Returns the rows of each group, ascending; the arguments are those of `begins_of`."""
-    return np.split(np.argsort(group, kind="stable"), begins_of(group, groups)[1:])[:-1]
+    return np.split(stable_order(group), begins_of(group, groups)[1:])[:-1]
 
 
 def run_starts(*columns: Ints) -> Ints:
@@ -187,7 +192,7 @@ def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
         indices of its times in the merged ones.
     """
     times = np.concatenate(parts)
-    order = np.argsort(times, kind="stable")
+    order = stable_order(times)
     places = np.empty(order.size, np.int64)
     places[order] = np.arange(order.size)
     return times[order], order, np.split(places, np.cumsum([part.size for part in parts])[:-1])
@@ -259,7 +264,7 @@ class Groups(NamedTuple):
     def of(cls, group: Ints) -> Groups:
         """Groups rows by the group that each has."""
         sizes = np.bincount(group).astype(np.int64)
-        return cls(np.argsort(group, kind="stable"), np.cumsum(sizes) - sizes, sizes)
+        return cls(stable_order(group), np.cumsum(sizes) - sizes, sizes)
 
     @property
     def firsts(self) -> Ints:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
+from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def pauses_among(
         counts: the number of messages in each span.
         longer_than: shorter pauses are left out.
     """
-    order = np.argsort(firsts, kind="stable")
+    order = stable_order(firsts)
     begins, reach = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
     is_pause = begins - reach > longer_than
     columns = (reach, begins, np.cumsum(counts[order])[:-1])

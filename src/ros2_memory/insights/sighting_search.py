@@ -15,7 +15,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.columns.values import TruthValues, nowhere
-from ros2_memory.core.arrays import rows_of, stacked
+from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
@@ -454,4 +454,4 @@ def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool) -> Ints:
 
 
 def _in_order(runs: Ints) -> Ints:
-    return runs[np.argsort(-runs[:, _LAST], kind="stable")]
+    return runs[stable_order(-runs[:, _LAST])]

@@ -21,7 +21,7 @@ from ros2_memory.analysis.motion.trajectory import (
     draw_waypoints,
     mean_speed,
 )
-from ros2_memory.core.arrays import rows_of, stacked
+from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import yaw
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -287,7 +287,7 @@ def _farthest_pose(
     times, track_x, track_y = _vertices_during(track, spans)
     track_away_m = np.hypot(track_x - x, track_y - y)
     farthest: _DistantPose | None = None
-    for nth in np.argsort(-track_away_m, kind="stable")[:_MOST_TRIED].tolist():
+    for nth in stable_order(-track_away_m)[:_MOST_TRIED].tolist():
         if farthest is not None and track_away_m[nth] <= farthest.away_m - _OFF_TRACK_M:
             break
         at = int(times[nth])

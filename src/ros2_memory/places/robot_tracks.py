@@ -38,6 +38,7 @@ from ros2_memory.columns.kinds import TRACKS
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
+from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.memo import Key
@@ -437,7 +438,7 @@ def _in_time_order(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of one or more tables, in order of log time."""
     columns = zip(*(part[:4] for part in parts), strict=True)
     times, x, y, heading = map(np.concatenate, columns)
-    order = np.argsort(times, kind="stable")
+    order = stable_order(times)
     left_out = sum(part.left_out for part in parts)
     return Placed(times[order], x[order], y[order], heading[order], left_out)
 

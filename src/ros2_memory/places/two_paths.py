@@ -12,7 +12,15 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, cut_track, jumps
-from ros2_memory.core.arrays import Flags, Groups, Ints, bounds_of, distinct_rows, range_numbers
+from ros2_memory.core.arrays import (
+    Flags,
+    Groups,
+    Ints,
+    bounds_of,
+    distinct_rows,
+    range_numbers,
+    stable_order,
+)
 from ros2_memory.core.regions import Region, Steps
 from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.results import FarFromOther, Pair, StandstillPlace
@@ -99,7 +107,7 @@ def _farthest(steps: _TrackSteps, other: _TrackSteps, region: Region | None) -> 
         return None
     points, times = _thinned(points, times)
     other_points, _ = _thinned(*_sampled(other))
-    candidates = np.argsort(-_nearest_squared(points, other_points), kind="stable")[:_CANDIDATES]
+    candidates = stable_order(-_nearest_squared(points, other_points))[:_CANDIDATES]
     lines = Steps(*other.begin.T, *other.end.T)
     away_m = [float(lines.nearest_to(x, y)[1].min()) for x, y in points[candidates].tolist()]
     nth = int(np.argmax(away_m))

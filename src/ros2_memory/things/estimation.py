@@ -25,6 +25,7 @@ from ros2_memory.core.arrays import (
     in_ranges,
     range_numbers,
     rows_by,
+    stable_order,
 )
 from ros2_memory.things.instances import (
     Estimate,
@@ -183,7 +184,7 @@ def _places_of_group(group: LabelGroup, observed: Observations) -> Iterator[tupl
     x, y, z, slices = (observed.sights.spots[rows, name] for name in names)
     place = np.full(len(rows), -1, np.int64)
     # A floor ends where heights leave a gap.
-    by_height = np.argsort(z, kind="stable")
+    by_height = stable_order(z)
     floors = np.split(by_height, np.flatnonzero(np.diff(z[by_height]) > STOREY_MM) + 1)
     for floor in floors:
         on_floor = places_of(x[floor], y[floor], observed.counts[rows[floor]], slices[floor])
@@ -310,7 +311,7 @@ def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) ->
     for stay in stays:
         observed.go_on()
         firsts = observed.sights.spots[stay.spots, Spot.FIRST]
-        rows = stay.spots[np.argsort(firsts, kind="stable")]
+        rows = stay.spots[stable_order(firsts)]
         cuts = _cuts_around_others(stay, rows, stays, observed)
         if not cuts:
             parts.append(stay)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.sights import SCORE_BINS, Spot, bin_of
+from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, places_at
@@ -408,7 +409,7 @@ class _Finder:
     def _usual_places(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:
         """Returns where a thing usually is, by its spots, with the named places there."""
         spots = self.known.estimate.spots[rows]
-        spots = spots[np.argsort(spots[:, Spot.LAST], kind="stable")]
+        spots = spots[stable_order(spots[:, Spot.LAST])]
         now = min(self.now, self.window.stop)
         usual = usual_places(spots[:, Spot.LAST], spots[:, [Spot.X, Spot.Y]], now)
         if usual is None:
@@ -439,7 +440,7 @@ class _Finder:
         spots = self.known.estimate.spots[newest.rows]
         last, by_all, stay = int(spots[:, Spot.LAST].max()), self.known.by_all, newest.stay
         if by_all is not self.known:
-            newest_first = np.argsort(-spots[:, Spot.LAST], kind="stable")
+            newest_first = stable_order(-spots[:, Spot.LAST])
             same = by_all.estimate.stay_with(spots[newest_first])
             if same is None:
                 return None

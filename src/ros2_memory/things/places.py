@@ -38,6 +38,7 @@ from ros2_memory.core.arrays import (
     places_among,
     range_numbers,
     run_starts,
+    stable_order,
 )
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
@@ -80,8 +81,8 @@ def places_of(x: Ints, y: Ints, n: Ints, slices: Ints) -> Ints:
     cells, cell_of = distinct_rows((x // _CELL_MM, y // _CELL_MM))
     mass = np.bincount(cell_of, weight).astype(np.float64)
     centre = np.stack([np.bincount(cell_of, weight * axis) / mass for axis in (x, y)], axis=1)
-    order = np.argsort(-_density(cells, mass), kind="stable")
-    spots = _Spots(np.argsort(order, kind="stable")[cell_of], weight, slices)
+    order = stable_order(-_density(cells, mass))
+    spots = _Spots(stable_order(order)[cell_of], weight, slices)
     peaks = _peaks(centre[order], mass[order], spots)
     if not len(peaks):
         return np.full(len(x), -1, np.int64)
@@ -574,5 +575,5 @@ def _poor_times(fixes: Columns) -> tuple[Ints, Ints]:
     vague = np.flatnonzero(sigma[newest] > _POOR_MM)
     starts = np.concatenate((time[jumped] - _BEFORE_NS, time[vague]))
     stops = np.concatenate((time[jumped + 1], time[vague] + np.minimum(after[vague], _KNOWN_NS)))
-    order = np.argsort(starts, kind="stable")
+    order = stable_order(starts)
     return starts[order], np.maximum.accumulate(stops[order])

@@ -31,6 +31,7 @@ from ros2_memory.core.arrays import (
     numbered,
     range_numbers,
     rows_by,
+    stable_order,
 )
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.instances import PlacedStay, Tally, count_labels
@@ -278,7 +279,7 @@ class _HostSearch:
         self._last_slice = _column(stay.stay.last_slice for stay in placed)
         places = np.array([(stay.x, stay.y, stay.z) for stay in placed], np.float64)
         self._places = places.reshape(-1, 3).T
-        self._by_x = np.argsort(self._places[0], kind="stable")
+        self._by_x = stable_order(self._places[0])
         # Each spot's stay and slice as one number, in order; and how many detections are before it.
         sizes = [len(stay.spots) for stay in placed]
         self._rows = np.concatenate([np.zeros(0, np.int64), *(stay.spots for stay in placed)])

@@ -27,7 +27,7 @@ from ros2_memory.analysis.motion.odometry import (
 )
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
 from ros2_memory.analysis.poses import Poses, headings, joined_poses
-from ros2_memory.core.arrays import Flags, Floats, Vectors, rows_of, stacked
+from ros2_memory.core.arrays import Flags, Floats, Vectors, rows_of, stable_order, stacked
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -337,7 +337,7 @@ def draw_waypoints(
     """
     jumps = np.flatnonzero(line.jumps[1:]) + 1
     jump_m = np.linalg.norm(line.places[jumps] - line.places[jumps - 1], axis=1)
-    longest = np.sort(jumps[np.argsort(-jump_m, kind="stable")[: at_most // 2 - 1]])
+    longest = np.sort(jumps[stable_order(-jump_m)[: at_most // 2 - 1]])
     ends = np.unique(np.concatenate(([0, len(line) - 1], longest - 1, longest)))
     seconds = (line.times - line.times[0]) / NS_PER_S
     left_m = max(TOLERANCE_M - error_m, TOLERANCE_M / 4)
