@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import row_maxima, row_sums, stacked
+from ros2_memory.core.arrays import Flags, Ints, row_maxima, row_sums, stacked
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.geometry import multiply, rotate, slerp
 from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
@@ -40,9 +40,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-Times: TypeAlias = "NDArray[np.int64]"
 Floats: TypeAlias = "NDArray[np.float64]"
-Mask: TypeAlias = "NDArray[np.bool_]"
 Vectors: TypeAlias = "tuple[Floats, Floats, Floats]"
 Rotations: TypeAlias = "tuple[Floats, Floats, Floats, Floats]"
 
@@ -77,7 +75,7 @@ class FramePoses(NamedTuple):
 
     translation: Vectors
     rotation: Rotations
-    valid: Mask
+    valid: Flags
 
     def points(self, points: Vectors) -> Vectors:
         """Returns points (m) of the frame, one for each time, in the other frame."""
@@ -103,8 +101,8 @@ class Edge:
         rotation: unit quaternions (x, y, z, w), N x 4.
     """
 
-    stamps: Times
-    log_times: Times
+    stamps: Ints
+    log_times: Ints
     translation: Floats
     rotation: Floats
 
@@ -190,7 +188,7 @@ class _History:
         self._rotation = joined.rotation[rows]
         self._parent = np.repeat([self.parents.index(name) for name in names], counts)[rows]
 
-    def at(self, times: Times) -> FramePoses:
+    def at(self, times: Ints) -> FramePoses:
         """Returns the poses of the child in its parent at some times (ns)."""
         before, after, ratio, valid = self._bracket(times)
         x, y, z = self._translation[before].T
@@ -201,7 +199,7 @@ class _History:
         turned = slerp((qx, qy, qz, qw), (to_qx, to_qy, to_qz, to_qw), ratio)
         return FramePoses(moved, turned, valid)
 
-    def parents_at(self, times: Times) -> Times:
+    def parents_at(self, times: Ints) -> Ints:
         """Returns the parent at some times (ns), as indices into `parents`."""
         return self._parent[self._bracket(times).before]
 
@@ -233,7 +231,7 @@ class _History:
             " extrapolated; ask for a time in that range",
         )
 
-    def _bracket(self, times: Times) -> _Bracket:
+    def _bracket(self, times: Ints) -> _Bracket:
         """Returns the rows between which the child is interpolated at some times (ns)."""
         count = len(self._times)
         # The first static transform is valid before it was received, too.
@@ -264,10 +262,10 @@ class _Bracket(NamedTuple):
         valid: whether a transform is valid.
     """
 
-    before: Times
-    after: Times
+    before: Ints
+    after: Ints
     ratio: Floats
-    valid: Mask
+    valid: Flags
 
 
 class FrameTree:
@@ -312,7 +310,7 @@ class FrameTree:
         """Returns whether transforms connect a frame with the target at some time."""
         return frame.lstrip("/") in connected_with(self.target, self._pairs)
 
-    def poses(self, frame: str, times: Times) -> FramePoses | None:
+    def poses(self, frame: str, times: Ints) -> FramePoses | None:
         """Returns the poses of a frame in the target at some times (ns).
 
         They are composed along the tree, up and down, through the common ancestor. None if no
@@ -359,7 +357,7 @@ class FrameTree:
                 raise self._no_path_at(name, time)
         return pose.at()
 
-    def _compose(self, name: str, times: Times) -> FramePoses:
+    def _compose(self, name: str, times: Ints) -> FramePoses:
         """Returns the poses of a frame in the target, through the common ancestor at each time.
 
         If the tree changes during the times, they are split until it does not.
@@ -381,7 +379,7 @@ class FrameTree:
                 axis[rows] = part_axis
         return whole
 
-    def _chain(self, frame: str, times: Times) -> dict[str, None]:
+    def _chain(self, frame: str, times: Ints) -> dict[str, None]:
         """Returns a frame and its ancestors, as far up as they are the same at all times."""
         chain = {frame: None}
         parents = self._parents_at(frame, times)
@@ -390,7 +388,7 @@ class FrameTree:
             parents = self._parents_at(parents[0], times)
         return chain
 
-    def _split_by_parent(self, times: Times, frames: Iterable[str]) -> list[Mask]:
+    def _split_by_parent(self, times: Ints, frames: Iterable[str]) -> list[Flags]:
         """Splits times so that the first frame with several parents has one parent in each mask.
 
         Empty if no frame has several.
@@ -401,13 +399,13 @@ class FrameTree:
                 return [numbers == number for number in np.unique(numbers)]
         return []
 
-    def _pose_in_ancestor(self, ancestor: str, chain: Iterable[str], times: Times) -> FramePoses:
+    def _pose_in_ancestor(self, ancestor: str, chain: Iterable[str], times: Ints) -> FramePoses:
         """Returns the poses of the first frame of a chain in one of its ancestors."""
         below = takewhile(lambda frame: frame != ancestor, chain)
         steps = [self._histories[frame].at(times) for frame in below]
         return reduce(_product, reversed(steps)) if steps else _identity(times)
 
-    def _parents_at(self, child: str, times: Times) -> Sequence[str]:
+    def _parents_at(self, child: str, times: Ints) -> Sequence[str]:
         """Returns all parents that a frame has at some times; none, if it is a root."""
         history = self._history(child)
         if history is None:
@@ -541,7 +539,7 @@ def unit_quaternions(rotations: Floats) -> Floats:
         return np.where(is_unit[:, None], rotations, scaled)
 
 
-def _identity(times: Times, *, valid: bool = True) -> FramePoses:
+def _identity(times: Ints, *, valid: bool = True) -> FramePoses:
     x, y, z, qx, qy, qz = np.zeros((6, *times.shape))
     return FramePoses((x, y, z), (qx, qy, qz, np.ones(times.shape)), np.full(times.shape, valid))
 

@@ -21,7 +21,7 @@ from ros2_memory.analysis.motion.trajectory import (
     draw_waypoints,
     mean_speed,
 )
-from ros2_memory.core.arrays import rows_of, stable_order, stacked
+from ros2_memory.core.arrays import Ints, rows_of, stable_order, stacked
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import yaw
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -49,7 +49,7 @@ from ros2_memory.results import DrivenInside, FarthestPose
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.frames import Floats, Times
+    from ros2_memory.analysis.frames import Floats
     from ros2_memory.history.context import Call, Memory
 
 _FARTHEST_FROM: Final = "farthest_from"
@@ -178,7 +178,7 @@ def _max_speed(line: Line, start: Ns, stop: Ns, driven_m: float) -> float | None
     return float(np.minimum(there.metres - here.metres, moved).max())
 
 
-def _between(times: Times, start: Ns, stop: Ns) -> Times:
+def _between(times: Ints, start: Ns, stop: Ns) -> Ints:
     """Returns those of ascending times that lie in `[start, stop)`."""
     return times[slice(*np.searchsorted(times, (start, stop)))]
 
@@ -304,7 +304,7 @@ def _farthest_pose(
     return farthest
 
 
-def _vertices_during(track: RobotTrack, spans: Sequence[Span]) -> tuple[Times, Floats, Floats]:
+def _vertices_during(track: RobotTrack, spans: Sequence[Span]) -> tuple[Ints, Floats, Floats]:
     """Returns the times, x and y (m) of a track's vertices in spans, and of the spans' ends.
 
     Vertices that the robot jumped to and from are left out.

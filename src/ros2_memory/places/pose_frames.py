@@ -54,11 +54,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.places.stays import KnownTrack
-    from ros2_memory.storage.base import Mask
 
 WHEREABOUTS: Final = "where the robot was"
 """What notes say is not known without poses."""
@@ -471,7 +471,7 @@ class RobotPlaces:
         return () if point is None else places_at(places, self.map_frame, *point)
 
     @cached_property
-    def _jumps(self) -> Mask:
+    def _jumps(self) -> Flags:
         return jumps(self._track)
 
     @cached_property

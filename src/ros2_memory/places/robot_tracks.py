@@ -19,8 +19,6 @@ from ros2_memory.analysis.frames import (
     TF_CACHE_NS,
     Floats,
     FrameTree,
-    Mask,
-    Times,
     static_in,
 )
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
@@ -38,7 +36,7 @@ from ros2_memory.columns.kinds import TRACKS
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.arrays import stable_order
+from ros2_memory.core.arrays import Flags, Ints, stable_order
 from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.memo import Key
@@ -146,7 +144,7 @@ class TrackReader:
         whole, recordings, is_beside = _joined_recordings(tracks, names)
         fastest_mps = self._view.limits.max_plausible_speed_mps
 
-        def robot_track(vertices: Mask) -> RobotTrack:
+        def robot_track(vertices: Flags) -> RobotTrack:
             index = np.flatnonzero(vertices)
             return track_by(whole.vertices(index), recordings[index], fastest_mps)
 
@@ -424,7 +422,7 @@ class Placed(NamedTuple):
         left_out: how many other poses no transform places.
     """
 
-    times: Times
+    times: Ints
     x: Floats
     y: Floats
     heading: Floats
@@ -475,8 +473,8 @@ class _JoinedRecordings(NamedTuple):
     """
 
     whole: PartialTrack
-    recordings: Times
-    is_beside: Mask
+    recordings: Ints
+    is_beside: Flags
 
 
 def _joined_recordings(

@@ -13,7 +13,7 @@ from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
 from ros2_memory.core.regions import ClippedSteps, Region, Steps, clipped
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.frames import Mask
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns, Span
 
@@ -79,7 +79,7 @@ class KnownTrack:
         return sorted(chain(*(stays_within(track, region, window) for track in self.tracks)))
 
 
-def _without_jumps(parts: ClippedSteps, are_jumps: Mask) -> ClippedSteps:
+def _without_jumps(parts: ClippedSteps, are_jumps: Flags) -> ClippedSteps:
     """Returns parts of steps inside of a region; of a jump only its ends, where they are inside.
 
     A robot does not drive along a jump: its odometry started again, or its map was corrected.

@@ -28,7 +28,7 @@ from ros2_memory.results import FarFromOther, Pair, StandstillPlace
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from ros2_memory.analysis.frames import Floats, Times
+    from ros2_memory.analysis.frames import Floats
     from ros2_memory.core.model import TimeWindow
 
 SAME_STAND_M: Final = 0.5
@@ -59,8 +59,8 @@ class _TrackSteps(NamedTuple):
 
     begin: Floats
     end: Floats
-    start: Times
-    stop: Times
+    start: Ints
+    stop: Ints
 
 
 def farthest_apart(
@@ -126,7 +126,7 @@ def _nearest_squared(points: Floats, others: Floats) -> Floats:
     return np.concatenate(nearest)
 
 
-def _sampled(steps: _TrackSteps) -> tuple[Floats, Times]:
+def _sampled(steps: _TrackSteps) -> tuple[Floats, Ints]:
     """Returns points (m) along the steps, `_STEP_M` apart or, if too many, more; and log times."""
     lengths = np.hypot(*(steps.end - steps.begin).T)
     step_m = max(_STEP_M, float(lengths.sum()) / _MOST_SAMPLES)
@@ -139,7 +139,7 @@ def _sampled(steps: _TrackSteps) -> tuple[Floats, Times]:
     return points, steps.start[row] + np.rint(lasted * share).astype(np.int64)
 
 
-def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
+def _thinned(points: Floats, times: Ints) -> tuple[Floats, Ints]:
     """Returns the first point in each cell of the finest grid with `_MOST_CELLS` or fewer."""
     cell_m = _STEP_M
     while True:

@@ -52,7 +52,7 @@ from ros2_memory.results import PlaceVisits, Visit, Visits
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.frames import Times
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
 _CURRENT_SPLITS: Final = 3
@@ -531,7 +531,7 @@ class ConfirmedStays:
         return min(approaches, default=(float(min(away_m[nearest], circle.radius_m)), at))
 
 
-def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[Span]:
+def _absences(times: Ints, inside: Sequence[Ns]) -> Iterator[Span]:
     """Yields the last pose inside before, and the first after, each absence of `FLICKER_NS`.
 
     An absence has poses (their log times are `times`) outside. A pause without poses is none.

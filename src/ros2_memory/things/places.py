@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.sights import Floats
     from ros2_memory.columns.sights import JoinedSights
     from ros2_memory.core.arrays import Columns
-    from ros2_memory.storage.base import Mask
 
 _CELL_MM: Final = 100
 _PEAK_MM: Final = 300
@@ -438,8 +437,8 @@ def with_synonyms(
     distinct, key_of_label = numbered(keys)
     number_of = {key: number for number, key in enumerate(distinct)}
 
-    def labels_of(key: str) -> Mask:
-        mask: Mask = key_of_label == number_of[key]
+    def labels_of(key: str) -> Flags:
+        mask: Flags = key_of_label == number_of[key]
         return mask
 
     def are_two(one: str, other: str) -> bool:
@@ -471,7 +470,7 @@ def _pairs_of_a_kind(keys: Iterable[str]) -> Iterator[tuple[str, str]]:
         yield from combinations(keys_of_a_kind, 2)
 
 
-def _are_beside(sights: JoinedSights, one: Mask, other: Mask) -> bool:
+def _are_beside(sights: JoinedSights, one: Flags, other: Flags) -> bool:
     """Returns whether messages have two keys at one place, more often than by mistake.
 
     Each mask selects the labels of one key.
@@ -483,7 +482,7 @@ def _are_beside(sights: JoinedSights, one: Mask, other: Mask) -> bool:
     return bool(n[is_both].sum() > _BESIDE_SHARE * rarer)
 
 
-def _alternate(sights: JoinedSights, counts: Ints, one: Mask, other: Mask) -> bool:
+def _alternate(sights: JoinedSights, counts: Ints, one: Flags, other: Flags) -> bool:
     """Returns whether two keys take turns at some place, within the scatter of each other.
 
     Each mask selects the labels of one key.

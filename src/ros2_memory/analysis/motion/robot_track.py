@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.arrays import range_numbers, run_starts
+from ros2_memory.core.arrays import Flags, Ints, range_numbers, run_starts
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.frames import Floats, Mask, Times
+    from ros2_memory.analysis.frames import Floats
     from ros2_memory.core.model import TimeWindow
 
 TOLERANCE_M: Final = 0.05
@@ -65,24 +65,24 @@ class RobotTrack:
         fastest_mps: the highest plausible speed; a faster step is a jump.
     """
 
-    times: Times
+    times: Ints
     x: Floats
     y: Floats
     heading: Floats
-    begins: Mask
+    begins: Flags
     fastest_mps: float = math.inf
 
     @property
-    def ends(self) -> Mask:
+    def ends(self) -> Flags:
         """Whether a piece ends at the vertex."""
         return _is_last(self.begins)
 
     @property
-    def pieces(self) -> tuple[Times, Times]:
+    def pieces(self) -> tuple[Ints, Ints]:
         """The first and the last time of each piece (ns, inclusive)."""
         return self.times[self.begins], self.times[self.ends]
 
-    def at(self, times: Times) -> tuple[Floats, Floats, Floats]:
+    def at(self, times: Ints) -> tuple[Floats, Floats, Floats]:
         """Returns x, y (m) and heading (rad) at log times; the track has at least one vertex."""
         # Relative to the first vertex, a time is small enough to be exact as a float.
         since = self.times[0]
@@ -105,12 +105,12 @@ class PartialTrack(NamedTuple):
         recording: the folder of the recording.
     """
 
-    times: Times
+    times: Ints
     x: Floats
     y: Floats
-    turns: Times
-    known: Mask
-    settled: Mask
+    turns: Ints
+    known: Flags
+    settled: Flags
     left_out: int
     recording: str = ""
 
@@ -120,7 +120,7 @@ class PartialTrack(NamedTuple):
         return 300 + 34 * len(self.times)
 
     @property
-    def columns(self) -> tuple[Times, Floats, Floats, Times, Mask, Mask]:
+    def columns(self) -> tuple[Ints, Floats, Floats, Ints, Flags, Flags]:
         """The arrays of its vertices."""
         return self[:6]
 
@@ -154,7 +154,7 @@ def empty_track() -> RobotTrack:
     return track_by(*joined_tracks([]))
 
 
-def slot_ends(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
+def slot_ends(times: Ints, recordings: Ints | int = 0) -> NDArray[np.intp]:
     """Returns the indices of the first and the last pose in each slot; of equal times the first.
 
     Poses are in order of time or, with the numbers of their recordings, of recordings and then of
@@ -166,20 +166,20 @@ def slot_ends(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
     return first[is_new | _is_last(is_new)]
 
 
-def _is_new(*columns: Times) -> Mask:
+def _is_new(*columns: Ints) -> Flags:
     """Returns which rows differ from the row before; the first row does."""
     differ = np.ones(len(columns[0]), np.bool_)
     differ[1:] = np.logical_or.reduce([np.diff(column) != 0 for column in columns])
     return differ
 
 
-def _is_last(is_first: Mask) -> Mask:
+def _is_last(is_first: Flags) -> Flags:
     """Returns which rows are the last of a group, by which are the first."""
     return np.append(is_first[1:], [True])[: len(is_first)]
 
 
 def partial_track(
-    times: Times, x: Floats, y: Floats, heading: Floats, left_out: int = 0
+    times: Ints, x: Floats, y: Floats, heading: Floats, left_out: int = 0
 ) -> PartialTrack:
     """Returns the track of a table of poses in log-time order.
 
@@ -197,20 +197,20 @@ def partial_track(
     return part.vertices(_vertices(part, ~settled, np.zeros(len(times), np.int64)))
 
 
-def _in_inner_slice(times: Times) -> Mask:
+def _in_inner_slice(times: Ints) -> Flags:
     """Returns which times are neither in the first nor in the last slice of all."""
     slices = times // TRACK_SLICE_NS
     first, last = slices.min(initial=MAX_NS), slices.max(initial=MIN_NS)
-    is_inner: Mask = (slices > first) & (slices < last)
+    is_inner: Flags = (slices > first) & (slices < last)
     return is_inner
 
 
-def track_of(times: Times, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
+def track_of(times: Ints, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
     """Returns the track of all poses (m, rad), which are in log-time order."""
     return track_by(*joined_tracks([[partial_track(times, x, y, heading)]]))
 
 
-def track_by(whole: PartialTrack, recordings: Times, fastest_mps: float = math.inf) -> RobotTrack:
+def track_by(whole: PartialTrack, recordings: Ints, fastest_mps: float = math.inf) -> RobotTrack:
     """Returns the track of all vertices in order of time; of equal times the first one counts.
 
     `recordings` has the number of the recording of each vertex.
@@ -225,7 +225,7 @@ def track_by(whole: PartialTrack, recordings: Times, fastest_mps: float = math.i
 
 def joined_tracks(
     recordings: Sequence[Sequence[PartialTrack]], *, keeps_ends: bool = False
-) -> tuple[PartialTrack, Times]:
+) -> tuple[PartialTrack, Ints]:
     """Joins the tables of each recording, and returns all vertices, recording by recording.
 
     Returns also the number of the recording of each vertex. Recordings are joined at once, since a
@@ -254,7 +254,7 @@ def joined_tracks(
     return whole.vertices(vertices), numbers[vertices]
 
 
-def _continuous(turns: Times, is_continuous: Mask) -> Times:
+def _continuous(turns: Ints, is_continuous: Flags) -> Ints:
     """Returns headings that change by less than half a turn from each to the next.
 
     Steps that are continuous already stay as they are.
@@ -262,11 +262,11 @@ def _continuous(turns: Times, is_continuous: Mask) -> Times:
     steps = np.diff(turns, prepend=0)
     short = (steps + _TURN // 2) % _TURN - _TURN // 2
     is_step_kept = is_continuous & (np.arange(len(turns)) > 0)
-    whole: Times = np.cumsum(np.where(is_step_kept, steps, short))
+    whole: Ints = np.cumsum(np.where(is_step_kept, steps, short))
     return whole
 
 
-def _vertices(part: PartialTrack, keeps: Mask, recordings: Times) -> NDArray[np.intp]:
+def _vertices(part: PartialTrack, keeps: Flags, recordings: Ints) -> NDArray[np.intp]:
     """Returns the indices of poses that are vertices.
 
     They are the poses to keep, the first and the last of each slice and, again and again, the pose
@@ -300,7 +300,7 @@ def _vertices(part: PartialTrack, keeps: Mask, recordings: Times) -> NDArray[np.
     return np.flatnonzero(is_vertex)
 
 
-def jumps(track: RobotTrack) -> Mask:
+def jumps(track: RobotTrack) -> Flags:
     """Returns after which vertices the robot jumped to the next one, faster than plausible."""
     lasted = np.diff(track.times)
     far = np.hypot(np.diff(track.x), np.diff(track.y)) * 1e9 > track.fastest_mps * lasted
