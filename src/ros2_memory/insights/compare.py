@@ -57,7 +57,6 @@ from ros2_memory.results import (
     ComparedThings,
     Comparison,
     FarFromOther,
-    MoverSeen,
     Pair,
     StandstillPlace,
     ThingStay,
@@ -310,7 +309,7 @@ class _ThingsBetween:
 
     def _movers(self) -> Iterator[ComparedMover]:
         """Yields the people, pets and other movers that differ between the windows."""
-        alone: dict[str, tuple[list[MoverSeen], list[MoverSeen]]] = {}
+        alone: dict[str, tuple[list[ThingStay], list[ThingStay]]] = {}
         for mover in self.known.estimate.movers:
             label = self.known.estimate.names[mover.key]
             before = self._last_seen(mover, self.earlier, self.later.start)
@@ -329,7 +328,7 @@ class _ThingsBetween:
             for earlier, later in zip_longest(befores, afters):
                 yield ComparedMover(label, earlier, later)
 
-    def _last_seen(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
+    def _last_seen(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> ThingStay | None:
         """Returns where a mover was last seen in a window, in slices that end before a time."""
         estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
         rows = self.known.seen_inside(mover, window, self.where, before)
@@ -337,15 +336,9 @@ class _ThingsBetween:
             return None
         spots = estimate.spots[rows]
         newest = spots[spots[:, Spot.LAST].argmax()]
-        x, y, z, last = newest[[Spot.X, Spot.Y, Spot.Z, Spot.LAST]].tolist()
-        place = x / 1000, y / 1000, z / 1000
-        return MoverSeen(
-            at_once=most_at_once(spots),
-            count=int(estimate.counts[rows].sum()),
-            place=place,
-            inside=places_at(self.places, frame, *place[:2]),
-            last=last,
-        )
+        x, y, z = (newest[[Spot.X, Spot.Y, Spot.Z]] / 1000).tolist()
+        seen = self.known.describe_stay(rows, (x, y, z), frame, self.places)
+        return replace(seen, at_once=most_at_once(spots))
 
 
 def _pair_across_runs(
@@ -381,7 +374,7 @@ def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:
     seen = thing.after or thing.before
     if seen is None:
         return 0, thing.label
-    return -(seen.end if isinstance(seen, ThingStay) else seen.last), thing.label
+    return -seen.end, thing.label
 
 
 def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:

@@ -45,7 +45,6 @@ from ros2_memory.results.things import (
     ComparedThings,
     Comparison,
     FarFromOther,
-    MoverSeen,
     Pair,
     StandstillPlace,
     StillThere,

@@ -337,31 +337,26 @@ class ComparedThing:
     looks: int = 0
 
 
-@result(
-    PLAIN("times", "count"),
-    "at_once",
-    _XY.spread("place"),
-    INSIDE("inside"),
-    TIME("last_seen", "last"),
-    LOCAL_OF_DAYS("local", "last"),
+_MOVER: Final = an_object(
+    keys(
+        PLAIN("times", "count"),
+        "at_once",
+        _XY.spread("place"),
+        INSIDE("inside"),
+        TIME("last_seen", "end"),
+        LOCAL_OF_DAYS("local", "end"),
+    )
 )
-class MoverSeen:
-    """A mover in a window: how many at most at once, how often seen, and its last place (m)."""
-
-    at_once: int
-    count: int
-    place: Vector3
-    inside: tuple[str, ...]
-    last: Ns
+"""A mover in a window: how many at most at once, how often seen, and its last place (m)."""
 
 
-@result(_LABEL("label"), OBJECT("was", "before").if_known, OBJECT("is", "after").if_known)
+@result(_LABEL("label"), _MOVER("was", "before").if_known, _MOVER("is", "after").if_known)
 class ComparedMover:
     """A mover in the earlier and in the later window; None where it was not seen."""
 
     label: str
-    before: MoverSeen | None
-    after: MoverSeen | None
+    before: ThingStay | None
+    after: ThingStay | None
 
 
 def _differences(most: int) -> Keys:
