@@ -143,18 +143,7 @@ def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
         return ()  # the recorder reports that, and starts again
     if state is None:
         return ()
-    return tuple(
-        FiredRule(
-            name,
-            rule.fired,
-            rule.moments,
-            rule.refused,
-            rule.last_fired,
-            rule.always_since,
-            rule.problem,
-        )
-        for name, rule in sorted(state.rules.items())
-    )
+    return tuple(FiredRule(name, rule) for name, rule in sorted(state.rules.items()))
 
 
 def _now(memory: Memory, call: Call) -> Ns:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.analysis.silences import Silence
     from ros2_memory.bag_dir.moment_file import StoredMoment
+    from ros2_memory.bag_dir.state_files import RuleRecord
     from ros2_memory.core.model import SetAside
     from ros2_memory.core.timebase import Ns
 
@@ -204,34 +205,19 @@ class RememberedMoment:
 
 @result(
     PLAIN("rule", "name"),
-    "fired",
-    "moments",
-    TIME("last_ts", "last").if_known,
-    AGO("last_ago_s", "last").if_known,
-    PLAIN("refused").if_any,
-    TIME("matches_since", "always_since").if_known,
-    PLAIN("problem").if_known,
+    PLAIN("fired", "record.fired"),
+    PLAIN("moments", "record.moments"),
+    TIME("last_ts", "record.last_fired").if_known,
+    AGO("last_ago_s", "record.last_fired").if_known,
+    PLAIN("refused", "record.refused").if_any,
+    TIME("matches_since", "record.always_since").if_known,
+    PLAIN("problem", "record.problem").if_known,
 )
 class FiredRule:
-    """How often a rule of `recording.keep_when` fired, and how many moments that made.
-
-    Attributes:
-        name: of the rule.
-        fired: how often it fired.
-        moments: how many moments it made; a moment may hold several matches.
-        refused: how often it fired and nothing was saved.
-        last: log time at which it last fired; None if it never did.
-        always_since: since when it has matched all the time; None unless that is long.
-        problem: why it may have missed something, or saves nothing; None if nothing is wrong.
-    """
+    """How often a rule of `recording.keep_when` fired, and how many moments that made."""
 
     name: str
-    fired: int
-    moments: int
-    refused: int
-    last: Ns | None
-    always_since: Ns | None
-    problem: str | None
+    record: RuleRecord
 
 
 def _size_gb(stored: StoredMoment) -> float:
