@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.layout import named_start
-from ros2_memory.bag_dir.state_files import LatchedMark, RunRecord, TriggerState
+from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, RunRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
@@ -282,8 +282,9 @@ class SplitSearch:
                 useless then.
         """
         for rule in self._rules:
+            record = state.rules.setdefault(rule.name, RuleRecord())
             if not chain.goes_on:
-                state.rules[rule.name].runs.clear()  # the recorder did not run on
+                record.runs.clear()  # the recorder did not run on
         firings: list[Firing] = []
         until, is_complete = max(part.window.stop for part in chain.parts), True
         previous: Ns | None = None

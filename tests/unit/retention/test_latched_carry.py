@@ -199,7 +199,7 @@ class TestTheBagOfCarriedMessages:
 
     def test_after_a_kill_it_is_the_recorder_s_own(self, tmp_path: Path) -> None:
         at_home(tmp_path)
-        with killed_at(OwnRecordings, "hold"):
+        with killed_at(OwnRecordings, "add_bags"):
             keeper_of(tmp_path, max_bytes=1).apply()
         keeper_of(tmp_path, max_bytes=1).apply()
         assert OwnRecordings(tmp_path).owns_bag(tmp_path / "latched/carried.mcap")
