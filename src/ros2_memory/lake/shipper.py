@@ -39,7 +39,7 @@ from ros2_memory.lake.tables import TABLES, ShippedBag, bags_condition, day_of, 
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.fill import Batch, Filling
@@ -136,15 +136,11 @@ class Shipper:
     patience_s: float = PATIENCE_S
 
     def __post_init__(self) -> None:
-        """Forgets what an earlier shipper knew."""
+        """Takes the robots over, and forgets what an earlier shipper knew of them."""
         self.done = Shipped()
+        for robot in self.robots:
+            robot.shipper = self
         self.look_again()
-
-    def report(self, robot: RobotBags, problem: object) -> None:
-        """Adds a problem of a robot to the pass, unless it is known."""
-        sentence = f"{robot.name}: {problem}"
-        if sentence not in self.done.problems:
-            self.done.problems.append(sentence)
 
     def look_again(self) -> None:
         """Makes the next pass look at all bags again, in the directories and in the lake."""
@@ -161,7 +157,7 @@ class Shipper:
         batch: list[_PreparedBags] = []
         size = bags = 0
         robots = [robot for robot in self.robots if self._forget(robot)]
-        for prepared in chain.from_iterable(robot.prepare(self) for robot in robots):
+        for prepared in chain.from_iterable(robot.prepare() for robot in robots):
             batch.append(prepared)
             bags += len(prepared.bags)
             size += sum(rows.nbytes for rows in prepared.rows.values())
@@ -197,14 +193,14 @@ class Shipper:
         """
         if not robot.answers(self.patience_s):
             why = "does not answer: is its disk reachable? Until it does, nothing of it is shipped"
-            self.report(robot, f"{robot.bag_dir} {why}")
+            robot.report(f"{robot.bag_dir} {why}")
             return False
         try:
             wanted = [*map(partial(Tombstone.of, robot.name), read_forgettings(robot.bag_dir))]
         except (OSError, ValueError) as error:
             why = "until it is repaired, since what was forgotten could come back"
             file = f"{robot.bag_dir / FORGOTTEN_FILE}: {error}"
-            self.report(robot, f"{file}; nothing of this robot is shipped {why}")
+            robot.report(f"{file}; nothing of this robot is shipped {why}")
             return False
         new = [tombstone for tombstone in wanted if tombstone not in self.tombstones]
         # Before the tombstone: after a kill it repeats the deletion in the lake, not this one.
@@ -216,7 +212,7 @@ class Shipper:
             gone = forget_in_lake(self.lake, tombstone)
             self.done.forgotten += gone.bags
             for name in gone.kept_by:
-                self.report(robot, f"a branch or tag keeps what was forgotten: {name}")
+                robot.report(f"a branch or tag keeps what was forgotten: {name}")
             self.tombstones.add(tombstone)
         if new:
             self.look_again()
@@ -249,7 +245,7 @@ class Shipper:
             for one in prepared.bags:
                 for bag in one.replaced:
                     robot.known.pop(bag.bag_id, None)
-            robot.confirm([one.bag for one in prepared.bags], self)
+            robot.confirm([one.bag for one in prepared.bags])
 
 
 @dataclass(eq=False, repr=False)
@@ -267,6 +263,7 @@ class RobotBags:
         messages: the topics whose messages are shipped whole.
         filling: stores the columns of bags, from which rows are made; None: each kind of row reads
             the bags anew.
+        shipper: ships the bags at present.
     """
 
     name: str
@@ -275,6 +272,7 @@ class RobotBags:
     config: str
     messages: Sequence[str] = ()
     filling: Filling | None = None
+    shipper: Shipper = field(init=False)
     _looking: threading.Thread | None = field(default=None, init=False)
 
     def answers(self, patience_s: float) -> bool:
@@ -293,6 +291,12 @@ class RobotBags:
     def bag_dir(self) -> Path:
         """The bag directory."""
         return self.memory.index.bag_dir
+
+    def report(self, problem: object) -> None:
+        """Adds a problem of the robot to the pass, unless it is known."""
+        sentence, problems = f"{self.name}: {problem}", self.shipper.done.problems
+        if sentence not in problems:
+            problems.append(sentence)
 
     def name_of(self, bag: BagFile) -> str:
         """Returns the path of a bag below the bag directory."""
@@ -329,34 +333,34 @@ class RobotBags:
             return [f"{self.name}: {error}"]
         return []
 
-    def prepare(self, shipper: Shipper) -> Iterator[_PreparedBags]:
+    def prepare(self) -> Iterator[_PreparedBags]:
         """Yields the bags to ship, the oldest first, with their rows."""
         snapshot = self.memory.index.refresh()
         if snapshot.problem is not None:
-            shipper.report(self, snapshot.problem)
+            self.report(snapshot.problem)
             return
-        bags = self._settled(snapshot, shipper)
-        self._load_known(bags, shipper.lake)
+        bags = self._settled(snapshot)
+        self._load_known(bags)
         batches = [] if self.filling is None else self.filling.batches(snapshot.timeline)
         waiting = {bag.file: batch for batch in batches for bag in batch.bags}
         group: list[_BagToShip] = []
-        for to_ship in self._to_ship(bags, shipper):
-            if group and not _fit_in_group([*group, to_ship], shipper.most_bags):
-                yield from self._with_rows(group, waiting, shipper)
+        for to_ship in self._to_ship(bags):
+            if group and not _fit_in_group([*group, to_ship], self.shipper.most_bags):
+                yield from self._with_rows(group, waiting)
                 group = []
             group.append(to_ship)
         if group:
-            yield from self._with_rows(group, waiting, shipper)
+            yield from self._with_rows(group, waiting)
         if self.filling is not None:
             self._cut_to_share(self.filling)
         self._drop_gone(bags)
 
-    def _to_ship(self, bags: Sequence[BagFile], shipper: Shipper) -> Iterator[_BagToShip]:
+    def _to_ship(self, bags: Sequence[BagFile]) -> Iterator[_BagToShip]:
         """Yields the bags to ship; confirms the bags in the lake at the end."""
         by_file = {shipped.file: shipped for shipped in self.known.values()}
         receipts = cache(partial(read_receipts, self.bag_dir))
         confirmed = list[ShippedBag]()
-        for number, (bag, bag_id) in enumerate(self._identified_bags(bags, shipper)):
+        for number, (bag, bag_id) in enumerate(self._identified_bags(bags)):
             if number % _GROUP == 0:
                 maker = RowMaker(self.memory, self.config, self.messages)
             before, same_file = self.known.get(bag_id), by_file.get(self.name_of(bag))
@@ -365,7 +369,7 @@ class RobotBags:
                     continue
                 shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
             except (EpisodicError, OSError, ValueError) as error:
-                shipper.report(self, error)
+                self.report(error)
                 continue
             # A copy with another path and mtime has the same rows.
             if before and before == shipped._replace(mtime_ns=before.mtime_ns, file=before.file):
@@ -378,11 +382,9 @@ class RobotBags:
             ):
                 replaced.add(same_file)
             yield _BagToShip(bag, shipped, [*replaced])
-        self.confirm(confirmed, shipper)
+        self.confirm(confirmed)
 
-    def _identified_bags(
-        self, bags: Sequence[BagFile], shipper: Shipper
-    ) -> Iterator[tuple[BagFile, str]]:
+    def _identified_bags(self, bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, str]]:
         """Yields the bags that may be in the lake with their ids, the oldest first, each bag once.
 
         A moment's copy of a bag is left out if the bag itself is there, or in the lake.
@@ -390,24 +392,24 @@ class RobotBags:
         ids: set[str] = set()
         copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
         for bag in sorted(bags, key=lambda bag: (bag.file in copies, bag.start)):
-            shipper.alive()
+            self.shipper.alive()
             try:
-                state = self._known_state(bag, shipper.tombstones)
+                state = self._known_state(bag)
             except (EpisodicError, OSError, ValueError) as error:
-                shipper.report(self, error)
+                self.report(error)
                 continue
             if state.bag_id in ids or (state.bag_id in self.known and bag.file in copies):
                 continue
             if state.is_forgotten:
                 do = "it is not shipped: delete it, or the messages, with ros2-memory forget"
                 why = f"{bag.file} has messages that were forgotten in the lake; {do}"
-                shipper.report(self, why)
+                self.report(why)
                 continue
             ids.add(state.bag_id)
             yield bag, state.bag_id
 
     def _with_rows(
-        self, group: Sequence[_BagToShip], waiting: dict[str, Batch], shipper: Shipper
+        self, group: Sequence[_BagToShip], waiting: dict[str, Batch]
     ) -> Iterator[_PreparedBags]:
         """Yields bags with their rows; a bag whose rows cannot be made is reported.
 
@@ -423,10 +425,10 @@ class RobotBags:
                 rows = self._rows(group)
         except (EpisodicError, OSError, ValueError) as error:
             if len(group) == 1:
-                shipper.report(self, error)
+                self.report(error)
                 return
             for alone in group:
-                yield from self._with_rows([alone], waiting, shipper)
+                yield from self._with_rows([alone], waiting)
         else:
             yield _PreparedBags(self, group, rows)
 
@@ -456,7 +458,7 @@ class RobotBags:
         filling.thin()
         filling.trim()
 
-    def _settled(self, snapshot: Snapshot, shipper: Shipper) -> Sequence[BagFile]:
+    def _settled(self, snapshot: Snapshot) -> Sequence[BagFile]:
         """Returns the closed bags that change no more; counts and reports the others."""
         now = self.memory.clock.now()
         closed = [
@@ -466,15 +468,15 @@ class RobotBags:
         ]
         bags = [bag for bag in closed if is_settled(bag, self.bag_dir, now)]
         open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
-        shipper.done.waiting += len(closed) - len(bags) + len(open_bags)
+        self.shipper.done.waiting += len(closed) - len(bags) + len(open_bags)
         for bag in open_bags:
             why = "was left open by a crash: ros2-memory recover closes it"
-            shipper.report(self, f"{bag.file} {why}")
+            self.report(f"{bag.file} {why}")
         for file in snapshot.damaged:
-            shipper.report(self, f"{file.path}: {file.reason}")
+            self.report(f"{file.path}: {file.reason}")
         return bags
 
-    def _load_known(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
+    def _load_known(self, bags: Sequence[BagFile]) -> None:
         """Reads the rows that the lake has of the time of new bags.
 
         Raises:
@@ -485,7 +487,7 @@ class RobotBags:
             begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
             stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
             of_time = window_condition(self.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
-            for row in lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
+            for row in self.shipper.lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
                 self.known.setdefault(row["bag_id"], ShippedBag(**row))
 
     def _drop_gone(self, bags: Sequence[BagFile]) -> None:
@@ -497,7 +499,7 @@ class RobotBags:
         self.known = {bag.bag_id: bag for bag in shipped}
         self._confirmed.intersection_update(shipped)
 
-    def _known_state(self, bag: BagFile, tombstones: Collection[Tombstone]) -> _KnownState:
+    def _known_state(self, bag: BagFile) -> _KnownState:
         """Returns a bag's id, and whether it has forgotten messages; reads each state once."""
         state = (bag.size, bag.mtime_ns, bag.sidecar_ns)
         known = self._states.get(bag.file)
@@ -509,7 +511,7 @@ class RobotBags:
             bag_id = bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
             is_forgotten = any(
                 tombstone.forbids(self.memory.reader, bag, bag_id)
-                for tombstone in tombstones
+                for tombstone in self.shipper.tombstones
                 if tombstone.robot == self.name
             )
             known = self._states[bag.file] = _KnownState(state, bag_id, is_forgotten)
@@ -536,16 +538,16 @@ class RobotBags:
             end_ns=bag.end,
         )
 
-    def confirm(self, bags: Sequence[ShippedBag], shipper: Shipper) -> None:
+    def confirm(self, bags: Sequence[ShippedBag]) -> None:
         """Remembers that bags are in the lake, and writes receipts if a recorder made them."""
         self.known |= {bag.bag_id: bag for bag in bags}
         new = [bag for bag in bags if bag not in self._confirmed]
         if not (new and has_recorded(self.bag_dir)):
             return
         try:
-            receipts, lake = read_receipts(self.bag_dir), shipper.lake.lake_id
+            receipts, lake = read_receipts(self.bag_dir), self.shipper.lake.lake_id
             missing = [
-                Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, shipper.clock.now())
+                Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, self.shipper.clock.now())
                 for bag in new
                 if not is_shipped(receipts, bag.file, bag.size) or receipts[bag.file].lake != lake
             ]
@@ -554,7 +556,7 @@ class RobotBags:
             self._confirmed.update(new)
         except OSError as error:
             what = f"no receipts can be written into {self.bag_dir} ({error.strerror or error})"
-            shipper.report(self, f"{what}: its recorder cannot wait for shipping")
+            self.report(f"{what}: its recorder cannot wait for shipping")
 
 
 def _is_cut(
