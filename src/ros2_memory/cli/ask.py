@@ -101,7 +101,7 @@ def ask(
             question.append(word)
     loaded, _ = load_to_look(bag_dir, looking, recording)
     fleet = build_fleet(loaded)
-    memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
+    memory = open_memory(loaded, verbose=verbose, allows_fleet=True)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
     if not question:
         _print_tools(dispatcher.tools, as_json=as_json)

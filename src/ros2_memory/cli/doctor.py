@@ -146,7 +146,7 @@ def _examine(bags: Bags) -> Iterator[Finding]:
     try:
         settings = bags.settings()
         robots = settings.fleet.robots
-        memory = open_memory(settings, verbose=bags.verbose, scans=not robots)
+        memory = open_memory(settings, verbose=bags.verbose, allows_fleet=True)
     except ConfigError as refused:
         yield Finding(Level.ERROR, "config", str(refused), _CORRECT)
         return

@@ -261,7 +261,7 @@ def open_memory(
     settings: Settings,
     *,
     verbose: bool,
-    scans: bool = True,
+    allows_fleet: bool = False,
     setting: str | None = None,
 ) -> "Memory":
     """Opens the memory of the configured bags, and indexes the directory as it is now.
@@ -270,15 +270,16 @@ def open_memory(
         settings: the configuration.
         verbose: whether log events are shown on stderr. Otherwise warnings are counted, and
             `reported_errors` prints the count when the command ends.
-        scans: False leaves out the index, for a command that asks the robots of a fleet.
+        allows_fleet: whether the command also asks the robots of a fleet, whose memory has no bags
+            of its own, and no index.
         setting: the setting that names the bags, if it is not `recording.bag_dir`.
 
     Raises:
         ConfigError: an adapter cannot be built.
-        InvalidArgumentsError: a fleet is configured, or `data.recording` does not exist.
+        InvalidArgumentsError: a fleet is not allowed, or `data.recording` does not exist.
     """
     robots = settings.fleet.robots
-    if robots and scans:
+    if robots and not allows_fleet:
         name, folder = next(iter(robots.items()))
         raise InvalidArgumentsError(
             f"this looks at the bags of one robot: name them, e.g. --bag-dir {folder} for {name}; "
@@ -291,7 +292,7 @@ def open_memory(
     if not verbose:
         withhold_warnings()
     memory = build_memory(settings, shared_parts(settings), setting=setting)
-    if not scans:
+    if robots:
         return memory
     with spinner(f"looking through {settings.recording.bag_dir}"):
         snapshot = memory.index.refresh()
