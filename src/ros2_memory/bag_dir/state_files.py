@@ -56,7 +56,7 @@ from ros2_memory.bag_dir.layout import (
     utc_day,
 )
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import NS_PER_S, Ns, Span
+from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -204,7 +204,7 @@ _APART_NS: Final[Ns] = 20 * NS_PER_S
 """The longest time without a message from one split of a recording to the next."""
 _TOUCHING_NS: Final[Ns] = NS_PER_S
 """The longest time without a message from one recording to the next."""
-_LONGEST_NS: Final[Ns] = 86_400 * NS_PER_S
+_LONGEST_NS: Final[Ns] = NS_PER_DAY
 """The clock was set within a longer split: its times mean nothing."""
 
 

@@ -35,7 +35,7 @@ from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
-from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
+from ros2_memory.core.timebase import FUTURE_NS, NS_PER_HOUR, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
 from ros2_memory.history.no_data import nothing_here
@@ -67,7 +67,7 @@ _WAIT: Final = (
 )
 _CORRECT: Final = "correct the key that it names"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
-_LATE_NS: Final[Ns] = 3600 * NS_PER_S
+_LATE_NS: Final[Ns] = NS_PER_HOUR
 """A hub that is reached has confirmed closed bags after this time."""
 
 

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -48,7 +48,6 @@ SCHEMA: Final = pa.schema(
 _GROUP_ROWS: Final = 20_000
 """Rows of a row group: some megabytes."""
 _AS_JSON: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
-_DAY_NS: Final = 86_400 * NS_PER_S
 _MAX_OPEN_FILES: Final = 16
 """Messages come in time order, so few recordings are written at a time."""
 
@@ -120,7 +119,7 @@ class Dataset:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".") as temporary:
             for stored in messages:
-                partition = stored.bag.recording.name, stored.time // _DAY_NS
+                partition = stored.bag.recording.name, stored.time // NS_PER_DAY
                 part = open_parts.pop(partition, None)
                 if part is None:
                     if len(open_parts) == _MAX_OPEN_FILES:
@@ -186,7 +185,7 @@ def _new_file(folder: Path, recording: str, day: int, others: Collection[Path]) 
     Raises:
         InvalidArgumentsError: an earlier export wrote files there.
     """
-    date = datetime.fromtimestamp(day * _DAY_NS // NS_PER_S, tz=UTC).date()
+    date = datetime.fromtimestamp(day * NS_PER_DAY // NS_PER_S, tz=UTC).date()
     partition = folder / f"recording={quote(recording, safe=' ')}" / f"date={date}"
     if any(partition.glob("*.parquet")):
         raise InvalidArgumentsError(

@@ -27,6 +27,8 @@ Ns: TypeAlias = int
 Span: TypeAlias = tuple[Ns, Ns]
 """A first and a last time, or a start and the stop behind it."""
 
+NS_PER_HOUR: Final = 3_600_000_000_000
+NS_PER_DAY: Final = 24 * NS_PER_HOUR
 NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000

@@ -33,7 +33,7 @@ from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import BagError, BusyError, EpisodicError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_DAY, Clock, Ns
 from ros2_memory.lake.rows import RowMaker, bag_id_of, sha256_of
 from ros2_memory.lake.tables import TABLES, ShippedBag, bags_condition, day_of, window_condition
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
@@ -58,7 +58,7 @@ _GROUP: Final = 64
 """Bags whose rows are made at once: messages read around one bag are needed for the next."""
 PATIENCE_S: Final = 30.0
 """How long a bag directory may take to answer."""
-_BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
+_BESIDE_NS: Final[Ns] = NS_PER_DAY
 """The lake may have a bag with a begin or end so far away: more of its messages counted then."""
 
 

@@ -24,7 +24,7 @@ from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_DAY, NS_PER_MS, Ns
 from ros2_memory.lake.rows import bag_id_of
 from ros2_memory.lake.tables import (
     TABLES,
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 log = get_logger(__name__)
 
 TOMBSTONES_FILE: Final = "tombstones.jsonl"
-_DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 FEW_FILES: Final = 3
 """A day of a robot with more files in a table is compacted."""
 _MOST_BYTES: Final = 128 << 20
@@ -70,7 +69,7 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     Raises:
         LakeError: the lake cannot be read or written.
     """
-    closed = day_of(now - _DAY_NS)
+    closed = day_of(now - NS_PER_DAY)
     done = 0
     for name in TABLES:
         for day, robots in _to_compact(lake.days(name), closed):

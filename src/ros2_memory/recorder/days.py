@@ -50,7 +50,7 @@ from ros2_memory.core.text import (
     looks_like_json,
     match_topics,
 )
-from ros2_memory.core.timebase import NS_PER_S, Ns, ms_since
+from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_HOUR, Ns, ms_since
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.recorder.thinning import (
     MINUTE_NS,
@@ -113,7 +113,7 @@ _NAMES: Final = _OF_DETECTIONS.union(
 _FIRST_DAY: Final = "2014"
 """Earlier days have a wrong date: there was no ROS 2."""
 _QOS: Final = "offered_qos_profiles"
-MONTH_NS: Final[Ns] = 31 * 86_400 * NS_PER_S
+MONTH_NS: Final[Ns] = 31 * NS_PER_DAY
 """The numbers of older days have one message a minute."""
 _BY_MINUTE: Final = ("ros2_memory_numbers_s", "60")
 """In the metadata of each channel of a day that was thinned to minutes: it is not thinned again."""
@@ -122,7 +122,6 @@ GRACE_S: Final = 86_400.0
 be an accident."""
 COUNTED_S: Final = 600.0
 """How often the rest of that time is written."""
-HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 _EVERYTHING: Final = TimeWindow.everything()
 _TopicType: TypeAlias = tuple[str, str]
 """A topic and its type."""
@@ -143,7 +142,7 @@ class MemoryLimits(NamedTuple):
     labels: tuple[str, ...] = ()
     people: tuple[str, ...] = ()
     max_bytes: int = 10**9
-    max_age_ns: Ns = 400 * 86_400 * NS_PER_S
+    max_age_ns: Ns = 400 * NS_PER_DAY
 
 
 @dataclass(eq=False, repr=False)
@@ -558,14 +557,14 @@ class MemoryDays:
         topics = [channel.topic for channel in self.reader.channels(path)] if path.exists() else []
         hours: defaultdict[int, list[Record]] = defaultdict(list)
         for record in added:
-            hours[record.log_time // HOUR_NS].append(record)
+            hours[record.log_time // NS_PER_HOUR].append(record)
         if topics:
             # Only hours with messages: if the clock was set, years may lie between two.
             for batch in self.reader.batches(path, topics, _EVERYTHING, bare=topics):
-                for hour in np.unique(batch.log_times // HOUR_NS).tolist():
+                for hour in np.unique(batch.log_times // NS_PER_HOUR).tolist():
                     hours.setdefault(hour, [])
         for hour in sorted(hours):
-            window = TimeWindow(hour * HOUR_NS, (hour + 1) * HOUR_NS)
+            window = TimeWindow(hour * NS_PER_HOUR, (hour + 1) * NS_PER_HOUR)
             records = hours[hour]
             if topics:
                 records = [*self.reader.records(path, topics, window), *records]

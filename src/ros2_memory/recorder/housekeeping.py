@@ -18,7 +18,7 @@ from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_since, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_HOUR, Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
@@ -363,7 +363,7 @@ class Housekeeping:
     def _describe_held(self, bags: int) -> str | None:
         if not bags:
             return None
-        limit = f"{self.limits.max_age_ns / (3600 * NS_PER_S):g} h"
+        limit = f"{self.limits.max_age_ns / NS_PER_HOUR:g} h"
         return (
             f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
             "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "

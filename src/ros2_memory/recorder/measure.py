@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
+from ros2_memory.core.timebase import MAX_NS, NS_PER_HOUR, NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.storage.base import BagReader, Channel, Record, Schema
 
-HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 RECENT: Final = 6
 """A message, or a recording, that is missing for so many splits does not come any more."""
 FEWEST: Final = 10
@@ -175,7 +174,7 @@ class LossCounter:
         """Returns how many messages of each topic are missing in the last hour."""
         lost = Counter[str]()
         for loss in self._lately:
-            if loss.stop > now - HOUR_NS:
+            if loss.stop > now - NS_PER_HOUR:
                 lost[loss.topic] += loss.lost
         return dict(lost)
 
@@ -399,7 +398,7 @@ MEASURED_NS: Final[Ns] = 30 * NS_PER_S
 SILENT_PERIODS: Final = 10
 LEAST_SILENCE_NS: Final[Ns] = 10 * NS_PER_S
 """A shorter pause is no silence, however often a topic comes: splits do not show it."""
-IRREGULAR_NS: Final[Ns] = 3600 * NS_PER_S
+IRREGULAR_NS: Final[Ns] = NS_PER_HOUR
 """A topic does not count as regular for so long after a silence."""
 _REGULAR: Final = 20
 """Messages that make a topic regular."""

@@ -34,7 +34,7 @@ from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_DAY, NS_PER_HOUR, Ns
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 
 if TYPE_CHECKING:
@@ -44,8 +44,7 @@ SMALL_BUDGET_GB: Final = 0.1
 """The files beside the bags may take a large part of a smaller budget."""
 GB: Final = 10**9
 """Bytes of a gigabyte, as configuration keys that end in `_gb` count them."""
-HOUR_NS: Final[Ns] = 3600 * NS_PER_S
-SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
+SHORTEST_PAUSE_NS: Final[Ns] = NS_PER_DAY
 """A shorter pause never parts two periods, however little history is kept."""
 
 
@@ -117,7 +116,7 @@ class StoredBag(NamedTuple):
     @property
     def hour(self) -> int:
         """The hour of its date, counted from the epoch."""
-        return self.date // HOUR_NS
+        return self.date // NS_PER_HOUR
 
     def dated(self, at: Ns) -> StoredBag:
         """Returns it with another date."""

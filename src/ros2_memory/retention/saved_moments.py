@@ -35,7 +35,7 @@ from ros2_memory.core import directories
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import overlaps_any, united, without
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
+from ros2_memory.core.timebase import MAX_NS, NS_PER_HOUR, NS_PER_S, Clock, Ns, iso_local
 from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.policy import GB
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 REPAIRED_WITHIN_NS: Final[Ns] = 600 * NS_PER_S
 """How long a moment waits for a bag that a crash left open: its repair makes another file."""
-LONGEST_WAIT_NS: Final[Ns] = 2 * 3600 * NS_PER_S
+LONGEST_WAIT_NS: Final[Ns] = 2 * NS_PER_HOUR
 """How long a moment waits for open splits, and for links that the disk refuses. No split is open
 for longer, unless another program writes it, or clocks differ."""
 SHORTEST_HOLE_NS: Final[Ns] = 2 * NS_PER_S

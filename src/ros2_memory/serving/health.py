@@ -23,7 +23,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, moment, seconds
 from ros2_memory.core.text import encodable, shortened
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_HOUR, Ns
 from ros2_memory.history.context import Call, Memory, short_name
 from ros2_memory.history.coverage import recording_gaps, unexcluded
 from ros2_memory.history.view import View
@@ -48,7 +48,6 @@ _MAX_CHARS: Final = 290
 _REPLY_WITHIN_S: Final = 5.0
 _LONGEST_REPLY: Final = 1 << 20
 
-_HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 
 log = get_logger(__name__)
 
@@ -175,7 +174,7 @@ def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> J
 def _gaps_last_hour(memory: Memory, now: Ns) -> JsonObject:
     """Returns how often nothing was recorded in the last hour, and for how long in all."""
     view = View(memory, Call())
-    gaps = [*unexcluded(view, recording_gaps(view, TimeWindow(now - _HOUR_NS, now)))]
+    gaps = [*unexcluded(view, recording_gaps(view, TimeWindow(now - NS_PER_HOUR, now)))]
     return {"count": len(gaps), "seconds": seconds(sum(end - start for start, end in gaps))}
 
 

@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.state_files import TRIGGERS, RuleMoment, RuleRecord, Tr
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, Span, ns_from_unix
+from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, NS_PER_S, Clock, Ns, Span, ns_from_unix
 from ros2_memory.triggers.rules import Firing, Rule, SplitSearch, chains_to_search
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ GLOB_MARKS: Final = "*?["
 """Characters that make a topic of a rule a glob."""
 LOOK_S: Final = 2.0
 """How long one look searches: meanwhile nothing is deleted, and no other moment is saved."""
-HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 LONGEST_NS: Final[Ns] = 600 * NS_PER_S
 """Matches join to moments that are no longer than this, or than one match needs."""
 MOST_WAITING: Final = 100
@@ -238,7 +237,7 @@ class Triggers:
             newest.matches += 1
             newest.stored = False
             return
-        record.begun = [begun for begun in record.begun if abs(firing.at - begun) < HOUR_NS]
+        record.begun = [begun for begun in record.begun if abs(firing.at - begun) < NS_PER_HOUR]
         if len(record.begun) >= rule.max_per_hour:
             reason = (
                 f"it fires more often than it may begin moments (max_per_hour: "
@@ -303,13 +302,17 @@ class Triggers:
 
     def _was_logged_recently(self, name: str, at: Ns) -> bool:
         """Whether a problem was noted in the hour before a rule fired."""
-        return name in self._reported and abs(at - self._reported[name]) < HOUR_NS
+        return name in self._reported and abs(at - self._reported[name]) < NS_PER_HOUR
 
 
 def _note_lasting_match(name: str, record: RuleRecord) -> None:
     """Stores since when a rule has matched for more than an hour, and logs it once."""
     since = min(
-        (run.first for run in record.runs.values() if run.fired and run.last - run.first > HOUR_NS),
+        (
+            run.first
+            for run in record.runs.values()
+            if run.fired and run.last - run.first > NS_PER_HOUR
+        ),
         default=None,
     )
     if since is not None and record.always_since is None:

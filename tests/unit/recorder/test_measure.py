@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.timebase import NS_PER_HOUR
 from ros2_memory.recorder.measure import (
-    HOUR_NS,
     Arrival,
     Arrivals,
     LossCounter,
@@ -92,7 +92,7 @@ def test_a_hole_between_two_splits_counts_and_only_once() -> None:
     found = (loss.topic, loss.start, loss.lost, loss.by)
     assert found == ("/odom", T0 + 99 * PERIOD + 1000, 3, "stamps")
     assert counter.in_last_hour(loss.stop) == {"/odom": 3}
-    assert counter.in_last_hour(loss.stop + HOUR_NS) == {}
+    assert counter.in_last_hour(loss.stop + NS_PER_HOUR) == {}
 
 
 @given(order=st.permutations(["old", "old", "old", "new", "new", "new"]), taken=st.booleans())
