@@ -12,6 +12,7 @@ header its stamp, `header_stamp` (UTC, to the nanosecond).
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -79,6 +80,7 @@ class _PartFile:
         self._rows.clear()
 
 
+@dataclass(eq=False, repr=False)
 class Dataset:
     """Writes messages as rows of partitioned Parquet files.
 
@@ -95,16 +97,13 @@ class Dataset:
         undecoded: the types of messages whose rows have no value.
     """
 
-    def __init__(
-        self, root: Path, reader: BagReader, extractor: SchemaExtractor, robot: str | None
-    ) -> None:
-        self._root = root
-        self._robot = robot
-        self._reader = reader
-        self._extractor = extractor
-        self.rows = 0
-        self.files = 0
-        self.undecoded: set[str] = set()
+    root: Path
+    reader: BagReader
+    extractor: SchemaExtractor
+    robot: str | None
+    rows: int = 0
+    files: int = 0
+    undecoded: set[str] = field(default_factory=set)
 
     def write(self, messages: Iterable[StoredMessage]) -> None:
         """Writes all messages. The files appear at the end; if it fails, none does.
@@ -144,11 +143,11 @@ class Dataset:
             InvalidArgumentsError: the dataset is partitioned by robot, and this part is not; or
                 the reverse.
         """
-        folder, other, change = self._root, "robot=*", "give"
-        if self._robot is not None:
-            folder /= f"robot={quote(self._robot, safe=' ')}"
+        folder, other, change = self.root, "robot=*", "give"
+        if self.robot is not None:
+            folder /= f"robot={quote(self.robot, safe=' ')}"
             other, change = "recording=*", "leave out"
-        if mixed := next(self._root.glob(other), None):
+        if mixed := next(self.root.glob(other), None):
             raise InvalidArgumentsError(
                 f"{mixed} may have these rows already, which would be there twice; {change} "
                 "--robot, or name another folder"
@@ -164,15 +163,15 @@ class Dataset:
             "publish_time": record.publish_time,
         }
         try:
-            message = self._reader.decode(record)
+            message = self.reader.decode(record)
         except UndecodableError as error:
             self.undecoded.add(channel.type)
             return row | {"undecodable": error.reason}
-        shown = self._extractor.shown(message, channel.type)
+        shown = self.extractor.shown(message, channel.type)
         # The text for replies is ASCII with escapes; a column of UTF-8 has the letters themselves.
         row["value"] = encodable(_AS_JSON(shown.value) if "\\" in shown.text else shown.text)
-        row["header_stamp"] = self._extractor.stamp(message)
-        if pose := self._extractor.pose(message, channel.type):
+        row["header_stamp"] = self.extractor.stamp(message)
+        if pose := self.extractor.pose(message, channel.type):
             row["frame_id"] = encodable(pose.frame_id) or None
             row |= zip(("x", "y", "z"), pose.position, strict=True)
             row |= zip(("qx", "qy", "qz", "qw"), pose.orientation or (), strict=False)

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import defaultdict
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -58,6 +59,7 @@ _CHANNEL_BYTES: Final = 8 << 20
 log = get_logger(__name__)
 
 
+@dataclass(eq=False, repr=False)
 class Lake:
     """The tables of a lake as they are now. Thread-safe.
 
@@ -72,16 +74,14 @@ class Lake:
         channels: the channels that were read last, of all robots.
     """
 
-    def __init__(
-        self,
-        catalog: IcebergCatalog,
-        translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext(),
-        memory_mb: int = 1024,
-        threads: int | None = None,
-    ) -> None:
-        self._memory_mb, self._threads = memory_mb, threads
+    catalog: IcebergCatalog
+    translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext()
+    memory_mb: int = 1024
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        """Starts with nothing read."""
         self._turns = threading.BoundedSemaphore(_AT_ONCE)
-        self._catalog, self._translated = catalog, translated
         self.messages = ByteLru[bytes](_MESSAGE_BYTES)
         self.channels = ByteLru[object](_CHANNEL_BYTES)
         self._lock = threading.Lock()
@@ -164,7 +164,7 @@ class Lake:
             is_named = re.search(rf"\b{name}\b", sql, re.IGNORECASE)
             files = self._files_for(robots, name) if is_named else ()
             tables[name] = self._files_of(name, files)
-        select = Select(sql, self._memory_mb, self._threads, most_rows, most_chars)
+        select = Select(sql, self.memory_mb, self.threads, most_rows, most_chars)
         left_s = max(0.0, min(deadline.left_s(), threading.TIMEOUT_MAX))
         if not self._turns.acquire(timeout=left_s):
             raise BusyError("other statements were not answered in time; ask again, or fewer")
@@ -207,13 +207,13 @@ class Lake:
 
     @contextmanager
     def _looking(self) -> Iterator[None]:
-        with self._lock, self._translated("looking into the lake"):
+        with self._lock, self.translated("looking into the lake"):
             yield
 
     def _loaded_table(self, name: str) -> IcebergTable | None:
         if name not in self._tables:
             try:
-                self._tables[name] = self._catalog.load_table(f"{NAMESPACE}.{name}")
+                self._tables[name] = self.catalog.load_table(f"{NAMESPACE}.{name}")
             except NoSuchTableError:
                 return None
         return self._tables[name]

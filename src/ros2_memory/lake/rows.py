@@ -118,6 +118,7 @@ class _Derived(NamedTuple):
     detections: Mapping[BagFile, Mapping[str, Sequence[Rows]]]
 
 
+@dataclass(eq=False, repr=False)
 class RowMaker:
     """Makes the rows of a robot's bags, all as one call sees the memory.
 
@@ -129,12 +130,16 @@ class RowMaker:
         whole: the topics whose messages are shipped whatever they take.
     """
 
-    def __init__(self, memory: Memory, config: str, whole: Collection[str]) -> None:
-        self._memory, self._config, self._whole = memory, config, whole
-        self._view = View(memory, Call())
+    memory: Memory
+    config: str
+    whole: Collection[str]
+
+    def __post_init__(self) -> None:
+        """Opens a view of the memory as it is now."""
+        self._view = View(self.memory, Call())
         self._sight_reader = SightReader(self._view)
         self._detections = DetectionRows(self._view)
-        self._thing = cache(Labels(memory.limits.labels).key)
+        self._thing = cache(Labels(self.memory.limits.labels).key)
 
     def made_of(self, bag: BagFile) -> str:
         """Returns a digest of all inputs of a bag's rows besides its bytes.
@@ -149,11 +154,11 @@ class RowMaker:
         sessions = self._view.sessions
         recordings = sessions.lending_to(bag.recording, bag.end)
         statics = repr(static_at(sessions.static(recordings), bag.end))
-        of_labels = self._memory.limits.labels.items()
+        of_labels = self.memory.limits.labels.items()
         labels = {name: sorted(variants) for name, variants in of_labels}
-        settings = ROWS_VERSION, self._config, self._view.pose_topic, labels
-        joined = self._memory.index.joined_with(bag.recording)
-        return _digest([*settings, statics, sorted(self._whole), counted, *joined])
+        settings = ROWS_VERSION, self.config, self._view.pose_topic, labels
+        joined = self.memory.index.joined_with(bag.recording)
+        return _digest([*settings, statics, sorted(self.whole), counted, *joined])
 
     def rows(self, bags: Mapping[BagFile, ShippedBag]) -> dict[str, pa.Table]:
         """Returns the rows of bags, which lie close together in time, by table.
@@ -194,7 +199,7 @@ class RowMaker:
         map_frame, track = tracks[0] if tracks else (None, empty_track())
         sightings, undecodable = self._sightings(derived.detections.get(bag, {}), map_frame, track)
         driven, stops = self._driven(derived.poses.get(bag.file))
-        joined = self._memory.index.joined_with(bag.recording)
+        joined = self.memory.index.joined_with(bag.recording)
         of_bag_alone = {
             "recording": bag.recording.name,
             "messages": bag.summary.count,
@@ -272,7 +277,7 @@ class RowMaker:
         topic = self._view.pose_topic
         if poses is None:
             return {}, []
-        fastest_mps = self._memory.limits.max_plausible_speed_mps
+        fastest_mps = self.memory.limits.max_plausible_speed_mps
         whole = path_slice(poses, fastest_mps, draws=False).trajectory(0)
         driven = {
             "poses": whole.poses,
@@ -302,10 +307,10 @@ class RowMaker:
         # By identity, since hashing a channel hashes its definition.
         by_channel: dict[int, _Messages] = {}
         topics = {topic.topic for topic in bag.summary.topics}
-        for batch in self._memory.reader.batches(bag.path, topics, TimeWindow.everything()):
+        for batch in self.memory.reader.batches(bag.path, topics, TimeWindow.everything()):
             channel = batch.channel
             if id(channel) not in by_channel:
-                is_whole = channel.topic in self._whole
+                is_whole = channel.topic in self.whole
                 has_payloads = is_whole or channel.type not in BULKY_TYPES
                 by_channel[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
             by_channel[id(channel)].add(batch)
@@ -375,9 +380,9 @@ class RowMaker:
 
     def _messages(self, bag: BagFile) -> Iterator[Row]:
         """Yields the messages of the topics that are shipped whole."""
-        reader, extractor = self._memory.reader, self._memory.extractor
+        reader, extractor = self.memory.reader, self.memory.extractor
         numbers = Counter[str]()
-        topics = {*self._whole}.intersection(topic.topic for topic in bag.summary.topics)
+        topics = {*self.whole}.intersection(topic.topic for topic in bag.summary.topics)
         if not topics:
             return
         for record in reader.records(bag.path, topics, TimeWindow.everything()):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
@@ -133,6 +134,7 @@ class _Folder(NamedTuple):
     size: int
 
 
+@dataclass(eq=False, repr=False)
 class Inventory:
     """The contents of one bag directory. Not thread-safe.
 
@@ -142,12 +144,12 @@ class Inventory:
             be deleted.
     """
 
-    def __init__(
-        self, root: Path, static_topics: Collection[str], own: OwnRecordings | None
-    ) -> None:
-        self._root = root
-        self._own = own
-        self._static_topics = static_topics
+    root: Path
+    static_topics: Collection[str]
+    own: OwnRecordings | None
+
+    def __post_init__(self) -> None:
+        """Starts with nothing known."""
         self._device: int | None = None
         self._settled_bags: dict[str, StoredBag] = {}
         self._folders: dict[str, _Folder] = {}
@@ -165,14 +167,14 @@ class Inventory:
         """
         self._drop_other_device()
         bags: list[StoredBag] = []
-        other_bytes = state_bytes = state_bytes_in(self._root)
+        other_bytes = state_bytes = state_bytes_in(self.root)
         foreign_bytes = 0
         recordings: set[str] = set()
-        named = {str(self._root / name) for name in known.named}
+        named = {str(self.root / name) for name in known.named}
         judge = None
-        if self._own is not None:
-            self._own.names()  # reads the list anew, or fails
-            judge = cache(self._own.judge_of)
+        if self.own is not None:
+            self.own.names()  # reads the list anew, or fails
+            judge = cache(self.own.judge_of)
         for state, bag in chain(self._changing(known), self._settled(known)):
             path, recording = bag.path, bag.recording
             if path in deleted:
@@ -205,15 +207,15 @@ class Inventory:
 
     def _drop_other_device(self) -> None:
         """Forgets bags and folders if the disk came back under another device number."""
-        device = self._root.stat().st_dev
+        device = self.root.stat().st_dev
         if device != self._device:
             self._device, self._settled_bags, self._folders = device, {}, {}
 
     def _saved_sizes(self, known: KnownBags) -> dict[tuple[int, int], int]:
         """Returns the sizes of the files of moments, by device and inode number."""
-        device = self._root.stat().st_dev
+        device = self.root.stat().st_dev
         with suppress(OSError):
-            device = (self._root / MOMENTS_FOLDER).stat().st_dev
+            device = (self.root / MOMENTS_FOLDER).stat().st_dev
         return {(device, stamp.inode): stamp.size for stamp in known.tree.saved.values()}
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
@@ -258,7 +260,7 @@ class Inventory:
         """Whether a bag that is kept counts among the other bytes."""
         if state is FileState.DAMAGED:
             # Where all bags may be deleted, only its name shows whether the recorder made it.
-            return self._own is not None or has_own_name(Path(bag.recording).name)
+            return self.own is not None or has_own_name(Path(bag.recording).name)
         return state is not FileState.UNREAD
 
     def _dating_span(self, bag: BagFile) -> Span:
@@ -272,7 +274,7 @@ class Inventory:
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
         """Whether each recording may receive all of a topic's messages in a bag again."""
-        if topic.topic in self._static_topics:
+        if topic.topic in self.static_topics:
             return True
         totals = TopicTotals(topic.first, topic.last, topic.count)
         return topic.latched and Pace(totals, topic.first, topic.last).is_rare
