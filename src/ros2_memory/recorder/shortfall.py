@@ -12,8 +12,7 @@ from ros2_memory.recorder.process.topics import TopicSelection
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
-    from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.sessions import Orders, RecordingSession, RecordingSessions
+    from ros2_memory.recorder.sessions import RecordingSession, RecordingSessions
 
 UNHEARD_S: Final = 30.0
 """A topic that is offered for so long, and never came, is not recorded."""
@@ -40,10 +39,11 @@ class TopicWatch:
         gone: the topics that a publisher has offered since the start, and none offers any more.
     """
 
-    def __init__(self, orders: Orders, events: EventLog) -> None:
-        self._orders = orders
-        self._topics = orders.topics
-        self._events = events
+    def __init__(self, sessions: RecordingSessions) -> None:
+        self._sessions = sessions
+        self._orders = sessions.orders
+        self._topics = sessions.orders.topics
+        self._events = sessions.events
         self.waiting_for: str | None = None
         self.gone = frozenset[str]()
         self.shortfall = Shortfall()
@@ -57,15 +57,15 @@ class TopicWatch:
         """Notes that a recording begins, and no other one runs."""
         self._unheard_from_s = now.monotonic_s
 
-    def look(self, now: ClockReading, sessions: RecordingSessions) -> None:
+    def look(self, now: ClockReading) -> None:
         """Looks at all topics, about once a second."""
-        current = sessions.current
-        self._look_for_messages(now, sessions)
+        current = self._sessions.current
+        self._look_for_messages(now)
         if current is None:
             return
-        if current.age_s(now) >= WAITING_S and sessions.handover is None:
-            self._name_absent(current, sessions)
-        before, after = self.shortfall, self._current_shortfall(now, current, sessions)
+        if current.age_s(now) >= WAITING_S and self._sessions.handover is None:
+            self._name_absent(current)
+        before, after = self.shortfall, self._current_shortfall(now, current)
         self.shortfall = after
         if new := sorted({*after.unheard} - {*before.unheard}):
             sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
@@ -77,23 +77,24 @@ class TopicWatch:
             sentence = f"required, and not recorded: {listed(after.required_missing)}"
             self._events.remark("required_missing", sentence)
 
-    def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
+    def missing(self) -> tuple[str, ...]:
         """Returns the topics that no publisher has offered; none before a child records."""
-        for session in sessions.running:
+        running = self._sessions.running
+        for session in running:
             self._offered |= session.subscribed | session.splits.received
-        if not any(session.has_recorded for session in sessions.running):
+        if not any(session.has_recorded for session in running):
             return ()
-        unknown = (session.of_unknown_type for session in sessions.running)
+        unknown = (session.of_unknown_type for session in running)
         offered = self._offered.union(self.shortfall.unknown_types, *unknown)
         return tuple(sorted({*self._topics.selection.exact} - offered))
 
-    def _look_for_messages(self, now: ClockReading, sessions: RecordingSessions) -> None:
+    def _look_for_messages(self, now: ClockReading) -> None:
         """Reports that no message has arrived since recording started.
 
         A robot that was heard once and is silent now is not waited for.
         """
-        current = sessions.current
-        if any(self._hears(session) for session in sessions.running):
+        current = self._sessions.current
+        if any(map(self._hears, self._sessions.running)):
             self._unheard_from_s = None
         self.waiting_for = None
         if current is None:
@@ -138,12 +139,12 @@ class TopicWatch:
             return False
         return bool(splits.messages or splits.bytes_written)
 
-    def _name_absent(self, current: RecordingSession, sessions: RecordingSessions) -> None:
+    def _name_absent(self, current: RecordingSession) -> None:
         """Reports topics that no publisher has offered, or that none offers any more.
 
         Each is reported once; a topic that comes back may be reported again.
         """
-        missing = frozenset(self.missing(sessions))
+        missing = frozenset(self.missing())
         if new := sorted(missing - self._named_missing):
             self._events.remark(
                 "topic_not_offered",
@@ -159,15 +160,13 @@ class TopicWatch:
             self._events.remark("topic_silent", sentence, topics=new)
         self.gone = gone
 
-    def _current_shortfall(
-        self, now: ClockReading, current: RecordingSession, sessions: RecordingSessions
-    ) -> Shortfall:
-        running, now_s = sessions.running, now.monotonic_s
+    def _current_shortfall(self, now: ClockReading, current: RecordingSession) -> Shortfall:
+        sessions, now_s = self._sessions, now.monotonic_s
         if self._began_s is None:
             self._began_s = now_s
-        offered = set[str]().union(*(session.subscribed for session in running))
-        unknown = set[str]().union(*(session.of_unknown_type for session in running))
-        if len(running) > 1 or current.age_s(now) < TYPES_S:
+        offered = set[str]().union(*(session.subscribed for session in sessions.running))
+        unknown = set[str]().union(*(session.of_unknown_type for session in sessions.running))
+        if len(sessions.running) > 1 or current.age_s(now) < TYPES_S:
             # A new recording has not discovered all topics yet.
             offered.update(self._offered_since_s)
             unknown.update(self.shortfall.unknown_types)

@@ -104,7 +104,7 @@ class Supervisor:
         self._sessions = RecordingSessions(
             orders, self._announce, self._add_interruption, self._events
         )
-        self._topic_watch = TopicWatch(orders, self._events)
+        self._topic_watch = TopicWatch(self._sessions)
         self._beat: Heartbeat | None = None
         self._backoff = {"restart": Backoff(), "rotate": Backoff()}
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
@@ -133,7 +133,7 @@ class Supervisor:
             _Task("list", self._check_list, LIST_S),
             _Task("rotation", self._check_rotation),
             _Task("restart", self._check_restart, needs_disk=True),
-            _Task("topics", lambda now: self._topic_watch.look(now, self._sessions), TOPICS_S),
+            _Task("topics", self._topic_watch.look, TOPICS_S),
             _Task("interruptions", self._report_interruptions, needs_disk=True),
             _Task("recorded", self._note_recorded),
             _Task("settle", lambda _: self._sessions.recover(), UNSETTLED_S, needs_disk=True),
@@ -461,7 +461,7 @@ class Supervisor:
             recovered=events.recovered,
             interval_s=HEARTBEAT_S,
             restarts=sessions.restarts,
-            missing=watch.missing(sessions),
+            missing=watch.missing(),
             lost=self._reception.lost_in_last_hour(now),
             waiting_for=watch.waiting_for if state is RecorderState.WAITING else None,
             cut_short=tuple(sorted(self._reception.cut_short)),
