@@ -21,7 +21,7 @@ from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.lake.shipper import RobotBags, Shipper
     from ros2_memory.lake.warehouse import LakeLocation
@@ -64,9 +64,9 @@ def ship(
     level = settings.logging.level if verbose or goes_on else "warning"
     configure_logging(level, settings.logging.format)
     with writing_alone(location.state_dir):
-        service = _ShippingService(settings, location, robots)
+        service = _ShippingService(overrides, shared, settings, location, robots)
         if goes_on:
-            service.run(partial(_new_robots, overrides, shared))
+            service.run()
         location.claim()
         if forget is not None and window is not None:
             return _forget(location, forget, window, robots, as_json=as_json)
@@ -169,6 +169,8 @@ class _ShippingService:
         reported: the problems of the last pass, which were logged.
     """
 
+    overrides: Overrides
+    shared: SharedParts
     settings: Settings
     location: "LakeLocation"
     robots: "Sequence[RobotBags]"
@@ -211,28 +213,21 @@ class _ShippingService:
         self.committed_s = time.monotonic()
         self.location.claim()
 
-    def run(self, new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]") -> NoReturn:
-        """Ships until the process is stopped; a lake that fails is tried again.
-
-        `new_robots` returns the robots of the settings that are not among the given ones.
-        """
+    def run(self) -> NoReturn:
+        """Ships until the process is stopped; a lake that fails is tried again."""
         notify(READY)
         log.info("shipping", robots=len(self.robots), warehouse=self.location.warehouse)
         while True:
             try:
                 self.location.claim()
                 with self.open_shipper() as shipper:
-                    new = self._ship_until_new(shipper, new_robots)
+                    new = self._ship_until_new(shipper)
                     self.robots = [*self.robots, *new]
             except LakeError as error:
                 log.warning("lake_failed", reason=str(error))
                 _wait(_RETRY_S)
 
-    def _ship_until_new(
-        self,
-        shipper: "Shipper",
-        new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]",
-    ) -> "Sequence[RobotBags]":
+    def _ship_until_new(self, shipper: "Shipper") -> "Sequence[RobotBags]":
         """Ships, and once an hour tidies the lake, until there are new robots; returns these."""
         while True:
             problems = shipper.run().problems
@@ -245,27 +240,25 @@ class _ShippingService:
                 if problem not in self.reported:
                     log.warning("not_shipped", reason=problem)
             self.reported = problems
-            if is_due and (new := new_robots(self.robots)):
+            if is_due and (new := self._new_robots()):
                 return new
             _wait(self.settings.reader.index_refresh_s)
 
+    def _new_robots(self) -> "Sequence[RobotBags]":
+        """Loads the settings again, and returns the robots that are not shipped yet.
 
-def _new_robots(
-    overrides: Overrides, shared: "SharedParts", robots: "Sequence[RobotBags]"
-) -> "Sequence[RobotBags]":
-    """Loads the settings again, and returns the robots that are not among `robots`.
-
-    `fleet.robots` may be a pattern, which matches more folders than before.
-    """
-    try:
-        settings, _ = load_for(None, overrides)
-        names = {robot.name for robot in robots}
-        new = {name: bags for name, bags in settings.fleet.robots.items() if name not in names}
-        if not new:
+        `fleet.robots` may be a pattern, which matches more folders than before.
+        """
+        try:
+            settings, _ = load_for(None, self.overrides)
+            fleet, names = settings.fleet, {robot.name for robot in self.robots}
+            new = {name: bags for name, bags in fleet.robots.items() if name not in names}
+            if not new:
+                return []
+            built = build_robots(replace(settings, fleet=replace(fleet, robots=new)), self.shared)
+        except ConfigError as error:
+            log.warning("not_shipped", reason=f"robots that are new are not looked for: {error}")
             return []
-        built = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)), shared)
-    except ConfigError as error:
-        log.warning("not_shipped", reason=f"robots that are new are not looked for: {error}")
-        return []
-    log.info("shipping", robots=len(robots) + len(built), warehouse=settings.lake.warehouse)
-    return built
+        total = len(self.robots) + len(built)
+        log.info("shipping", robots=total, warehouse=settings.lake.warehouse)
+        return built
