@@ -34,7 +34,9 @@ from ros2_memory.fleet.replies import (
     shipped_to,
 )
 from ros2_memory.fleet.robots import AT_ONCE, FanOut, Robot, StoppedClock, robots_clause
+from ros2_memory.places.where import has_coordinates
 from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings
+from ros2_memory.tools.arguments import as_region, as_while
 from ros2_memory.tools.replies import ROBOT_NAME, as_json
 
 T = TypeVar("T")
@@ -260,12 +262,12 @@ def _answer(question: Question, memory: Memory, call: Call) -> OneAnswer:
 def _coordinates_in(given: Mapping[str, object]) -> str | None:
     """Returns the argument that has coordinates, if there is one."""
     for name in ("where", "near"):
-        where = given.get(name)
-        is_object = isinstance(where, dict) or str(where).lstrip().startswith("{")
-        is_label = name == "near" and "label" in str(where)
-        if is_object and not is_label:
+        place = as_region(given.get(name))
+        is_label = name == "near" and isinstance(place, dict) and "label" in place
+        if has_coordinates(place) and not is_label:
             return name
-    if "near_position" in str(given.get("while")):
+    during = () if given.get("while") is None else as_while(given["while"])
+    if any(condition.condition_type == "near_position" for condition in during):
         return "while"
     names = ["x", "y"]
     if given.get("condition_type") == "near_position":

@@ -147,6 +147,11 @@ def parse_where(
     return Where(region, _shared_frame(places), names, tuple(places))
 
 
+def has_coordinates(value: object) -> bool:
+    """Returns whether a value of the argument `where` gives more than names of places."""
+    return isinstance(value, dict) and not all(isinstance(part, str) for part in value.values())
+
+
 def _places_by_name(limits: QuerySettings, value: JsonValue) -> JsonObject | None:
     """Returns the values of several places by name; None if the value describes one place."""
     if isinstance(value, str):

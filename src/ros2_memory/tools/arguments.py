@@ -148,7 +148,7 @@ def _parse_json(text: str) -> object:
         return None
 
 
-def _as_region(value: object) -> object:
+def as_region(value: object) -> object:
     """Returns a region, or several, which planners also send as JSON text."""
     if not isinstance(value, str):
         return value
@@ -156,7 +156,7 @@ def _as_region(value: object) -> object:
     return parsed if isinstance(parsed, dict | list) else value
 
 
-def _as_while(value: object) -> object:
+def as_while(value: object) -> tuple[WhileCondition, ...]:
     """Returns the conditions on other topics, which planners also send as JSON text."""
     parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if isinstance(value, str) else value
     conditions = parsed if isinstance(parsed, list) else [parsed]
@@ -284,7 +284,7 @@ _Labels: TypeAlias = Annotated[
 _Coordinate: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
 ]
-_Region: TypeAlias = Annotated[JsonValue, BeforeValidator(_as_region)]
+_Region: TypeAlias = Annotated[JsonValue, BeforeValidator(as_region)]
 _REGION_SCHEMA: Final[dict[str, JsonValue]] = {
     "type": [*REGION_KINDS],
     "examples": ["kitchen", "kitchen, hall", {"den": {"x": [0, 5], "y": [0, 9]}}],
@@ -659,7 +659,7 @@ class VisitsArguments(Arguments):
 
 _While: TypeAlias = Annotated[
     tuple[InstanceOf[WhileCondition], ...],
-    BeforeValidator(_as_while),
+    BeforeValidator(as_while),
     WithJsonSchema(
         {
             "type": ["object", "array"],

@@ -292,7 +292,9 @@ def test_several_that_are_named_answer_as_all_do(folder: Path, fleet: Fleet) -> 
     [
         ("find_things", {"where": {"x": 1, "y": 2, "radius_m": 5}}),
         ("find_things", {"where": '{"x": 1, "y": 2, "radius_m": 5}'}),
+        ("find_things", {"where": {"den": {"x": 1, "y": 2, "radius_m": 5}}}),
         ("find_things", {"near": {"x": 1, "y": 2, "radius_m": 1}}),
+        ("find_things", {"near": {"label shelf": {"x": 1, "y": 2, "radius_m": 1}}}),
         ("visits", {"x": 1, "y": 2}),
         (
             "find_last_match",
@@ -322,6 +324,31 @@ def test_coordinates_are_asked_of_one_robot_unless_all_share_a_map(
         one = {} if asked_of.shared_map else {"robot": "r1"}
         assert "error" not in reply(asked_of, name, {**given, **one})
     assert "error" not in reply(fleet, "find_things", {"near": {"label": "table"}})
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("find_things", {"where": {"dock": "dock"}}),
+        ("find_things", {"where": '{"dock": "dock", "bench": "dock"}'}),
+        ("find_things", {"near": '{"label": "table", "radius_m": 1}'}),
+        *(
+            ("find_matches", {**MUG, "while": {"condition_type": "contains", **condition}})
+            for condition in (
+                {"topic": "/near_position_reached", "value": True},
+                {"topic": "/is_docked", "value": "near_position"},
+            )
+        ),
+    ],
+)
+def test_names_and_texts_without_coordinates_are_asked_of_all(
+    folder: Path, name: str, given: dict[str, object]
+) -> None:
+    limits = QuerySettings(places=(Place("dock", "map", Circle(1.0, 2.0, 2.0)),))
+    robots = [Robot(name, folder / name, fleet_memory(folder / name, limits)) for name in NAMES]
+    found = reply(Fleet(robots, FixedClock(NOW)), name, given)
+    assert "has coordinates" not in found.get("detail", "")
+    assert found.get("reason", "topic_not_recorded") == "topic_not_recorded"
 
 
 def test_a_place_is_that_of_each_robots_own_map(folder: Path) -> None:
