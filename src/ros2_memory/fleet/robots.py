@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextvars
 import threading
-import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
     BusyError,
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.timebase import Deadline
     from ros2_memory.lake.engine import Lake
 
 T = TypeVar("T")
@@ -262,16 +263,81 @@ def robots_clause(robots: Iterable[Robot]) -> str:
     return f"there {'is' if len(names) == 1 else 'are'} {listed(names, at_most=_MOST_NAMED)}"
 
 
+@dataclass(frozen=True, slots=True)
+class _Question(Generic[T]):
+    """One question to robots, each of which is asked in a thread of its own.
+
+    Attributes:
+        work: asks one robot.
+        call: the call, with the limits of all robots together.
+        is_of_several: whether it is about several robots.
+        left_s: the time that was left of the call at first.
+        until: the deadline of all robots.
+        context: the context variables of the call.
+    """
+
+    work: Callable[[Robot, Call], T]
+    call: Call
+    is_of_several: bool
+    left_s: float
+    until: Deadline
+    context: contextvars.Context
+
+    @classmethod
+    def of(cls, call: Call, work: Callable[[Robot, Call], T], robots: int) -> _Question[T]:
+        """Returns the question of a call to so many robots."""
+        left_s = call.deadline.left_s()
+        until = call.deadline.within(left_s * _OF_ALL)
+        return cls(work, call, robots > 1, left_s, until, contextvars.copy_context())
+
+    def own_call(self) -> Call:
+        """Returns the call to a robot that is asked now, with its part of the time."""
+        most_s = self.left_s * (_OF_ONE if self.is_of_several else _OF_ALL)
+        own = self.call.within(min(most_s, self.until.left_s()))
+        return replace(own, stages=Stages(), used_active=False, used_thinned=False)
+
+    def start(self, robot: Robot, own: Call) -> Future[T | EpisodicError]:
+        """Asks a robot in a thread of its own; returns the future answer."""
+        answer: Future[T | EpisodicError] = Future()
+
+        def run() -> None:
+            try:
+                answer.set_result(self.work(robot, own))
+            except EpisodicError as error:
+                answer.set_result(error)
+            except Exception:
+                log.exception("robot_failed", robot=robot.name)
+                fault = "failed through a fault in this server; its log has the cause"
+                answer.set_result(EpisodicError(fault))
+
+        # A daemon: one that hangs must not keep the program from ending.
+        ask = partial(self.context.copy().run, run)
+        threading.Thread(target=ask, name=f"robot-{robot.name}", daemon=True).start()
+        return answer
+
+    def wait(self, answer: Future[T | EpisodicError], own: Call) -> T | EpisodicError:
+        """Returns the answer of a robot, or an error if it does not come in time."""
+        own_s = own.deadline.budget_s
+        try:
+            return answer.result(min(own_s + self.left_s * _GRACE, threading.TIMEOUT_MAX))
+        except TimeoutError:
+            do = "ask about it alone, or about" if self.is_of_several else "ask about"
+            return QueryTimeoutError(f"no answer in {own_s:.3g} s; {do} a shorter window")
+
+
 class FanOut:
     """Asks robots in threads, a few at a time, each with a time limit. Thread-safe.
 
-    A robot that is stuck is not asked again until it is done. So a hanging disk blocks one thread,
-    however many questions follow.
+    A robot that exceeded its limit is not asked again until the threads of all questions that it
+    did not answer in time are done. So a hanging disk blocks the threads of the questions that were
+    asked within the first one's limit, however many follow.
     """
 
     def __init__(self, at_once: int = AT_ONCE) -> None:
         self._at_once = at_once
-        self._is_done: dict[str, Callable[[], bool]] = {}
+        self._lock = threading.Lock()
+        self._late: dict[str, list[Callable[[], bool]]] = {}
+        """For each robot, whether questions are done that it did not answer in time."""
 
     def ask(
         self, robots: Sequence[Robot], work: Callable[[Robot, Call], T], call: Call
@@ -280,27 +346,9 @@ class FanOut:
 
         It takes at most `_OF_ALL` plus `_GRACE` of the time that is left of the call.
         """
-        left_s, begun_s = call.deadline.left_s(), time.monotonic()
-        limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
-        context = contextvars.copy_context()
-
-        def ask_one(robot: Robot) -> tuple[T | EpisodicError, Call]:
-            own_s = min(limit_s, begun_s + left_s * _OF_ALL - time.monotonic())
-            own = replace(call.within(own_s), stages=Stages())
-            own.used_active = own.used_thinned = False
-            if refused := self._refusal_of(robot, call, own_s):
-                return refused, own
-            self._is_done.pop(robot.name, None)
-            answer = _start_asking(robot, work, own, context.copy())
-            try:
-                return answer.result(min(own_s + left_s * _GRACE, threading.TIMEOUT_MAX)), own
-            except TimeoutError:
-                self._is_done[robot.name] = answer.done
-                do = "ask about it alone, or about" if len(robots) > 1 else "ask about"
-                return QueryTimeoutError(f"no answer in {own_s:.3g} s; {do} a shorter window"), own
-
+        question = _Question.of(call, work, len(robots))
         with ThreadPoolExecutor(self._at_once) as threads:
-            answers = [*threads.map(ask_one, robots)]
+            answers = [*threads.map(partial(self._ask_one, question), robots)]
         for _, own in answers:
             for stage, spent in [*own.stages.spent.items()]:
                 call.stages.add(stage, spent)
@@ -308,35 +356,26 @@ class FanOut:
             call.used_thinned |= own.used_thinned
         return {robot.name: answer for robot, (answer, _) in zip(robots, answers, strict=True)}
 
-    def _refusal_of(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
-        """Returns why a robot is not asked: it is stuck, or no time is left."""
-        if robot.name in self._is_done and not self._is_done[robot.name]():
+    def _ask_one(self, question: _Question[T], robot: Robot) -> tuple[T | EpisodicError, Call]:
+        """Returns the answer of a robot, or the error, and the call that it was asked in."""
+        own = question.own_call()
+        if self._is_stuck(robot):
             late = "still busy with an earlier question that it did not finish in time"
-            return BusyError(f"{late}: is its disk reachable?")
-        if own_s <= 0 or call.deadline.expired():
+            return BusyError(f"{late}: is its disk reachable?"), own
+        if own.deadline.expired():
             do = "ask about fewer robots, or a shorter time"
-            return QueryTimeoutError(f"not asked: the time of the call was up; {do}")
-        return None
+            return QueryTimeoutError(f"not asked: the time of the call was up; {do}"), own
+        future = question.start(robot, own)
+        answer = question.wait(future, own)
+        if not future.done():
+            with self._lock:
+                self._late.setdefault(robot.name, []).append(future.done)
+        return answer, own
 
-
-def _start_asking(
-    robot: Robot, work: Callable[[Robot, Call], T], call: Call, context: contextvars.Context
-) -> Future[T | EpisodicError]:
-    """Asks a robot in a thread of its own; returns the future answer."""
-    answer: Future[T | EpisodicError] = Future()
-
-    def run() -> None:
-        try:
-            answer.set_result(work(robot, call))
-        except EpisodicError as error:
-            answer.set_result(error)
-        except Exception:
-            log.exception("robot_failed", robot=robot.name)
-            fault = "failed through a fault in this server; its log has the cause"
-            answer.set_result(EpisodicError(fault))
-
-    # A daemon: one that hangs must not keep the program from ending.
-    threading.Thread(
-        target=context.run, args=(run,), name=f"robot-{robot.name}", daemon=True
-    ).start()
-    return answer
+    def _is_stuck(self, robot: Robot) -> bool:
+        """Returns whether some question is not done that the robot did not answer in time."""
+        with self._lock:
+            late = [is_done for is_done in self._late.pop(robot.name, ()) if not is_done()]
+            if late:
+                self._late[robot.name] = late
+            return bool(late)

@@ -149,7 +149,7 @@ class _FleetQuestion:
         )
 
     def _ask_one(self, robot: Robot, call: Call) -> OfRobot:
-        """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
+        """Returns a robot's answer, asked in a thread of its own: its disk may hang.
 
         Raises:
             EpisodicError: the robot has no answer.

@@ -9,6 +9,7 @@ import os
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -204,6 +205,43 @@ def test_as_many_as_are_asked_at_once_may_hang_and_are_not_asked_again_until_the
         if thread.name.startswith("robot-r"):
             thread.join()
     assert fan_out.ask(robots(1), lambda *_: "fine", Call()) == {"r0": "fine"}
+
+
+def test_while_one_of_several_late_questions_hangs_the_robot_is_not_asked_again(
+    released: threading.Event,
+) -> None:
+    fan_out, first_may_end = FanOut(), threading.Event()
+    hanging: list[threading.Thread] = []
+
+    def second(_robot: Robot, _call: Call) -> None:
+        hanging.append(threading.current_thread())
+        released.wait()
+
+    def first(_robot: Robot, _call: Call) -> None:
+        hanging.append(threading.current_thread())
+        fan_out.ask(robots(1), second, Call(Deadline.after(0.1)))
+        first_may_end.wait()
+
+    late = fan_out.ask(robots(1), first, Call(Deadline.after(2)))["r0"]
+    assert isinstance(late, QueryTimeoutError)
+    first_may_end.set()
+    hanging[0].join()
+    assert isinstance(fan_out.ask(robots(1), lambda *_: "fine", Call())["r0"], BusyError)
+    released.set()
+    hanging[1].join()
+    assert fan_out.ask(robots(1), lambda *_: "fine", Call()) == {"r0": "fine"}
+
+
+def test_questions_at_once_to_a_robot_that_answers_run_beside_each_other() -> None:
+    fan_out, all_run = FanOut(), threading.Barrier(3)
+
+    def meets(_robot: Robot, _call: Call) -> str:
+        all_run.wait(60)
+        return "fine"
+
+    with ThreadPoolExecutor(3) as threads:
+        answers = threads.map(lambda _: fan_out.ask(robots(1), meets, Call()), range(3))
+    assert [*answers] == [{"r0": "fine"}] * 3
 
 
 def test_a_robot_is_told_when_its_time_is_up() -> None:
