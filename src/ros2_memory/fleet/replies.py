@@ -237,29 +237,38 @@ def _combined(values: Mapping[str, JsonObject], added: Collection[str] = frozens
     """
     combined: JsonObject = {}
     by_robot: dict[str, JsonObject] = {}
-    # If a robot did not count all, the sum is not a total, but at least so many.
-    is_counted = not any(AT_LEAST in value for value in values.values())
     for key in dict.fromkeys(chain.from_iterable(values.values())):
-        of_robots = {name: value[key] for name, value in values.items() if key in value}
-        counts = [value for value in of_robots.values() if isinstance(value, dict)]
-        texts = {to_json_text(value) for value in of_robots.values()}
         if key in _LEFT_OUT:
             continue
-        if key in added and counts:
-            combined[key] = dict(sum(map(Counter[str], counts), Counter()).most_common())
-            continue
-        if key == AT_LEAST:
-            totals = [value.get(_TOTAL) for value in values.values()]
-            combined[key] = _sum((*of_robots.values(), *totals))
-        elif key in added:
-            if is_counted or key != _TOTAL:
-                combined[key] = _sum(of_robots.values())
-        elif len(texts) == 1 and len(of_robots) == len(values):
+        of_robots = {name: value[key] for name, value in values.items() if key in value}
+        if key in added or key == AT_LEAST:
+            total = _total_of(key, values.values())
+            if total is not None:
+                combined[key] = total
+            if isinstance(total, dict):
+                continue
+        elif len(of_robots) == len(values) and _are_equal(of_robots.values()):
             combined[key] = next(iter(of_robots.values()))
             continue
         for name, value in of_robots.items():
             by_robot.setdefault(name, {})[key] = value
     return {**combined, "by_robot": {**by_robot}} if by_robot else combined
+
+
+def _total_of(key: str, values: Collection[JsonObject]) -> float | JsonObject | None:
+    """Returns the sum of a key's numbers, or its counts by name; None if there is no total."""
+    of_robots = [value[key] for value in values if key in value]
+    if counts := [value for value in of_robots if isinstance(value, dict)]:
+        return dict(sum(map(Counter[str], counts), Counter()).most_common())
+    # If a robot did not count all, the sum is not a total, but at least so many.
+    if key == AT_LEAST:
+        return _sum((*of_robots, *(value.get(_TOTAL) for value in values)))
+    is_counted = key != _TOTAL or not any(AT_LEAST in value for value in values)
+    return _sum(of_robots) if is_counted else None
+
+
+def _are_equal(values: Iterable[JsonValue]) -> bool:
+    return len({*map(to_json_text, values)}) == 1
 
 
 def _merge_topics(replies: Sequence[RobotReply]) -> list[JsonValue]:
