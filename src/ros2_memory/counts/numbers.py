@@ -49,6 +49,8 @@ SUM_SCALE: Final = 2.0**-64
 LEAST: Final = 1
 GREATEST: Final = -1
 """Numbers are multiplied by one of these signs, so that the greatest is found as a least one."""
+_LEFT_TO_COUNT_S: Final = 2.0
+"""How long what was read may still be counted after the call's time is over."""
 
 
 class TooManyError(Exception):
@@ -172,6 +174,7 @@ class PieceNumbers:
             if not self._parts:
                 raise
             self.since = self._reached_to + 1
+            self._view.bags.finish_within(_LEFT_TO_COUNT_S)
         for rows in self._pending:
             self._add(rows, MIN_NS if self.since is None else self.since)
         self._pending.clear()

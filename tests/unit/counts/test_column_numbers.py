@@ -1,6 +1,7 @@
 """Numbers of fields: as exact as by the bags, whatever is stored."""
 
 import math
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -13,7 +14,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.robot import count_visits
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.results import Bins
 from tests.support.bags import Msg, battery, make, odom, text, write_mcap, write_splits
@@ -82,6 +83,35 @@ class Limited(Deadline):
 
 def limited(looks: int) -> Deadline:
     return Limited(600.0, 600.0, looks=[False] * looks)
+
+
+CHARGES = [battery(BEGIN + n * 10 * S, 0.5 + n / 10_000) for n in range(600)]
+
+
+def sizes_counted(memory: Memory, looks: Iterable[int]) -> set[int]:
+    """How many of the charges were counted, by calls whose time is over after so many looks."""
+    sizes = set()
+    for most in looks:
+        with suppress(QueryTimeoutError):
+            call = Call(deadline=limited(most))
+            answer = count_range(
+                memory, call, "/battery_state", span(), "hour", fields=["percentage"]
+            )
+            size = int(cells(answer, "count")[-1] or 0)
+            assert cells(answer, "percentage.min_at")[-1] == CHARGES[-size].log_time
+            mean = pytest.approx(0.5 + (1199 - size) / 20_000, abs=1e-6)
+            assert cells(answer, "percentage.mean")[-1] == mean
+            sizes.add(size)
+    return sizes
+
+
+def test_numbers_of_a_call_that_runs_out_of_time_are_of_all_that_was_counted(
+    tmp_path: Path,
+) -> None:
+    write(tmp_path, CHARGES, split=30)
+    sizes = sizes_counted(memory_of(tmp_path, limits=LATEST), range(1, 120, 3))
+    assert len(sizes) > 2
+    assert max(sizes) == len(CHARGES)
 
 
 def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
