@@ -11,7 +11,7 @@ import math
 import sys
 from bisect import bisect_right
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -108,6 +108,8 @@ class Part(NamedTuple):
     greatest: Extreme
 
 
+_KeyedPart: TypeAlias = tuple[tuple[int, int], Part]
+"""A part with the index of its field, and its piece."""
 _NO_NUMBER: Final = Extreme.known(math.inf, MAX_NS)
 
 
@@ -175,8 +177,7 @@ class PieceNumbers:
                 raise
             self.since = self._reached_to + 1
             self._view.bags.finish_within(_LEFT_TO_COUNT_S)
-        for rows in self._pending:
-            self._add(rows, MIN_NS if self.since is None else self.since)
+        self._add(self._pending, MIN_NS if self.since is None else self.since)
         self._pending.clear()
         note_summarised(self._view, self._topic, self._fields, window)
 
@@ -210,31 +211,38 @@ class PieceNumbers:
         Raises:
             QueryTimeoutError: time for reading is over, and something has been counted.
         """
-        complete = [rows for rows in self._pending if rows.span[0] > at]
+        self._add([rows for rows in self._pending if rows.span[0] > at], MIN_NS)
         self._pending = [rows for rows in self._pending if rows.span[0] <= at]
-        for rows in complete:
-            self._add(rows, MIN_NS)
         self._reached_to = at
         if self._reading.expired() and self._parts:
             raise QueryTimeoutError("the rest is left out")
 
-    def _add(self, rows: Rows, since: Ns) -> None:
-        """Adds the numbers in a table's messages from log time `since` on."""
+    def _add(self, tables: Sequence[Rows], since: Ns) -> None:
+        """Adds the numbers in the messages of tables from log time `since` on: of all, or of none.
+
+        Raises:
+            QueryTimeoutError: the call's time is over; nothing is added.
+            TooManyError: bags hold more than `most_read` messages to read.
+        """
+        for key, part in [each for rows in tables for each in self._parts_of(rows, since)]:
+            self._parts[key].append(part)
+
+    def _parts_of(self, rows: Rows, since: Ns) -> Iterator[_KeyedPart]:
+        """Yields the numbers in a table's messages from log time `since` on."""
         piece = bisect_right(self._edges, rows.first)
         is_in_piece = rows.first >= since and piece == bisect_right(self._edges, rows.last)
         if rows.index is None and is_in_piece:
             outlines = [self._outlined(rows, field) for field in range(len(self._fields))]
             parts = [part for part in outlines if part is not None]
             if len(parts) == len(outlines):
-                for field, part in enumerate(parts):
-                    self._parts[field, piece].append(part)
+                yield from (((field, piece), part) for field, part in enumerate(parts))
                 return
         stored = of_columns(self._view, rows, self._numbers_of_fields)
         if stored is None:
-            self._add_from_messages(rows, since)
+            yield from self._parts_of_messages(rows, since)
             return
         for stored_rows, numbers_of_fields in stored:
-            self._add_to_pieces(stored_rows, numbers_of_fields, since)
+            yield from self._parts_in_pieces(stored_rows, numbers_of_fields, since)
 
     def _outlined(self, rows: Rows, field: int) -> Part | None:
         """Returns the numbers of a field as the table's outline has them; None without one."""
@@ -273,10 +281,10 @@ class PieceNumbers:
         counting = _numbers_at(stored, np.flatnonzero(rows.mask()[stored.rows]))
         return counting._replace(rows=np.searchsorted(rows.index, counting.rows))
 
-    def _add_to_pieces(
+    def _parts_in_pieces(
         self, rows: Rows, numbers_of_fields: Sequence[FieldNumbers], since: Ns
-    ) -> None:
-        """Adds the numbers of each field in the rows from log time `since` on."""
+    ) -> Iterator[_KeyedPart]:
+        """Yields the numbers of each field in the rows from log time `since` on."""
         outlines = [
             self._outlined(rows, field) if rows.index is None else None
             for field in range(len(numbers_of_fields))
@@ -289,7 +297,7 @@ class PieceNumbers:
                 if begin < end:
                     piece_numbers = _numbers_at(field_numbers, np.arange(begin, end))
                     part = _part_of(rows, piece_numbers, first, last, outlines[field])
-                    self._parts[field, piece].append(part)
+                    yield (field, piece), part
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[_PieceRows]:
         """Yields the pieces that rows from log time `since` on lie in."""
@@ -305,8 +313,8 @@ class PieceNumbers:
             if max(start, least) < stop:
                 yield _PieceRows(piece, max(start, least), stop)
 
-    def _add_from_messages(self, rows: Rows, since: Ns) -> None:
-        """Adds the numbers by decoding the messages, since columns lack a field.
+    def _parts_of_messages(self, rows: Rows, since: Ns) -> Iterator[_KeyedPart]:
+        """Yields the numbers by decoding the messages, since columns lack a field.
 
         Raises:
             TooManyError: bags hold more than `most_read` messages to read.
@@ -320,7 +328,7 @@ class PieceNumbers:
             if times.size:
                 table = Table(rows.table.channel, times, times, times)
                 decoded = Rows(BagUnit(bag, table, 0), lambda: None)
-                self._add_to_pieces(decoded, numbers_of_fields, since)
+                yield from self._parts_in_pieces(decoded, numbers_of_fields, since)
 
     def _decoded_numbers(
         self, messages: Iterable[StoredMessage]

@@ -18,7 +18,7 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.results import Bins
 from tests.support.bags import Msg, battery, make, odom, text, write_mcap, write_splits
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.tables import table
 
 S = 10**9
@@ -112,6 +112,15 @@ def test_numbers_of_a_call_that_runs_out_of_time_are_of_all_that_was_counted(
     sizes = sizes_counted(memory_of(tmp_path, limits=LATEST), range(1, 120, 3))
     assert len(sizes) > 2
     assert max(sizes) == len(CHARGES)
+
+
+def test_no_number_is_lost_where_time_runs_out_while_a_table_is_counted(tmp_path: Path) -> None:
+    """The columns lack the field, so that bags are read as each table is counted."""
+    write(tmp_path, CHARGES[::2], split=60)
+    for begin, end in ((0, 95), (95, 250), (250, 300)):
+        write_mcap(tmp_path / "other" / f"other_{begin}.mcap", CHARGES[1::2][begin:end])
+    memory = with_store(memory_of(tmp_path, limits=LATEST), tmp_path, share=0.0)
+    assert len(sizes_counted(memory, range(1, 40))) > 1
 
 
 def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
