@@ -27,7 +27,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S, Call, Memory
-from ros2_memory.history.no_data import no_data_between, resolve_topic
+from ros2_memory.history.no_data import no_data_between, require_fields, resolve_topic
 from ros2_memory.history.reverse_search import note_no_fix, note_summarised
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.scan import count_messages, decoded_rows, messages_of, of_columns, scan
@@ -553,7 +553,7 @@ def count_range(
     binned.add_last(last, int(last.max()))
     for field, (cells, window_cell) in zip(names, cells_of_fields, strict=True):
         if window_cell is None:
-            _require_field(view, name, field, binned.counted.stop)
+            require_fields(view, name, (field,), binned.counted.stop)
             view.notes.add(f"{field} holds no number in the window")
             continue
         for column, kind in _CELL_COLUMNS.items():
@@ -561,18 +561,6 @@ def count_range(
             binned.add(f"{field}.{column}", kind, values, getattr(window_cell, column))
     note_robots(view, name, binned.counted)
     return binned.answer()
-
-
-def _require_field(view: View, topic: str, field: str, until: Ns) -> None:
-    """Checks that the newest message of a topic before a log time has a field.
-
-    Raises:
-        InvalidArgumentsError: the message lacks the field.
-    """
-    newest = view.stream.last(topic, until)
-    message = None if newest is None else view.bags.decode(newest)
-    if newest is not None and message is not None:
-        view.extractor.shown(message, newest.type, (field,))
 
 
 def _cells_of_fields(

@@ -38,7 +38,7 @@ from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -458,6 +458,18 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
         reason = reason_beyond(view, start)
     detail += _advice(view, reason, start)
     raise with_notes(view, asked, NoDataError(reason, "; ".join(detail)))
+
+
+def require_fields(view: View, topic: str, fields: Sequence[str], until: Ns) -> None:
+    """Checks that the newest message of a topic before a log time has the fields.
+
+    Raises:
+        InvalidArgumentsError: the message lacks a field.
+    """
+    newest = view.stream.last(topic, until) if fields else None
+    message = None if newest is None else view.bags.decode(newest)
+    if newest is not None and message is not None:
+        view.extractor.shown(message, newest.type, fields)
 
 
 def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataError:

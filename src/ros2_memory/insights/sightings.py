@@ -27,7 +27,7 @@ from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
 from ros2_memory.history.held_values import held_at, held_until, is_latched
-from ros2_memory.history.no_data import matching_topics, require_recorded
+from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
@@ -114,8 +114,9 @@ def find_matches(
     sightings: Sequence[Sighting] = ()
     episodes: Sequence[Episode] = ()
     if goals is not None:
-        sightings, total, searched = _goal_sightings(view, goals, scope, selection)
+        sightings, total, searched = _goal_sightings(view, goals, scope, selection, fields)
     elif are_episodes:
+        require_fields(view, topics[0], fields, window.stop)
         episodes, total, searched = _select_episodes(view, topics[0], condition, scope, selection)
     else:
         search = ReverseSearch(view, topic, condition)
@@ -191,17 +192,21 @@ def _with_durations(row: Row, elapsed: Elapsed, other: MeanwhileReader | None) -
 
 
 def _goal_sightings(
-    view: View, goals: list[GoalRun], scope: Scope, selection: _Selection
+    view: View, goals: list[GoalRun], scope: Scope, selection: _Selection, fields: Sequence[str]
 ) -> _SelectedRows[Sighting]:
-    """Returns the selected goals as sightings. `goals` have the last one first."""
+    """Returns the selected goals as sightings. `goals` have the last one first.
+
+    Raises:
+        InvalidArgumentsError: no sighting has one of the fields.
+    """
     view.notes.retract_outside(scope.window)
     ordered = goals[::-1] if selection.oldest_first else goals
-    sightings = [
+    found = (
         _goal_sighting(view, goal, scope, selection.frame_id)
         for goal in ordered[: selection.limit]
         if view.call.wants(goal.last)
-    ]
-    return _SelectedRows(sightings, len(goals), scope.window)
+    )
+    return _SelectedRows(_with_fields(view, found, fields), len(goals), scope.window)
 
 
 def _select_episodes(
@@ -256,26 +261,23 @@ def _run_sightings(
         oldest = runs[0] if oldest_first else runs[-1]
         searched = TimeWindow(oldest.first, searched.stop)
     view.notes.retract_outside(searched)
-    sightings: list[Sighting] = []
-    refused: list[InvalidArgumentsError] = []
+    found = _found_in(view, search, runs, scope, selection.frame_id)
+    sightings = _with_fields(view, found, fields)
+    return _SelectedRows(sightings, total, searched)
+
+
+def _found_in(
+    view: View, search: ReverseSearch, runs: Iterable[Run], scope: Scope, frame_id: str | None
+) -> Iterator[tuple[Sighting, StoredMessage]]:
+    """Yields the runs of matches as sightings, with their last messages."""
     for run in runs:
         # To say where the robot was takes longest.
         newest = _newest_match(view, search, run) if view.call.wants(run.last) else None
-        if newest is None:
-            continue
-        sighting = _sighting(
-            view, search.condition, run, newest, scope=scope, frame_id=selection.frame_id
-        )
-        if fields:
-            try:
-                sighting = _with_fields(view, sighting, newest, fields)
-            except InvalidArgumentsError as error:
-                # A traceback refers to this frame, and the frame to the errors: break the cycle.
-                refused.append(error.with_traceback(None))
-        sightings.append(sighting)
-    if refused and len(refused) == len(sightings):
-        raise refused.pop(0)
-    return _SelectedRows(sightings, total, searched)
+        if newest is not None:
+            sighting = _sighting(
+                view, search.condition, run, newest, scope=scope, frame_id=frame_id
+            )
+            yield sighting, newest
 
 
 class SightingSpans(NamedTuple):
@@ -468,13 +470,18 @@ def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
     return scope.holds_until(goal.last, max(goal.last, until))
 
 
-def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None) -> Sighting:
-    """Returns a goal as a sighting, with the robot's pose when it ended or was last listed."""
+def _goal_sighting(
+    view: View, goal: GoalRun, scope: Scope, frame_id: str | None
+) -> tuple[Sighting, StoredMessage | None]:
+    """Returns a goal as a sighting, and its last message (None if it was deleted).
+
+    The sighting has the robot's pose when the goal ended or was last listed.
+    """
     message = view.stream.last(goal.topic, goal.last + 1)
     robot = None
     if message is not None:
         robot = robot_at(view, goal.last, message.bag.recording, frame_id)
-    return Sighting(
+    sighting = Sighting(
         topic=goal.topic,
         first=goal.first,
         last=goal.last,
@@ -485,19 +492,49 @@ def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None
         thing=None,
         value={"goal": goal.goal, "status": goal.status_word},
     )
+    return sighting, message
 
 
 def _with_fields(
+    view: View, found: Iterable[tuple[Sighting, StoredMessage | None]], fields: Sequence[str]
+) -> list[Sighting]:
+    """Returns sightings with fields of their last messages in place of matched texts.
+
+    A sighting stays as it is if its message lacks a field.
+
+    Raises:
+        InvalidArgumentsError: no sighting has one of the fields.
+    """
+    sightings: list[Sighting] = []
+    refused: list[InvalidArgumentsError] = []
+    for sighting, newest in found:
+        narrowed = sighting
+        if fields and newest is not None:
+            try:
+                narrowed = _narrowed(view, sighting, newest, fields)
+            except InvalidArgumentsError as error:
+                # A traceback refers to this frame, and the frame to the errors: break the cycle.
+                refused.append(error.with_traceback(None))
+        sightings.append(narrowed)
+    if refused and len(refused) == len(sightings):
+        raise refused.pop(0)
+    return sightings
+
+
+def _narrowed(
     view: View, sighting: Sighting, newest: StoredMessage, fields: Sequence[str]
 ) -> Sighting:
-    """Returns a sighting with fields of its last message in place of matched texts.
+    """Returns a sighting with fields of its last message; a goal keeps its id and status.
 
     Raises:
         InvalidArgumentsError: the message does not have the fields.
     """
     shown = view.extractor.shown(view.memory.reader.decode(newest.record), newest.type, fields)
     view.notes.add(*shown.notes)
-    return replace(sighting, matched=(), value=quote(shown.value))
+    value = quote(shown.value)
+    if isinstance(sighting.value, dict) and isinstance(value, dict):
+        value = {**sighting.value, **value}
+    return replace(sighting, matched=(), value=value)
 
 
 def _place_of_thing(

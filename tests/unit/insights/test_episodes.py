@@ -125,6 +125,13 @@ def test_the_size_of_a_long_array_is_no_value_of_it(tmp_path: Path, *, recalls: 
         assert len(reply["changes"] if "changes" in how else reply["rows"]) == 10
 
 
+def test_a_field_that_texts_do_not_have_is_refused(memory: Memory) -> None:
+    given = {"topic": "/task", "condition_type": "contains", "value": "wash"}
+    assert ask(memory, "find_matches", **given, fields=["data"])["episodes"]
+    refused = ask(memory, "find_matches", **given, fields=["nope"])
+    assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
+
+
 def test_a_search_that_runs_out_of_time_says_from_where_to_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -217,3 +217,14 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     assert held("succeeded", 20, 50) == ([(20, True, 4.0)], 1, 20, "34:00")
     assert held("succeeded", 45, 55) == ([], 0, 0, "None")
     assert held("executing", 900, 940) == ([], 0, 0, "None")
+
+
+def test_a_goal_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+    memory = memory_of(tmp_path)
+    aborted = {"topic": TOPIC, "condition_type": "equals", "value": "aborted"}
+    status = "status_list.1.status"
+    goal = asked(memory, "find_matches", **aborted, fields=[status])["sightings"][0]["value"]
+    assert (goal["goal"][-1], goal["status"], goal[status]) == ("2", "aborted", 6)
+    refused = asked(memory, "find_matches", **aborted, fields=["nope"])
+    assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
