@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -101,42 +101,30 @@ def find_matches(
         NoDataError: nothing is recorded, or no such topic.
         QueryTimeoutError: the call's time is over before anything was found.
     """
-    span = TimeRange(start_s, end_s, last_s)
-    view, now, asked = open_search(memory, call, span)
+    view, now, asked = open_search(memory, call, TimeRange(start_s, end_s, last_s))
     require_recorded(view, asked)
     condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     window = clamped(view, asked)
     scope = Scope(view, window, where, during)
     other = None if beside is None else MeanwhileReader(view, beside)
-    topics, selection = matching_topics(view, topic), _Selection(limit, oldest_first, frame_id)
-    goals = goals_matching(view, topics, condition, scope)
-    are_episodes = goals is None and says_episodes(view, topics)
-    sightings: Sequence[Sighting] = ()
-    episodes: Sequence[Episode] = ()
-    if goals is not None:
-        sightings, total, searched = _goal_sightings(view, goals, scope, selection, fields)
-    elif are_episodes:
-        require_fields(view, topics[0], fields, window.stop)
-        episodes, total, searched = _select_episodes(view, topics[0], condition, scope, selection)
-    else:
-        search = ReverseSearch(view, topic, condition)
-        sightings, total, searched = _run_sightings(view, search, scope, selection, fields)
-        view.notes.add(*_latched_notes(view, search, window))
-    elapsed = elapsed_in(view, searched)
-    sightings = tuple(_with_durations(sighting, elapsed, other) for sighting in sightings)
-    episodes = tuple(_with_durations(episode, elapsed, other) for episode in episodes)
+    selection = _Selection(limit, oldest_first, frame_id, fields)
+    found = _select_rows(view, topic, condition, scope, selection)
+    topics, is_never = matching_topics(view, topic), found.total == 0
+    elapsed = elapsed_in(view, found.searched)
+    sightings = tuple(_with_durations(sighting, elapsed, other) for sighting in found.sightings)
+    episodes = tuple(_with_durations(episode, elapsed, other) for episode in found.episodes)
     rows: list[Sighting | Episode] = [*sightings, *episodes]
-    note_robots_on(view, topics, searched)
-    note_unread(view, searched, nothing=total == 0, search=True)
-    if total == 0:
-        view.notes.add(*describe_silences(view, topics, searched))
+    note_robots_on(view, topics, found.searched)
+    note_unread(view, found.searched, nothing=is_never, search=True)
+    if is_never:
+        view.notes.add(*describe_silences(view, topics, found.searched))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()
-    if total == 0:
+    if is_never:
         bounded = scope.is_bounded
         notes += notes_on_never(view, topic, condition, window, min_score, is_bounded=bounded)
-    total = total if scope.since is None else None
+    total = found.total if scope.since is None else None
     return Sightings(
         sightings,
         more=total is None or total > len(rows),
@@ -146,7 +134,7 @@ def find_matches(
         now=now,
         unknown=elapsed.among(scope.unknown),
         topic="" if topics[1:] else topics[0],
-        of_texts=are_episodes,
+        of_texts=found.of_texts,
         episodes=episodes,
         notes=notes,
     )
@@ -162,24 +150,50 @@ def _searched_times(view: View, window: TimeWindow, shown_at: Sequence[Ns]) -> S
 
 
 class _Selection(NamedTuple):
-    """How many rows are shown, from which end, and the frame of the robot's positions."""
+    """How many rows are shown, from which end, the frame of the robot's positions, and fields."""
 
     limit: int
     oldest_first: bool
     frame_id: str | None
+    fields: Sequence[str]
 
 
-class _SelectedRows(NamedTuple, Generic[Row]):
+class _SelectedRows(NamedTuple):
     """The rows of a reply.
 
     Attributes:
         total: how many there are; None if the search ended before it counted all.
         searched: the part of the window in which all matches are known.
+        of_texts: whether there are `episodes` in place of sightings.
     """
 
-    rows: Sequence[Row]
     total: int | None
     searched: TimeWindow
+    sightings: Sequence[Sighting] = ()
+    episodes: Sequence[Episode] = ()
+    of_texts: bool = False
+
+
+def _select_rows(
+    view: View, pattern: str, condition: Condition, scope: Scope, selection: _Selection
+) -> _SelectedRows:
+    """Returns the selected goals, the episodes of a topic of texts, or the runs of matches.
+
+    Raises:
+        InvalidArgumentsError: nothing can meet the condition, or no row has one of the fields.
+        QueryTimeoutError: the call's time is over before anything was found.
+    """
+    topics = matching_topics(view, pattern)
+    goals = goals_matching(view, topics, condition, scope)
+    if goals is not None:
+        return _goal_sightings(view, goals, scope, selection)
+    if says_episodes(view, topics):
+        require_fields(view, topics[0], selection.fields, scope.window.stop)
+        return _select_episodes(view, topics[0], condition, scope, selection)
+    search = ReverseSearch(view, pattern, condition)
+    selected = _run_sightings(view, search, scope, selection)
+    view.notes.add(*_latched_notes(view, search, scope.window))
+    return selected
 
 
 def _with_durations(row: Row, elapsed: Elapsed, other: MeanwhileReader | None) -> Row:
@@ -192,8 +206,8 @@ def _with_durations(row: Row, elapsed: Elapsed, other: MeanwhileReader | None) -
 
 
 def _goal_sightings(
-    view: View, goals: list[GoalRun], scope: Scope, selection: _Selection, fields: Sequence[str]
-) -> _SelectedRows[Sighting]:
+    view: View, goals: list[GoalRun], scope: Scope, selection: _Selection
+) -> _SelectedRows:
     """Returns the selected goals as sightings. `goals` have the last one first.
 
     Raises:
@@ -206,12 +220,13 @@ def _goal_sightings(
         for goal in ordered[: selection.limit]
         if view.call.wants(goal.last)
     )
-    return _SelectedRows(_with_fields(view, found, fields), len(goals), scope.window)
+    sightings = _with_fields(view, found, selection.fields)
+    return _SelectedRows(len(goals), scope.window, sightings)
 
 
 def _select_episodes(
     view: View, topic: str, condition: Condition, scope: Scope, selection: _Selection
-) -> _SelectedRows[Episode]:
+) -> _SelectedRows:
     """Returns the selected episodes, with the robot's pose when they began."""
     limit, oldest_first = selection.limit, selection.oldest_first
     found = find_episodes(view, topic, condition, scope, limit=limit, oldest_first=oldest_first)
@@ -224,7 +239,7 @@ def _select_episodes(
         for episode in found.episodes
         if view.call.wants(episode.until)
     ]
-    return _SelectedRows(episodes, found.total, searched)
+    return _SelectedRows(found.total, searched, episodes=episodes, of_texts=True)
 
 
 def _find_runs_early(
@@ -238,8 +253,8 @@ def _find_runs_early(
 
 
 def _run_sightings(
-    view: View, search: ReverseSearch, scope: Scope, selection: _Selection, fields: Sequence[str]
-) -> _SelectedRows[Sighting]:
+    view: View, search: ReverseSearch, scope: Scope, selection: _Selection
+) -> _SelectedRows:
     """Returns the selected runs of matches as sightings.
 
     Raises:
@@ -262,8 +277,8 @@ def _run_sightings(
         searched = TimeWindow(oldest.first, searched.stop)
     view.notes.retract_outside(searched)
     found = _found_in(view, search, runs, scope, selection.frame_id)
-    sightings = _with_fields(view, found, fields)
-    return _SelectedRows(sightings, total, searched)
+    sightings = _with_fields(view, found, selection.fields)
+    return _SelectedRows(total, searched, sightings)
 
 
 def _found_in(
