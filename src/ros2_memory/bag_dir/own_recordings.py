@@ -397,6 +397,22 @@ class OwnRecordings:
                 self._remember_unwritten([row])
                 _log.error("recordings_not_listed", reason=str(error))
 
+    def forget(self, folder: Path) -> None:
+        """Drops a removed folder and those that were in it; if the disk refuses, a later call does.
+
+        Folders that are still there stay listed.
+        """
+        with self._lock:
+            name = self.name_of(folder)
+            gone = self._missing_on_disk(
+                row for row in self._rows if f"{row}/".startswith(f"{name}/")
+            )
+            for row in gone:
+                self._unwritten.pop(row, None)
+            if gone:
+                with suppress(OSError):
+                    self._rewrite(())
+
     def _remember_unwritten(self, rows: Sequence[ListRow]) -> None:
         """Adds rows that cannot be written now; they are written with the next row."""
         self._unwritten |= _by_recording(rows)

@@ -206,10 +206,8 @@ class MomentKeeper:
         except _MomentRefusedError as error:
             refused = str(error)
         except OSError as error:
-            refused = (
-                f"the bags cannot be saved in {self.bag_dir / MOMENTS_FOLDER} by hard "
-                f"links: {error.strerror or error}"
-            )
+            folder = self.bag_dir / MOMENTS_FOLDER
+            refused = f"the bags cannot be saved in {folder}: {error.strerror or error}"
         else:
             return Outcome(moment.folder.name, len(moment.files), moment.moment.pending)
         _log.warning("moment_refused", label=request.label, reason=refused)
@@ -280,10 +278,11 @@ class MomentKeeper:
             moment = _with_links(StoredMoment(folder, wanted, {}), need, links)
             if moment.moment != wanted:
                 write_saved_moment(folder, moment.moment)
+            flush(folder.parent)
         except OSError:
             directories.remove(folder)
+            self.own.forget(folder)
             raise
-        flush(folder.parent)
         rule = {} if wanted.rule is None else {"rule": wanted.rule}
         _log.info("moment_kept", folder=folder.name, bags=len(moment.files), **rule)
         return moment
@@ -479,6 +478,8 @@ def _link_bag(bag: Path, target: Path, inode: int) -> bool:
         with suppress(FileNotFoundError):
             return target.lstat().st_ino == inode
         return False
+    except OSError as error:
+        raise OSError(error.errno, f"no hard link can be made: {error.strerror}") from error
     return True
 
 

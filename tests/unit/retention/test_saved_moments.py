@@ -30,6 +30,7 @@ from tests.support.housekeepers import (
     house_of,
     in_moments,
     kept,
+    lines,
     recording,
     recording_now,
     told_of,
@@ -100,12 +101,24 @@ class TestKeeping:
 
         assert "nothing was recorded then" in refusal(500, 600)
         with broken(os, "link", errno.EPERM):
-            assert "by hard links: Operation not permitted" in refusal(15, 25)
+            assert "no hard link can be made: Operation not permitted" in refusal(15, 25)
         assert not [*(tmp_path / "moments").glob("*")]
+        assert lines(tmp_path) == []
         # A bag that two moments share counts once in the share.
         assert [kept(house, tmp_path, *span).bags for span in ((0, 15), (5, 25))] == [2, 3]
         assert "retention.max_moments_gb" in refusal(25, 35)
         assert len(list(stored_moments_in(tmp_path))) == 2
+
+    def test_of_a_moment_that_the_disk_refuses_at_its_last_step_nothing_is_left(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, A, 0)
+        house, moments = house_of(tmp_path), tmp_path / "moments"
+        with broken(saved_moments, "flush", errno.EIO, where=lambda path: path == moments):
+            outcome = kept(house, tmp_path, 15, 25)
+        assert outcome.refused == f"the bags cannot be saved in {moments}: Input/output error"
+        assert not list(stored_moments_in(tmp_path))
+        assert lines(tmp_path) == []
 
     def test_a_request_is_not_granted_twice(self, tmp_path: Path) -> None:
         """As where the recorder was killed after it kept a moment, and before it answered."""
@@ -198,9 +211,10 @@ class TestOpenBags:
                 clock.at += LONGEST_WAIT_NS
                 house.keep_moments()
         told = events(captured, "moment_not_followed")
-        assert [each["reason"] for each in told] == ["No space left on device"]
+        reason = "no hard link can be made: No space left on device"
+        assert [each["reason"] for each in told] == [reason]
         house.keep_moments()
-        missing = ["not all can be saved: No space left on device"]
+        missing = [f"not all can be saved: {reason}"]
         assert told_of(tmp_path)["missing"] == (missing if stays_full else [])
         assert len(in_moments(tmp_path)) == (2 if stays_full else 3)
 
