@@ -39,10 +39,11 @@ LEVELS: Final = {
     "exception": "error",
     "fail": "error",
     "lasting": "error",
+    "lasting_faults": "error",
     "lasting_if_refused": "error",
     "remark": "warning",
 }
-EXPLAINED: Final = {"warn", "remark", "fail", "lasting", "lasting_if_refused"}
+EXPLAINED: Final = {"warn", "remark", "fail", "lasting", "lasting_faults", "lasting_if_refused"}
 OPTIONS: Final[Mapping[str, tuple[str, str, type]]] = {
     "lake/duckdb.yaml": ("lake", "engine", DuckdbNode),
     "recorder/ros2bag.yaml": ("recorder", "", Ros2BagNode),

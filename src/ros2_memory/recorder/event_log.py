@@ -106,9 +106,22 @@ class EventLog:
 
     def report_faults(self, faults: Mapping[str, str]) -> None:
         """Logs each failing task of the housekeeper, once until it succeeds."""
-        failed = [task for event, task in self._unresolved if event == "housekeeping_failed"]
-        for task in (*failed, *faults):
+        for task in (*self._lasting_of("housekeeping_failed"), *faults):
             self.lasting("housekeeping_failed", task, faults.get(task), task=task)
+
+    def lasting_faults(self, event: str, recording: str, faults: Mapping[str, str]) -> None:
+        """Logs the fault of each file of a recording, once until the file has none."""
+        found = {f"{recording}/{file}": fault for file, fault in faults.items()}
+        for subject in (*self._lasting_of(event, f"{recording}/"), *found):
+            self.lasting(event, subject, found.get(subject), recording=recording)
+
+    def _lasting_of(self, event: str, prefix: str = "") -> list[str]:
+        """Returns the subjects that begin with a prefix and have this fault."""
+        return [
+            subject
+            for each, subject in self._unresolved
+            if each == event and subject.startswith(prefix)
+        ]
 
     def report_output(self, recording: str, lines: Iterable[Line]) -> None:
         """Logs the lines that the `ros2 bag record` of a recording printed."""

@@ -13,6 +13,7 @@ from collections import Counter, defaultdict, deque
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush_bags
@@ -63,13 +64,13 @@ class SplitChanges(NamedTuple):
         closed: names of the splits that were closed, in the order in which they were recorded.
         empty: names of the splits that will stay empty, since a newer one was started.
         gone: whether the directory, which existed, is missing.
-        faults: sentences on what cannot be read.
+        faults: a sentence for each file that cannot be read, or for the directory: "".
     """
 
     closed: tuple[str, ...] = ()
     empty: tuple[str, ...] = ()
     gone: bool = False
-    faults: tuple[str, ...] = ()
+    faults: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(slots=True)
@@ -105,14 +106,14 @@ class Splits:
             existed, self.exists = self.exists, False
             return SplitChanges(gone=existed)
         except OSError as error:
-            return SplitChanges(faults=(f"{self.directory}: {error.strerror or error}",))
+            return SplitChanges(faults={"": f"{self.directory}: {error.strerror or error}"})
         self.exists = True
         for name, size in sizes.items():
             split = self._files.setdefault(name, _Split(now_s))
             split.size = max(split.size, size)
         closed, faults = self._find_closed(sizes)
         empty = self._find_empty(sizes, now_s)
-        return SplitChanges(tuple(closed), tuple(empty), faults=tuple(faults))
+        return SplitChanges(tuple(closed), tuple(empty), faults=faults)
 
     @property
     def bytes_written(self) -> int:
@@ -143,10 +144,10 @@ class Splits:
                     sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
         return sizes
 
-    def _find_closed(self, names: Iterable[str]) -> tuple[list[str], list[str]]:
-        """Returns the newly closed splits, in the order of their start, and sentences on faults."""
+    def _find_closed(self, names: Iterable[str]) -> tuple[list[str], dict[str, str]]:
+        """Returns the newly closed splits, in the order of their start, and faults by file."""
         closed: list[str] = []
-        faults: list[str] = []
+        faults: dict[str, str] = {}
         for name in names:
             split, path = self._files[name], self.directory / name
             if split.closed or not split.size:
@@ -161,9 +162,9 @@ class Splits:
                     self.messages += summary.count
             except BagError as error:
                 if split.closed:  # an open file need not be readable yet
-                    faults.append(str(error))
+                    faults[name] = str(error)
             except OSError as error:
-                faults.append(f"{path}: {error.strerror or error}")
+                faults[name] = f"{path}: {error.strerror or error}"
         closed.sort(key=lambda name: (self._files[name].start, name))
         return closed, faults
 
@@ -537,7 +538,19 @@ class RecordingSessions:
                 self.orders.own.note_splits(session.name, session.splits.seen, ended=has_ended)
 
     def _observe_session(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
+        """Reads the output and the splits of one child, and reports on them."""
         self._report_output(session)
+        changes = self._observe_growth(session, now)
+        self._learn_closed(session, changes.closed, now)
+        for name in changes.empty:
+            file = f"{session.name}/{name}"
+            sentence = f"{file} is empty although a newer split was started"
+            self.events.fail("split_empty", sentence, recording=session.name)
+        self.events.lasting_faults("unreadable", session.name, changes.faults)
+        return changes
+
+    def _observe_growth(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
+        """Reads the splits of one child, and notes when they grew."""
         before = session.splits.bytes_written
         changes = session.splits.observe(now.monotonic_s)
         if session.splits.bytes_written > before:
@@ -545,24 +558,23 @@ class RecordingSessions:
             # A recording that ends grows by the end of its file.
             if session.is_recording and session.age_s(now) >= SETTLE_S:
                 self.grew_s = now.monotonic_s
-        for name in changes.closed:
+        return changes
+
+    def _learn_closed(
+        self, session: RecordingSession, closed: Sequence[str], now: ClockReading
+    ) -> None:
+        """Counts what newly closed splits have received and lost, and flushes them."""
+        for name in closed:
             self.events.info("split_closed", recording=session.name, file=name)
             self.orders.reception.learn(session.name, session.splits.directory / name)
-        if changes.closed or session.state is SessionState.ENDED:
+        if closed or session.state is SessionState.ENDED:
             # After `learn`: what a split itself shows to be missing is counted first.
             for topic, count in session.take_lost().items():
                 self.orders.reception.note_lost(session.name, topic, count)
-        if changes.closed:
+        if closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s
-            self._flush_later(session, session.splits.directory, changes.closed)
-        for name in changes.empty:
-            file = f"{session.name}/{name}"
-            sentence = f"{file} is empty although a newer split was started"
-            self.events.fail("split_empty", sentence, recording=session.name)
-        for fault in changes.faults or (None,):
-            self.events.lasting("unreadable", session.name, fault, recording=session.name)
-        return changes
+            self._flush_later(session, session.splits.directory, closed)
 
     def _report_output(self, session: RecordingSession) -> None:
         lines = session.new_lines()

@@ -175,7 +175,7 @@ class TestFailingDisk:
     ) -> None:
         for _ in range(2):
             with broken(world.reader, "closing", errno.ESTALE):
-                [reported] = world.logged(12, "unreadable")
+                *_, reported = world.logged(12, "unreadable")
             assert reported["reason"] == world.heartbeat()["last_error"]
             assert world.heartbeat()["recovered"] is False
             world.run(13)
@@ -186,6 +186,21 @@ class TestFailingDisk:
         with broken(world.reader, "closing", errno.ESTALE):
             assert "Stale file handle" in world.logged(6, "unreadable")[0]["reason"]
         assert len(world.running) == 1
+
+    def test_each_split_that_cannot_be_read_is_named_once_until_it_can_be(
+        self, world: World
+    ) -> None:
+        world.run(10)
+        directory = world.recorders[0].directory
+        unread = [directory / f"{directory.name}_{number}.mcap" for number in (4, 5)]
+
+        def named_meanwhile(*paths: Path) -> list[str]:
+            with broken(world.reader, "closing", errno.EACCES, where=lambda path: path in paths):
+                return [each["reason"] for each in world.logged(20, "unreadable")]
+
+        sentences = [f"{path}: Permission denied" for path in unread]
+        assert named_meanwhile(*unread) == sentences
+        assert named_meanwhile(unread[1]) == []
 
     def test_one_task_that_fails_keeps_no_other_from_being_done(self, world: World) -> None:
         with broken(world.recorders[0], "take_lines", errno.EIO):
