@@ -145,8 +145,19 @@ def unrecorded(window: TimeWindow, bags: Iterable[BagFile]) -> tuple[str, ...]:
     )
 
 
+class Refusal(NamedTuple):
+    """Why a moment is not saved: its kind, which lasts while the numbers of the sentence change."""
+
+    kind: str
+    sentence: str
+
+
 class _MomentRefusedError(Exception):
     """A moment cannot be saved; the text is the reason."""
+
+    def __init__(self, kind: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.refusal = Refusal(kind, sentence)
 
 
 @dataclass(eq=False, repr=False)
@@ -215,7 +226,7 @@ class MomentKeeper:
 
     def keep_for_rule(
         self, request: SaveRequest, rule: str, matches: int, snapshot: Snapshot
-    ) -> str | None:
+    ) -> Refusal | None:
         """Begins the moment of a rule, or extends it; returns why nothing of it is kept, or None.
 
         The same request changes nothing the second time. Nothing may be deleted meanwhile.
@@ -230,7 +241,7 @@ class MomentKeeper:
             try:
                 self._begin_moment(wanted, stored, snapshot)
             except _MomentRefusedError as error:
-                return str(error)
+                return error.refusal
             self._waiting = True
         elif known.moment.matches < matches or known.moment.request.end < request.end:
             extended = known._replace(moment=replace(wanted, missing=known.moment.missing))
@@ -302,20 +313,21 @@ class MomentKeeper:
         group = self._group(wanted, stored)
         if len(group) >= MAX_MOMENTS // (1 + len(self.rule_bytes)):
             raise _MomentRefusedError(
+                "number",
                 f"there are {len(group)} moments, the maximum; delete folders in "
-                "moments/ of the bag directory"
+                "moments/ of the bag directory",
             )
         if not need.bags and not need.waits:
             thinned = snapshot.timeline.thinned_times
             if overlaps_any(thinned, need.window.start, need.window.stop - 1):
                 reason = "the bags of that time were deleted, and memory/ has what stayed of them"
-            else:
-                reason = "nothing was recorded then: ask for a time at which something was"
-            raise _MomentRefusedError(reason)
+                raise _MomentRefusedError("deleted", reason)
+            reason = "nothing was recorded then: ask for a time at which something was"
+            raise _MomentRefusedError("unrecorded", reason)
         share = self._share_of(wanted, stored)
         files = filter(None, (_file_of(bag.path) for bag in need.bags))
         if refused := share.refusal(files, sum(map(size_of, need.open_files))):
-            raise _MomentRefusedError(refused)
+            raise _MomentRefusedError("share", refused)
         return share
 
     def _continue_moment(

@@ -24,6 +24,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, NS_PER_S, Clock, Ns, Span, ns_from_unix
+from ros2_memory.retention.saved_moments import MomentKeeper, Refusal
 from ros2_memory.triggers.rules import Firing, Rule, SplitSearch, chains_to_search
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.saved_moments import MomentKeeper
 
 GLOB_MARKS: Final = "*?["
 """Characters that make a topic of a rule a glob."""
@@ -79,7 +79,8 @@ class Triggers:
         self.restarts: list[Span] = []
         self._deleted = 0
         self._is_written = False
-        self._reported: dict[str, Ns] = {}
+        # When a rule last fired with a problem, by its name and the kind of the problem.
+        self._reported: dict[tuple[str, str], Ns] = {}
 
     def note_restart(self, first: Ns, at: Ns) -> None:
         """Records that the recording ended unexpectedly and restarted between two wall times."""
@@ -243,15 +244,16 @@ class Triggers:
                 f"it fires more often than it may begin moments (max_per_hour: "
                 f"{rule.max_per_hour}): narrow its condition, or raise for_s"
             )
-            self._refuse(rule.name, record, reason)
+            self._refuse(rule.name, record, Refusal("often", reason))
             return
         if newest is not None and not newest.stored:
             self._store_moments(rule.name, record, snapshot)
         if len(record.newest) >= MOST_WAITING:
-            self._refuse(rule.name, record, f"{MOST_WAITING} of its moments wait to be stored")
+            reason = f"{MOST_WAITING} of its moments wait to be stored"
+            self._refuse(rule.name, record, Refusal("waiting", reason))
             return
         record.begun.append(firing.at)
-        if not self._was_logged_recently(rule.name, firing.at):
+        if not self._reported_recently(rule.name, firing.at):
             record.problem = None
         # The same number after a kill, so that the moment is recognised.
         number = uuid.uuid5(uuid.NAMESPACE_OID, f"{rule.name}/{firing.topic}/{firing.at}").hex
@@ -277,7 +279,8 @@ class Triggers:
         try:
             refused = self.moments.keep_for_rule(request, name, moment.matches, snapshot)
         except OSError as error:
-            self._report(name, record, f"its moments cannot be stored: {error.strerror or error}")
+            reason = f"its moments cannot be stored: {error.strerror or error}"
+            self._report(name, record, Refusal("disk", reason))
             return True
         moment.stored = True
         if refused is not None:
@@ -288,21 +291,25 @@ class Triggers:
         moment.known = True
         return True
 
-    def _refuse(self, name: str, record: RuleRecord, reason: str) -> None:
+    def _refuse(self, name: str, record: RuleRecord, refusal: Refusal) -> None:
         record.refused += 1
-        self._report(name, record, reason)
+        self._report(name, record, refusal)
 
-    def _report(self, name: str, record: RuleRecord, problem: str) -> None:
-        """Stores why a rule saves nothing, and logs it once for as long as that goes on."""
+    def _report(self, name: str, record: RuleRecord, refusal: Refusal) -> None:
+        """Stores why a rule saves nothing, and logs each kind once for as long as it goes on."""
         at = record.last_fired or 0
-        if record.problem != problem or not self._was_logged_recently(name, at):
-            _log.warning("trigger_not_kept", rule=name, reason=problem)
-        record.problem = problem
-        self._reported[name] = at
+        if refusal.kind not in self._reported_recently(name, at):
+            _log.warning("trigger_not_kept", rule=name, reason=refusal.sentence)
+        record.problem = refusal.sentence
+        self._reported[name, refusal.kind] = at
 
-    def _was_logged_recently(self, name: str, at: Ns) -> bool:
-        """Whether a problem was noted in the hour before a rule fired."""
-        return name in self._reported and abs(at - self._reported[name]) < NS_PER_HOUR
+    def _reported_recently(self, name: str, at: Ns) -> set[str]:
+        """Returns the kinds of problems that a rule had in the hour before it fired."""
+        return {
+            kind
+            for (rule, kind), last in self._reported.items()
+            if rule == name and abs(at - last) < NS_PER_HOUR
+        }
 
 
 def _note_lasting_match(name: str, record: RuleRecord) -> None:
