@@ -655,7 +655,8 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
     """Yields what a path leaves out, and how it was measured."""
     yield from length_notes(path)
     jumps = [point for point in path.waypoints if point.jump]
-    if jumps:
+    # Waypoints also mark where odometry restarted: that is no jump of the robot.
+    if jumps and path.totals.jumps:
         longest = "the longest lead" if len(jumps) < path.totals.jumps else "each leads"
         yield (
             f"of the jumps {longest} to a waypoint with jump: true; that distance was not driven"

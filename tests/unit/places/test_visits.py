@@ -92,6 +92,9 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_unless_they_are_in_a_
     assert [each.restarts for each in answer.visits] == [0, int(not in_map)]
     assert any("odometry restarted" in note for note in answer.notes) is not in_map
     assert visits(with_store(memory, tmp_path), Call(), 0.0, 0.0, radius_m=1.0) == answer
+    driven = asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 1100)
+    assert any("odometry restarted" in note for note in driven["notes"])
+    assert not any("of the jumps" in note for note in driven["notes"])
 
 
 def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_path: Path) -> None:
