@@ -40,7 +40,7 @@ BESIDE_NS: Final = NS_PER_S
 """The speed of the robot beside a hole is measured over this time."""
 _DRIVING_MPS: Final = 0.1
 _MOVED: Final = 0.3
-"""Across a step, the robot moved less than this share of what it drives in the hole's time."""
+"""Across a step, the robot moved less than this share of the distance it drives in such a time."""
 
 
 class ClockStep(NamedTuple):

@@ -201,7 +201,7 @@ class _StateLog:
         return tuple(self._states.values())
 
     def add(self, states: Iterable[KnownState], changes: Iterable[Change] = ()) -> None:
-        """Adds the states of what comes next, and the changes within it."""
+        """Adds the next states, and the changes within them."""
         between: list[Change] = []
         for state in states:
             key = state.kind, state.name

@@ -135,7 +135,7 @@ def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:
-    """Returns counts and sizes of what is recorded, as `ros2 bag info` does."""
+    """Returns the counts and sizes of messages and bags, as `ros2 bag info` does."""
     bags, first, last = snapshot.bags, snapshot.earliest, snapshot.latest
     span_s = None if first is None or last is None else round(unix_from_ns(last - first), 3)
     amount: JsonObject = {

@@ -344,7 +344,7 @@ class _Planner:
         self.align, self.size, self.run = 1, 0, []
 
     def _begin_variable(self) -> tuple[int, int]:
-        """Ends the run before a length; returns `align` and `skip` of what follows."""
+        """Ends the run before a length; returns `align` and `skip` for the next run."""
         self._flush()
         self.first = self.first or _LENGTH_BYTES
         return (_LENGTH_BYTES, 0) if self.unit < _LENGTH_BYTES else (1, -self.rest % _LENGTH_BYTES)

@@ -74,7 +74,7 @@ class _Heads(NamedTuple):
 
     @classmethod
     def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
-        """Returns the parts with what a coverage says of them."""
+        """Returns the parts, each with the bags that a coverage has for it."""
         return cls(
             coverage,
             heads,
@@ -121,7 +121,7 @@ _NO_ZONES: Final = _ColumnZones(0, {}, Zones.of([], []))
 
 @dataclass(frozen=True, slots=True)
 class Caches:
-    """Caches of all scanners, and of what is derived from parts, within one capacity.
+    """Caches of all scanners, and of data derived from parts, within one capacity.
 
     So the memory of a server does not grow with the robots that it is asked about.
 

@@ -133,7 +133,7 @@ class Layout:
 
 
 class LevelPaths(NamedTuple):
-    """The paths in `Layout.slots` of what messages, or elements of a sequence, have.
+    """The paths in `Layout.slots` of the fields of messages, or of elements of a sequence.
 
     Attributes:
         columns: by the names of the columns.

@@ -91,7 +91,7 @@ def letters_of(text: str) -> list[str]:
 
 
 def words_of(text: str) -> list[str]:
-    """Returns the runs of letters in a text; whatever is not ASCII counts as a letter."""
+    """Returns the runs of letters in a text; each character beyond ASCII counts as a letter."""
     spaced = text.encode("utf-8", "surrogatepass").translate(_SPACES)
     return spaced.decode("utf-8", "surrogatepass").split()
 
@@ -263,7 +263,7 @@ class Table:
         """Returns what `make` returns; a stored part remembers it.
 
         Args:
-            what: the name of what is made, used for nothing else.
+            what: the key under which the result is remembered.
             make: makes it of all rows.
             size_of: returns about how much memory it takes.
         """

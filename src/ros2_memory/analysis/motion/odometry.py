@@ -270,8 +270,8 @@ def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -
     It is expected from the paces of the ends, unless the distance is clearly longer than that.
 
     Args:
-        before: the end of what lies before the steps.
-        after: the begin of what lies after them.
+        before: the end of the path before the steps.
+        after: the beginning of the path after the steps.
         steps: how many there are.
         net_m: the distance from the first to the last position.
         plain_m: the sum of the distances of all positions.
