@@ -139,7 +139,7 @@ class Triggers:
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that are not searched, and those before that a match may save."""
         state = self._current_state(snapshot)
-        before = max((rule.before for rule in self._rules.values()), default=0)
+        before = max((rule.before + rule.hold for rule in self._rules.values()), default=0)
         reached = next(reversed(state.searched.values()), None)
         since = MIN_NS if reached is None else reached - before
         closed, _ = self._closed_bags(snapshot, state)

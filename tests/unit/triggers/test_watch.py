@@ -210,6 +210,19 @@ def test_age_deletes_nothing_that_a_rule_may_need(tmp_path: Path) -> None:
     assert [each.exists() for each in splits] == [False] * 4 + [True] * 6
 
 
+def test_a_match_that_takes_long_keeps_the_bags_in_which_it_began(tmp_path: Path) -> None:
+    lasting = rule(before=2 * S, hold=60 * S)
+    robot = watched(tmp_path, lasting, max_age_h=5 / 3600)
+    robot.begin(T0)
+    for begin in range(0, 100, 10):
+        robot.split(seconds(begin, begin + 10, range(20, 100)))
+        robot.clock.at = T0 + (begin + 10) * S
+        robot.look()
+    robot.close_all()
+    assert robot.spans() == [(18, 83)]
+    assert [len(moment.files) for moment in robot.moments()] == [8]
+
+
 def test_the_budget_deletes_it_and_that_is_said(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(before=3600 * S), max_bytes=10_000)
     robot.begin(T0)
