@@ -174,8 +174,10 @@ class FileNotes:
         return Path(self.file)
 
     def restore(self, summary: BagSummary) -> None:
-        """Sets the content of a closed file that was read earlier and has not changed."""
-        self.closing, self.summary = Closing.CLOSED, summary
+        """Sets the content of a file that was read earlier and has not changed."""
+        self.summary = summary
+        if summary.complete:  # else a recorder may still have it open
+            self.closing = Closing.CLOSED
 
     def update(self, stamp: Stamp, now: Ns) -> bool:
         """Notes a new stat result; returns whether the file has to be read again."""

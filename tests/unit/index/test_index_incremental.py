@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
@@ -152,6 +152,15 @@ class World:
 
 @settings(max_examples=examples(300))
 @given(script=st.lists(steps, max_size=40))
+@example(
+    script=[
+        ("open", "rec_1/a.mcap", 0),
+        ("beat", "./a.mcap", 0),
+        ("wait", "", WAITS_S.index(2.0)),
+        ("scan", "", 0),
+        ("beat", "./a.mcap", 1),
+    ]
+)
 def test_an_index_that_followed_every_change_knows_what_a_fresh_one_finds(
     script: list[tuple[str, str, int]],
 ) -> None:
