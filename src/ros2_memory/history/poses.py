@@ -178,7 +178,8 @@ class PoseReader:
         return [
             pair
             for pair in self._parallel
-            if pair.other == rows.recording and pair.span.overlaps(rows.first, rows.last)
+            if (pair.bags or pair.other == rows.recording)
+            and pair.span.overlaps(rows.first, rows.last)
         ]
 
     def poses(self, rows: Rows) -> Poses:

@@ -20,16 +20,17 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
+from ros2_memory.core.timebase import NS_PER_S, Ns, Span, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
     Overlapping,
+    mingled_bags,
     overlapping_recordings,
     recordings_of,
 )
-from ros2_memory.index.segment import TopicExtent
+from ros2_memory.index.segment import TopicExtent, wider
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = 
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
 _OWN: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings that the recorder of the bag directory made."""
+_MINGLED: Final[Key[Mapping[str, str]]] = Key()
+"""Of a call: by path, the recording of each loose bag beside bags of another recording."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: by path of a closed recording, the parent of each static frame."""
 SET_BACK: Final = "the clock was set back between recordings"
@@ -275,7 +278,7 @@ class ParallelRecordings(NamedTuple):
         by_clock: whether a clock that was set back explains it: between the two recordings (the
             span is the end of the first and the begin of the other, and less than half of each), or
             during one of them (the span is no longer than the step); or one recorder made both.
-        bags: the files of the other recording that overlap the first; empty for all.
+        bags: the files of the other recording that overlap the first; empty for all in its folder.
     """
 
     first: Path
@@ -429,11 +432,14 @@ class _TopicSpan(NamedTuple):
 
 def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields pairs of recordings that hold a topic at the same time in a window."""
-    recordings = dict(view.timeline.recordings(topic))
+    recordings = _recordings_with(view, topic)
     # A thinned day contains the bags of moments and rules of that day.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
     spans = [_TopicSpan(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
     steps = _steps_back(view)
+    loose_files: dict[str, list[str]] = defaultdict(list)
+    for file, recording in _mingled(view).items():
+        loose_files[recording].append(file)
     going_on: list[_TopicSpan] = []
     for later in sorted(spans):
         going_on = [earlier for earlier in going_on if earlier.last >= later.first]
@@ -448,17 +454,37 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
                     or span.stop - 1 - span.start <= step
                     or own.issuperset((earlier.path, later.path))
                 )
-                yield ParallelRecordings(earlier.path, later.path, span, by_clock)
+                bags = frozenset(loose_files.get(str(later.path), ()))
+                yield ParallelRecordings(earlier.path, later.path, span, by_clock, bags)
         going_on.append(later)
+
+
+def _recordings_with(view: View, topic: str) -> dict[Path, Span]:
+    """Returns the recordings that hold a topic, with its first and last log time in each."""
+    if not _mingled(view):
+        return dict(view.timeline.recordings(topic))
+    recordings: dict[Path, Span] = {}
+    for bag, first, last in view.timeline.extents(topic, TimeWindow.everything()):
+        path = _recording_of(view, bag)
+        recordings[path] = wider(recordings.get(path), (first, last))
+    return recordings
+
+
+def _recording_of(view: View, bag: BagFile) -> Path:
+    """Returns the recording of a bag: its folder, or its own name if it lies loose beside others."""
+    name = _mingled(view).get(bag.file)
+    return bag.recording if name is None else Path(name)
+
+
+def _mingled(view: View) -> Mapping[str, str]:
+    return view.memo.of(_MINGLED, lambda: mingled_bags(view.snapshot))
 
 
 def _has_bags_near(view: View, topic: str, recording: Path, span: TimeWindow) -> bool:
     """Whether a recording holds a topic near a span: a misdated one spans years without a bag."""
     segments = view.timeline.segments_in(span.widened(COPY_HORIZON_NS))
-    return any(
-        str(recording) in segment.bags.folders and recording in segment.recordings(topic)
-        for segment in segments
-    )
+    folders = recording, recording.parent  # a loose recording is in its parent's bags
+    return any(not segment.recordings(topic).keys().isdisjoint(folders) for segment in segments)
 
 
 def _is_short_edge(earlier: _TopicSpan, later: _TopicSpan) -> bool:
@@ -502,7 +528,8 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
     steps: dict[Path, Ns] = defaultdict(int)
     for fault in view.snapshot.dating.faults:
         if fault.kind is FaultyClock.SET_BACK:
-            steps[fault.bag.recording] = max(fault.by, steps[fault.bag.recording])
+            recording = _recording_of(view, fault.bag)
+            steps[recording] = max(fault.by, steps[recording])
     return steps
 
 
@@ -515,7 +542,9 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
         return False
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
-    first, other = ([extent for extent in near if extent.bag.recording == path] for path in pair)
+    first, other = (
+        [extent for extent in near if _recording_of(view, extent.bag) == path] for path in pair
+    )
     differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
         remembered[key] = differ

@@ -123,6 +123,21 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     return recordings
 
 
+def mingled_bags(snapshot: Snapshot) -> dict[str, str]:
+    """Returns by path the recording of each loose bag beside bags of another recording."""
+    loose = loose_bags(snapshot)
+    if not loose:
+        return loose
+    recordings: dict[str, set[str]] = {}
+    for bags in (segment.bags for segment in snapshot.timeline.recorded_segments):
+        for file in bags.files():
+            folder = file.rpartition("/")[0]
+            recordings.setdefault(folder, set()).add(loose.get(file, folder))
+    return {
+        file: name for file, name in loose.items() if len(recordings[file.rpartition("/")[0]]) > 1
+    }
+
+
 def is_named_after_folder(file: str) -> bool:
     """Returns whether a bag has the name of its folder and a number, or just a number."""
     folder, _, name = file.rpartition("/")

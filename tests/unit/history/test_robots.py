@@ -32,12 +32,13 @@ def mounted(parent: str, at: int = T0) -> Msg:
 MIXED = re.compile("as from several robots.*blue, red")
 
 
-@pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> Memory:
-    """The bags of two robots that drive at once, 10 m apart."""
+@pytest.fixture(scope="module", params=["{0}/{0}_0", "{0}", "{0}_0"])
+def both(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Memory:
+    """The bags of two robots that drive at once, 10 m apart: in a folder each, or in one."""
     folder = tmp_path_factory.mktemp("both")
     for number, robot in enumerate(("red", "blue")):
-        write_mcap(folder / robot / f"{robot}_0.mcap", drive(10.0 * number))
+        name = str(request.param).format(robot)
+        write_mcap(folder / f"{name}.mcap", drive(10.0 * number))
     return memory_of(folder)
 
 
@@ -130,6 +131,16 @@ def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robot
         asks = {"topic": "/chatter", "condition_type": "equals", "value": word}
         answer = asked(memory_of(tmp_path), "find_last_match", **asks)
         assert [note for note in answer["notes"] if MIXED.search(note)]
+
+
+def test_the_path_of_loose_bags_that_overlap_at_their_ends_is_that_of_the_first(
+    tmp_path: Path,
+) -> None:
+    for number, robot in enumerate(("red", "blue")):
+        write_mcap(tmp_path / f"{robot}.mcap", drive(10.0 * number, begin=55 * number))
+    answer = driven(memory_of(tmp_path), 0, 59)
+    assert any("the path there is that of red" in note for note in answer["notes"])
+    assert {point["x"] for point in answer["waypoints"]} == {0.0}
 
 
 @pytest.mark.parametrize("asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}])
