@@ -471,7 +471,7 @@ def _recordings_with(view: View, topic: str) -> dict[Path, Span]:
 
 
 def _recording_of(view: View, bag: BagFile) -> Path:
-    """Returns the recording of a bag: its folder, or its own name if it lies loose beside others."""
+    """Returns the recording of a bag: its folder, or its own name if it is loose beside others."""
     name = _mingled(view).get(bag.file)
     return bag.recording if name is None else Path(name)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -24,6 +24,12 @@ T = TypeVar("T")
 
 STOPPING: Final = "the server is stopping; ask again when it runs again"
 _NO_THREAD: Final = "the machine starts no more threads for the server; ask again later"
+_HANGING: Final = (
+    "every thread is still busy with a question whose time is over, as when a disk hangs: is it "
+    "reachable?"
+)
+_HANGING_WAIT_S: Final = 2.0
+"""Waited for a turn where all threads were left behind: a query that only is late ends sooner."""
 MOST_WAITING: Final = 256
 """Queries that may wait in one queue. Each holds its arguments in memory."""
 
@@ -49,6 +55,8 @@ class FairQueue:
         self._stopped = False
         self._waiting: list[_Turn] = []
         self._running: Counter[Hashable] = Counter()
+        self._left_behind: set[Future[object]] = set()
+        """The running queries for whose answers nobody waits any more."""
 
     @property
     def waiting(self) -> int:
@@ -71,9 +79,14 @@ class FairQueue:
         If the caller is cancelled, its query leaves the queue; a running query goes on.
 
         Raises:
-            BusyError: too many queries wait already, or the queue was stopped.
+            BusyError: too many queries wait already, all threads hang, or the queue was stopped.
         """
-        await self._wait_for_turn(client)
+        is_hanging = len(self._left_behind) == self._at_once
+        try:
+            async with asyncio.timeout(_HANGING_WAIT_S if is_hanging else None):
+                await self._wait_for_turn(client)
+        except TimeoutError:
+            raise BusyError(_HANGING) from None
         loop = asyncio.get_running_loop()
         try:
             running = self._threads.submit(contextvars.copy_context().run, query)
@@ -81,12 +94,21 @@ class FairQueue:
             self._release(client)
             raise BusyError(STOPPING if self._stopped else _NO_THREAD) from error
 
-        def release(_: object) -> None:
-            with suppress(RuntimeError):  # the loop has ended, and with it the queue
-                loop.call_soon_threadsafe(self._release, client)
+        def release() -> None:
+            self._left_behind.discard(running)
+            self._release(client)
 
-        running.add_done_callback(release)
-        return await asyncio.wrap_future(running)
+        def release_soon(_: object) -> None:
+            with suppress(RuntimeError):  # the loop has ended, and with it the queue
+                loop.call_soon_threadsafe(release)
+
+        running.add_done_callback(release_soon)
+        try:
+            return await asyncio.wrap_future(running)
+        except asyncio.CancelledError:
+            if not running.done():
+                self._left_behind.add(running)
+            raise
 
     async def _wait_for_turn(self, client: Hashable) -> None:
         """Waits for a free thread, and takes it."""

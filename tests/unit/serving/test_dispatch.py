@@ -284,6 +284,22 @@ async def test_a_call_that_waits_for_all_of_its_time_is_told_that_the_server_is_
     assert dispatcher.blocking.waiting == 0
 
 
+async def test_a_question_behind_a_hanging_disk_is_told_so_soon_and_answered_when_it_is_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ros2_memory.serving.fair_queue._HANGING_WAIT_S", 0.05)
+    held = Held()
+    dispatcher = served(tool("read", held.ask), timeout_s=0.2).dispatcher
+    async with anyio.create_task_group() as tasks:
+        for _ in range(2 * QUICK_AT_ONCE):
+            tasks.start_soon(dispatcher.answer, "read", {})
+    refused = json.loads((await dispatcher.answer("read", {})).text)
+    assert (refused["error"], "as when a disk hangs" in refused["detail"]) == ("busy", True)
+    held.released.set()
+    await until(lambda: dispatcher.quick.running == 0)
+    assert json.loads((await dispatcher.answer("read", {})).text)["value"] == QUICK_AT_ONCE + 1
+
+
 async def test_more_calls_than_may_wait_are_told_so() -> None:
     held = Held()
     dispatcher = served(tool("slow", held.ask, blocking=True)).dispatcher
