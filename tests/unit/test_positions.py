@@ -20,6 +20,7 @@ from tests.support.bags import (
     header,
     make,
     odom,
+    text,
     tf,
     transform,
     write_mcap,
@@ -286,3 +287,43 @@ def test_a_position_is_in_places_of_several_frames_the_smallest_first(tmp_path: 
     memory = memory_of(tmp_path, limits=QuerySettings(places=places))
     reply = asked(memory, "get_position_at", timestamp=T0_S + 1)
     assert (reply["in"], reply["also_in"]) == ("dock", ["pen", "yard"])
+
+
+def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_is_known(
+    tmp_path: Path,
+) -> None:
+    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
+    messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
+    messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
+    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    later = {"start": T0_S + 40, "end": T0_S + 59}
+    for tool, given in (
+        ("get_position_at", {"timestamp": T0_S + 50}),
+        ("trajectory_summary", later),
+    ):
+        answer = asked(memory, tool, frame_id="map", **given)
+        assert (answer["error"], answer["reason"]) == ("no_data", "outside_range")
+        assert answer["detail"].startswith("no transform leads to map from odom then: ")
+        assert f"at {T0_S + 19}" in answer["detail"]
+        answer = asked(memory, tool, frame_id="moon", **given)
+        assert answer["error"] == "invalid_arguments"
+    both = asked(memory, "get_position_at", timestamps=[T0_S + 10, T0_S + 50], frame_id="map")
+    assert [each.get("x", each.get("error")) for each in both["results"]] == [6.0, "no_data"]
+
+
+def test_a_match_stays_where_the_robot_is_not_known_in_the_frame_that_was_asked_for(
+    tmp_path: Path,
+) -> None:
+    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
+    messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
+    messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
+    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    said = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+    answer = asked(memory, "find_matches", frame_id="map", **said)
+    newest, oldest = answer["sightings"]
+    assert (newest["robot"], oldest["robot"]["x"]) == (None, 6.0)
+    assert "where the robot was is left out where no transform leads to map then" in answer["notes"]
+    around = asked(memory, "recap", around=T0_S + 50, frame_id="map")
+    assert "robot" not in around["state"]

@@ -46,7 +46,7 @@ from ros2_memory.insights.topic_events import (
     note_left_out,
     toggle_sentence,
 )
-from ros2_memory.places.pose_frames import newest_pose, pose_in_map, with_place
+from ros2_memory.places.pose_frames import newest_pose, pose_if_placed, with_place
 from ros2_memory.results import Before, PastChange
 
 if TYPE_CHECKING:
@@ -410,7 +410,7 @@ def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | No
     """Returns the robot's newest pose, in the map if transforms lead there, and its speed (m/s).
 
     Raises:
-        InvalidArgumentsError: no transform leads to `frame_id`.
+        InvalidArgumentsError: no transform leads to `frame_id` at any time.
     """
     try:
         newest = newest_pose(view, resolve_path_topic(view), TimeWindow.before(at, _POSE_NS))
@@ -424,7 +424,9 @@ def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | No
     if pose is None:
         return None, speed_mps
     recording = message.bag.recording
-    placed_pose = pose_in_map(view, pose, message.time, recording, frame_id)
+    placed_pose = pose_if_placed(view, pose, message.time, recording, frame_id)
+    if placed_pose is None:
+        return None, speed_mps
     return with_place(view, placed_pose, message.time, recording), speed_mps
 
 

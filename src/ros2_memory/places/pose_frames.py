@@ -125,14 +125,16 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     is a pose of the recording's session, if that has poses. None if there is no recent pose.
 
     Raises:
-        InvalidArgumentsError: no transform leads to `frame_id`.
+        InvalidArgumentsError: no transform leads to `frame_id` at any time.
     """
     window = TimeWindow.before(at, NEWEST_POSE_NS)
     topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
     stored, pose = newest_pose(view, topic, window, recording) or (None, None)
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
-    in_frame = pose_in_map(view, pose, stored.time, stored.bag.recording, frame_id)
+    in_frame = pose_if_placed(view, pose, stored.time, stored.bag.recording, frame_id)
+    if in_frame is None:
+        return None
     view.notes.add(*axes_of(in_frame.frame_id))
     return with_place(view, in_frame, stored.time, stored.bag.recording)
 
@@ -143,13 +145,43 @@ def pose_in_map(
     """Returns a pose in `frame_id`; without one, in the map if transforms lead there, else as is.
 
     Raises:
-        InvalidArgumentsError: no transform leads to `frame_id`.
+        InvalidArgumentsError: no transform leads to `frame_id` at any time.
+        NoDataError: none leads there at that time.
     """
     target = frame_id or view.limits.map_frame
     in_target = None if not target else pose_in(view, pose, target, time, recording)
     if in_target is None and frame_id is not None:
-        raise InvalidArgumentsError(_unreachable(frame_id, pose.frame_id))
+        _require_connected(view, frame_id, pose.frame_id)
+        _require_transform(view, frame_id, pose.frame_id, time, recording)
     return pose if in_target is None else in_target
+
+
+def pose_if_placed(
+    view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None
+) -> Pose | None:
+    """Returns a pose as `pose_in_map`; None, with a note, if none leads to `frame_id` then.
+
+    Raises:
+        InvalidArgumentsError: no transform leads to `frame_id` at any time.
+    """
+    try:
+        return pose_in_map(view, pose, time, recording, frame_id)
+    except NoDataError:
+        view.notes.add(f"{WHEREABOUTS} is left out where no transform leads to {frame_id} then")
+        return None
+
+
+def _require_connected(view: View, frame_id: str, own_frame: str) -> None:
+    """Checks that transforms lead from one frame to another at some time.
+
+    Raises:
+        InvalidArgumentsError: they never do.
+    """
+    if not (own_frame and connects(view, (frame_id, own_frame))):
+        raise InvalidArgumentsError(
+            f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
+            f"{own_frame or 'a pose without a frame'}"
+        )
 
 
 def placed_waypoints(
@@ -162,22 +194,21 @@ def placed_waypoints(
     frame are marked.
 
     Raises:
-        InvalidArgumentsError: no transform places any of them.
+        InvalidArgumentsError: no transform leads to `frame_id` at any time.
+        NoDataError: none leads there at the time of any of them.
         QueryTimeoutError: the call's time is over before it is known whether any leads there.
     """
     placed_ones: list[Waypoint] = []
-    known_to_lead = False
     for waypoint in waypoints:
         in_frame = _placed_waypoint(view, topic, waypoint, own_frame, frame_id)
         if in_frame is not None:
             placed_ones.append(in_frame)
-            continue
-        # Asked once, since looking for a frame that no transform leads to takes long.
-        known_to_lead = known_to_lead or bool(placed_ones) or connects(view, (frame_id, own_frame))
-        if not known_to_lead:
-            break
+        elif not placed_ones:
+            # Looking for a frame that no transform leads to takes long.
+            _require_connected(view, frame_id, own_frame)
     if waypoints and not placed_ones:
-        raise InvalidArgumentsError(_unreachable(frame_id, own_frame))
+        at = waypoints[0].time
+        _require_transform(view, frame_id, own_frame, at, recording_at(view, topic, at))
     if len(placed_ones) < len(waypoints):
         left_out = counted(len(waypoints) - len(placed_ones), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
@@ -233,11 +264,19 @@ def _with_jumps(view: View, waypoints: Sequence[Waypoint], frame_id: str) -> tup
     )
 
 
-def _unreachable(frame_id: str, own_frame: str) -> str:
-    return (
-        f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
-        f"{own_frame or 'a pose without a frame'} at that time"
-    )
+def _require_transform(
+    view: View, frame_id: str, own_frame: str, time: Ns, recording: Path | None
+) -> None:
+    """Checks that transforms lead from one frame to another at a time.
+
+    Raises:
+        NoDataError: they do not; it says when they are known.
+    """
+    try:
+        transform_at(view, frame_id, own_frame, time, recording)
+    except NoDataError as error:
+        why = f"no transform leads to {frame_id} from {own_frame} then: {error.detail}"
+        raise NoDataError(error.reason, why, error.notes) from error
 
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
