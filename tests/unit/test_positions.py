@@ -327,3 +327,21 @@ def test_a_match_stays_where_the_robot_is_not_known_in_the_frame_that_was_asked_
     assert "where the robot was is left out where no transform leads to map then" in answer["notes"]
     around = asked(memory, "recap", around=T0_S + 50, frame_id="map")
     assert "robot" not in around["state"]
+
+
+def test_coordinates_beside_a_place_are_in_its_frame_in_compare_as_in_visits(
+    tmp_path: Path,
+) -> None:
+    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(120)]
+    messages += [
+        tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (50, 0, 0))) for n in range(120)
+    ]
+    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
+    den = Place("den", "odom", Circle(9.0, 0.0, 0.5))
+    memory = memory_of(tmp_path, limits=QuerySettings(places=(den,)))
+    where = {"den": "den", "spot": {"x": 3.0, "y": 0.0, "radius_m": 1.0}}
+    first = {"start": T0_S, "end": T0_S + 59}
+    second = {"with_start": T0_S + 60, "with_end": T0_S + 119}
+    [visit] = asked(memory, "visits", where=where, **first)["visits"]
+    minutes = asked(memory, "compare", where=where, **first, **second)["minutes"]
+    assert minutes["spot"] == {"this": pytest.approx(visit["duration_s"] / 60, abs=0.01), "with": 0}

@@ -478,19 +478,15 @@ def _minutes_in_places(
     for window, drive in zip(windows, drives, strict=True):
         if where is None:
             tracks = places_in(view, places, placement, window)
-            asked = [(place.name, place.region, track) for place, track in tracks]
         else:
-            frame = placement.frame_id
-            asked = [
-                (place.title, place.region, known_track(view, place.frame_id or frame, window))
-                for place in where.each
-            ]
+            asked = where.places(placement.frame_id)
+            tracks = [(place, known_track(view, place.frame_id, window)) for place in asked]
         minutes: dict[str, float | None] = {}
-        for name, region, track in asked:
-            lasted = drive.elapsed.among(stay.span for stay in track.inside(region, window))
-            minutes[name] = unix_from_ns(lasted) / 60 if track.reaches(window) else None
-            if minutes[name]:
-                visited.add(name)
+        for place, track in tracks:
+            lasted = drive.elapsed.among(stay.span for stay in track.inside(place.region, window))
+            minutes[place.name] = unix_from_ns(lasted) / 60 if track.reaches(window) else None
+            if minutes[place.name]:
+                visited.add(place.name)
         minutes_of_windows.append(minutes)
     return [
         {name: lasted for name, lasted in minutes.items() if name in visited}
