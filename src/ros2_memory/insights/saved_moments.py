@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, TRIGGERS_FILE
 from ros2_memory.bag_dir.moment_file import Outcome, PendingRequest, StoredMoment, stored_moments_in
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
@@ -102,20 +102,21 @@ def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
     """
     with _refuse_unreadable():
         stored = _moments_of(memory)
+    with _refuse_unreadable(TRIGGERS_FILE):
         rules = fired_rules(memory.index.bag_dir)
     stored.sort(key=lambda saved: (saved.moment.request.end, saved.folder.name), reverse=True)
     return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
 
 
 @contextmanager
-def _refuse_unreadable() -> Iterator[None]:
-    """Raises `RefusedError` in place of an `OSError`."""
+def _refuse_unreadable(name: str = f"{MOMENTS_FOLDER}/") -> Iterator[None]:
+    """Raises `RefusedError`, which names a path in the bag directory, in place of an `OSError`."""
     try:
         yield
     except OSError as error:
         raise RefusedError(
             f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
-            "to read moments/ of the bag directory"
+            f"to read {name} of the bag directory"
         ) from error
 
 

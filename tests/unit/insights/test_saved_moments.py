@@ -212,6 +212,17 @@ def test_a_status_says_that_moments_cannot_be_listed(
         list_moments(memory_of(tmp_path), Call())
 
 
+def test_the_file_that_keeps_moments_from_being_listed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_self: object, _bag_dir: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(type(TRIGGERS), "read", refused)
+    with pytest.raises(RefusedError, match=r"be allowed to read \.episodic/triggers\.json of"):
+        list_moments(memory_of(tmp_path), Call())
+
+
 def test_a_file_in_the_place_of_the_folder_holds_no_moment(tmp_path: Path) -> None:
     (tmp_path / MOMENTS_FOLDER).write_text("no folder")
     assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
