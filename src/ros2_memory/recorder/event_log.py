@@ -37,9 +37,9 @@ class EventLog:
     """Logs events of the recorder, and remembers the newest fault.
 
     Attributes:
-        last_error: the newest fault, as a sentence.
+        last_error: the newest fault, as a sentence; while others last, the newest of these.
         last_error_at: when it was logged (wall time).
-        recovered: whether recording has gone on since then.
+        recovered: whether recording has gone on since then, and no fault lasts.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -47,8 +47,8 @@ class EventLog:
         self.last_error: str | None = None
         self.last_error_at: Ns | None = None
         self.recovered = False
-        self._lasting: tuple[str, str] | None = None
-        self._unresolved: set[tuple[str, str]] = set()
+        self._unresolved: dict[tuple[str, str], tuple[str, Ns]] = {}
+        """The faults that last, by event and subject: the sentence, and when it was logged."""
         self._said: set[tuple[str, str]] = set()
 
     def info(self, event: str, **values: object) -> None:
@@ -72,11 +72,10 @@ class EventLog:
     def lasting(self, event: str, subject: str, fault: str | None, **values: object) -> None:
         """Logs a fault of a subject as `fail` does, once until the fault is None."""
         if fault is None:
-            self._unresolved.discard((event, subject))
+            self._unresolved.pop((event, subject), None)
         elif (event, subject) not in self._unresolved:
-            self._unresolved.add((event, subject))
+            self._unresolved[event, subject] = fault, self._clock.now()
             self.fail(event, fault, **values)
-            self._lasting = (event, subject)
 
     @contextmanager
     def lasting_if_refused(self, event: str, subject: str, **values: object) -> Iterator[None]:
@@ -89,20 +88,22 @@ class EventLog:
             self.lasting(event, subject, None)
 
     def note_recording(self) -> None:
-        """Notes that recording goes on: the newest fault is over, unless it lasts."""
-        self.recovered = self.last_error is not None and self._lasting not in self._unresolved
+        """Notes that recording goes on: the faults that do not last are over."""
+        if self._unresolved:
+            self.last_error, self.last_error_at = [*self._unresolved.values()][-1]
+        self.recovered = self.last_error is not None and not self._unresolved
 
     def note_end(self, recording: str) -> None:
         """Notes that a recording has ended: its lasting faults are over."""
         self._unresolved = {
-            (event, subject)
-            for event, subject in self._unresolved
+            (event, subject): fault
+            for (event, subject), fault in self._unresolved.items()
             if subject.partition("/")[0] != recording
         }
 
     def _note_error(self, sentence: str) -> None:
         self.last_error, self.last_error_at = sentence, self._clock.now()
-        self.recovered, self._lasting = False, None
+        self.recovered = False
 
     def report_faults(self, faults: Mapping[str, str]) -> None:
         """Logs each failing task of the housekeeper, once until it succeeds."""

@@ -202,6 +202,21 @@ class TestFailingDisk:
         assert named_meanwhile(*unread) == sentences
         assert named_meanwhile(unread[1]) == []
 
+    def test_the_heartbeat_has_recovered_when_no_split_is_unreadable_any_more(
+        self, world: World
+    ) -> None:
+        world.run(10)
+        directory = world.recorders[0].directory
+        unread = [directory / f"{directory.name}_{number}.mcap" for number in (4, 5)]
+        for paths, fault in ((unread, unread[1]), (unread[:1], unread[0])):
+            with broken(world.reader, "closing", errno.EACCES, where=paths.__contains__):
+                world.run(20)
+            beat = world.heartbeat()
+            assert beat["last_error"] == f"{fault}: Permission denied"
+            assert beat["recovered"] is False
+        world.run(20)
+        assert world.heartbeat()["recovered"] is True
+
     def test_one_task_that_fails_keeps_no_other_from_being_done(self, world: World) -> None:
         with broken(world.recorders[0], "take_lines", errno.EIO):
             [reported] = world.logged(30, "supervision_failed")
