@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 from collections import Counter
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -55,7 +55,7 @@ class FairQueue:
         self._stopped = False
         self._waiting: list[_Turn] = []
         self._running: Counter[Hashable] = Counter()
-        self._left_behind: set[Future[object]] = set()
+        self._left_behind: set[object] = set()
         """The running queries for whose answers nobody waits any more."""
 
     @property
