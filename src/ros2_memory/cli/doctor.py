@@ -142,12 +142,12 @@ def doctor(as_json: AsJson = False, *, bags: Bags) -> int:
 
 
 def _examine(bags: Bags) -> Iterator[Finding]:
-    """Yields all findings; a refused configuration is the only one."""
+    """Yields all findings; a refused configuration, or recording, is the only one."""
     try:
         settings = bags.settings()
         robots = settings.fleet.robots
         memory = open_memory(settings, verbose=bags.verbose, allows_fleet=True)
-    except ConfigError as refused:
+    except EpisodicError as refused:
         yield Finding(Level.ERROR, "config", str(refused), _CORRECT)
         return
     yield Finding(Level.OK, "config", f"files in use: {', '.join(files_in_use(settings))}")
@@ -187,7 +187,7 @@ def _examine_robot(name: str, fleet: Settings, *, verbose: bool) -> Iterator[Fin
     """Yields what is wrong with a robot of the fleet, and how many of its bags are readable."""
     try:
         own, memory = open_robot(fleet, name, verbose=verbose)
-    except ConfigError as refused:
+    except EpisodicError as refused:
         yield Finding(Level.ERROR, "robot", f"{name}: {refused}", _CORRECT)
         return
     snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir

@@ -113,6 +113,11 @@ def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
     assert f"MEMORY_CONFIG_DIR={beside}" in output
 
 
+def test_a_recording_that_is_not_there_is_a_finding(robot: Path, examined: Examined) -> None:
+    [found] = examined(2, "data.recording=typo")["config"]
+    assert "no bag is named typo (data.recording)" in found["seen"]
+
+
 def test_data_from_the_future_means_that_the_clock_is_wrong(
     robot: Path, examined: Examined
 ) -> None:
