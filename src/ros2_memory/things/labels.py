@@ -43,6 +43,25 @@ _IRREGULAR: Final = {
     "movies": "movie",
     **{word: word for word in ("gas", "canvas", "atlas", "christmas", "chaos", "thermos", "lens")},
 }
+_NO_SINGULARS: Final = (
+    "binoculars",
+    "clothes",
+    "earphones",
+    "goggles",
+    "headphones",
+    "jeans",
+    "leggings",
+    "pants",
+    "pliers",
+    "scissors",
+    "shears",
+    "shorts",
+    "sunglasses",
+    "tongs",
+    "trousers",
+    "tweezers",
+)
+"""Names of one thing in the plural: nobody asks for a scissor."""
 _MOVES_BY_ITSELF: Final = frozenset(
     {
         "person",
@@ -98,6 +117,15 @@ def _singular(word: str) -> str:
     return word
 
 
+_PLURALS: Final = {_singular(word): word for word in _NO_SINGULARS}
+
+
+def _key_of(label: str) -> str:
+    """Returns a label as `singular`, but in the plural if that names one thing."""
+    before, space, word = singular(label).rpartition(" ")
+    return before + space + _PLURALS.get(word, word)
+
+
 class Labels:
     """Maps labels as detectors write them to keys, which are equal for equal things.
 
@@ -109,14 +137,14 @@ class Labels:
         self._keys: dict[str, str] = {}
         self._shown: dict[str, str] = {}
         for name, variants in spellings.items():
-            key = singular(name)
+            key = _key_of(name)
             self._shown[key] = name
             for spelling in (name, *variants):
-                self._keys[singular(spelling)] = key
+                self._keys[_key_of(spelling)] = key
 
     def key(self, label: str) -> str:
         """Returns the key of a label as a detector writes it."""
-        plain_key = singular(shortened(label, MAX_LABEL_CHARS))
+        plain_key = _key_of(shortened(label, MAX_LABEL_CHARS))
         return self._keys.get(plain_key, plain_key)
 
     def are_apart(self, one: str, other: str) -> bool:

@@ -22,6 +22,7 @@ from ros2_memory.columns.units import GoneError
 from ros2_memory.lake import shipper as shipper_module
 from ros2_memory.lake.rows import RowMaker, sha256_of
 from ros2_memory.lake.tables import TABLES
+from tests.support.bags import detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import START_S
 from tests.support.lakes import (
@@ -130,6 +131,14 @@ def test_columns_that_another_program_deletes_or_damages_keep_no_bag_from_being_
     spared = "rec/rec_0.mcap"
     done = ship(tmp_path / "always", [robot], most_bags=100)
     assert (done.bags, len(done.problems)) == (BAGS - 1, 1)
+
+
+def test_a_thing_has_the_name_by_which_people_ask_for_it(tmp_path: Path) -> None:
+    seen = detections(START_S * 10**9, ["Scissors", "safety_goggles", "cups"])
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", [seen])
+    ship_from(tmp_path)
+    things = {row["thing"] for row in lake_rows(tmp_path / "lake", "sightings")}
+    assert things == {"scissors", "safety goggles", "cup"}
 
 
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(

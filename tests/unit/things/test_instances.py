@@ -164,6 +164,7 @@ def test_labels_without_a_place_are_compared_with_none_and_take_no_more_memory_e
         ("cookie", "Cookies"),
         ("bus", "buses"),
         ("caf\u00e9", "cafe\u0301"),
+        ("scissors", "Scissor"),
     ],
 )
 def test_case_spacing_and_a_plural_do_not_matter(one: str, other: str) -> None:
