@@ -62,10 +62,10 @@ _STATUS = ToolDeclaration(
 )
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits", drawn=True),),
-    "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
-    "{map_frame} if transforms lead there, else {pose_topic}'s; without one, "
+    "When, how long, how often the robot was in a place (where, or near x, y), newest first, in "
+    "{map_frame} if known, else {pose_topic}'s; without one, "
     "all named. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
-    "closest_m, ago_s}}], total, minutes, unknown_s}} or "
+    "ago_s}}], total, entries (seen to begin), exits, minutes, unknown_s}} or "
     "{{places: [{{place, minutes, entries}}]}}.",
     VisitsArguments,
     visits,
