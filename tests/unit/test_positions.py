@@ -17,6 +17,8 @@ from ros2_memory.places.local_map import fixes_in
 from ros2_memory.serving.page.drawn_path import Box, line_in_box
 from tests.support.bags import (
     Msg,
+    boolean,
+    detections,
     header,
     make,
     odom,
@@ -287,6 +289,24 @@ def test_a_position_is_in_places_of_several_frames_the_smallest_first(tmp_path: 
     memory = memory_of(tmp_path, limits=QuerySettings(places=places))
     reply = asked(memory, "get_position_at", timestamp=T0_S + 1)
     assert (reply["in"], reply["also_in"]) == ("dock", ["pen", "yard"])
+
+
+def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_path: Path) -> None:
+    placed = [tf(T0, transform(T0, "map", "odom", (10.0, 0.0, 0.0)), topic="/tf_static")]
+    messages = [*placed, detections(T0 + 30 * S, ["cup"], at=(0.1, 0.0, 0.0))]
+    for n in range(60):
+        at = T0 + n * S
+        body = transform(at, "odom", "base_link", (3.0, 0.0, 0.0))
+        messages += [odom(at, 3.0, 0.0), tf(at, body), boolean(at, n == 30)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    places = (Place("pen", "odom", Circle(3.0, 0.0, 1.0)), Place("yard", "map", Circle(13, 0, 9)))
+    memory = memory_of(tmp_path, limits=QuerySettings(places=places))
+    events = asked(memory, "recap", start=T0_S, end=T0_S + 59)["events"]
+    assert len(events) >= 3
+    seen = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
+    [cup] = asked(memory, "find_matches", **seen)["sightings"]
+    for at in (*(event for event in events if "in" in event), cup["place"]):
+        assert (at["in"], at["also_in"]) == ("pen", ["yard"])
 
 
 def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_is_known(

@@ -20,7 +20,6 @@ from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
-from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
@@ -43,7 +42,7 @@ from ros2_memory.insights.sighting_search import Run, SearchedRuns, find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.insights.topic_events import GoalRun, goals_matching
 from ros2_memory.messages.detections import Detection, detections_of
-from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
+from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at, with_place
 from ros2_memory.places.where import Scope, WhileCondition
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 from ros2_memory.things.unseen import notes_on_never
@@ -620,7 +619,7 @@ def _place_of_detection(
         if placed is not None:
             position, frame = placed.position, target
             break
-    inside = places_at(view.limits.places, frame, *position[:2])
+    inside = with_place(view, seen, time, message.bag.recording).places
     return LabelledPlace(thing.label, position, frame, inside)
 
 

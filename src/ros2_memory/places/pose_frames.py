@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from heapq import merge
 from typing import TYPE_CHECKING, Final
@@ -29,7 +29,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.regions import Place, names_by_size, places_at
+from ros2_memory.core.regions import Place, names_by_size
 from ros2_memory.core.spans import Spans, spans_of, without
 from ros2_memory.core.text import abbreviate, counted
 from ros2_memory.core.timebase import MIN_NS, Ns
@@ -476,6 +476,7 @@ class RobotPlaces:
         frame_id: the frame of positions: the one that was asked for, or else `map_frame`.
         pose_frame: the frame of the poses.
         map_frame: the frame of places: the map if transforms lead there, else `pose_frame`.
+        frames: all frames in which positions are known.
     """
 
     view: View
@@ -483,6 +484,8 @@ class RobotPlaces:
     frame_id: str
     pose_frame: str
     map_frame: str
+    frames: tuple[str, ...]
+    _tracks: dict[str, RobotTrack] = field(default_factory=dict)
 
     def at(self, time: Ns) -> tuple[float, float] | None:
         """Returns where the robot was (x, y in m) in the map frame.
@@ -491,45 +494,55 @@ class RobotPlaces:
         """
         if self.frame_id != self.map_frame:
             return None
-        return place_at(self._track, time, SILENCE_NS)
+        return self._place_at(time, self.map_frame)
 
     def standstill_time(self, start: Ns, end: Ns) -> Ns:
         """Returns the time that shows where the robot stood.
 
         The middle of the standstill, or its start if the map jumps meanwhile.
         """
-        first, last = np.searchsorted(self._track.times, (start, end)).tolist()
+        times = self._track_in(self.map_frame).times
+        first, last = np.searchsorted(times, (start, end)).tolist()
         return start if self._jumps[max(first - 1, 0) : last].any() else (start + end) // 2
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the names of the places that the robot was in, the smallest place first."""
-        places = self.view.limits.places
-        if not any(place.frame_id == self.map_frame for place in places):
-            return ()
-        point = place_at(self._track, time, SILENCE_NS)
-        return () if point is None else places_at(places, self.map_frame, *point)
+        inside: list[Place] = []
+        for place in self.view.limits.places:
+            if place.frame_id in self.frames:
+                point = self._place_at(time, place.frame_id)
+                if point is not None and place.region.contains(*point):
+                    inside.append(place)
+        return names_by_size(inside)
 
     @cached_property
     def _jumps(self) -> Flags:
-        return jumps(self._track)
+        return jumps(self._track_in(self.map_frame))
 
-    @cached_property
-    def _track(self) -> RobotTrack:
+    def _place_at(self, time: Ns, frame_id: str) -> tuple[float, float] | None:
+        return place_at(self._track_in(frame_id), time, SILENCE_NS)
+
+    def _track_in(self, frame_id: str) -> RobotTrack:
+        if frame_id not in self._tracks:
+            self._tracks[frame_id] = self._read_track(frame_id)
+        return self._tracks[frame_id]
+
+    def _read_track(self, frame_id: str) -> RobotTrack:
         try:
-            known = TrackReader(self.view, self.map_frame).track_in(self.window)
-            note_runs(self.view, resolve_path_topic(self.view), self.map_frame, self.window)
+            known = TrackReader(self.view, frame_id).track_in(self.window)
+            note_runs(self.view, resolve_path_topic(self.view), frame_id, self.window)
         except QueryTimeoutError:
             # If the whole call is out of time, not reading alone, it fails here.
             self.view.bags.check_deadline()
-            self._note_reach("not known")
+            self._note_reach(frame_id, "not known")
             return empty_track()
         if known.since is not None:
-            self._note_reach(f"known back to {unix_text(known.since)} alone")
+            self._note_reach(frame_id, f"known back to {unix_text(known.since)} alone")
         return known.track
 
-    def _note_reach(self, reach: str) -> None:
+    def _note_reach(self, frame_id: str, reach: str) -> None:
         self.view.notes.add(
-            f"where the robot was in {self.map_frame} is {reach}: reading the bags that are not "
+            f"where the robot was in {frame_id} is {reach}: reading the bags that are not "
             "stored takes too long"
         )
 
@@ -544,4 +557,4 @@ def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) ->
     if usual is None:
         return None
     asked = usual if frame_id is None else map_placement(view, resolve_path_topic(view), frame_id)
-    return RobotPlaces(view, window, asked.frame_id, usual.pose_frame, usual.frame_id)
+    return RobotPlaces(view, window, asked.frame_id, usual.pose_frame, usual.frame_id, usual.frames)
