@@ -173,6 +173,8 @@ class GarbageCollector:
         )
         self._carried_since: dict[str, float] = {}
         self._reported: set[str] = set()
+        self._not_deleted: set[str] = set()
+        """Bags whose deletion failed after it was written down."""
         self.emptied: set[Path] = set()
         self._unwritten: list[Deleted] = []
 
@@ -357,8 +359,9 @@ class GarbageCollector:
         """Writes down what is deleted, and deletes it. A full disk does not stop deletion."""
         splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
         for bag in going:
-            name = self.own.name_of(bag.recording)
-            splits[name].append((bare_name(bag.path), bag.start, bag.end))
+            if bag.path not in self._not_deleted:
+                name = self.own.name_of(bag.recording)
+                splits[name].append((bare_name(bag.path), bag.start, bag.end))
         self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
         self._append_unwritten()
         for bag in going:
@@ -388,10 +391,12 @@ class GarbageCollector:
             except FileNotFoundError:
                 continue
             except OSError as error:
+                self._not_deleted.add(bag.path)
                 self._keep_failed(bag, str(error), run)
                 return
             if path not in run.saved:
                 size += freed
+        self._not_deleted.discard(bag.path)
         self._reported.discard(bag.path)
         self._carried_since.pop(bag.path, None)
         run.deleted.add(bag.path)

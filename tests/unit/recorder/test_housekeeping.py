@@ -13,6 +13,7 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import (
+    DELETED,
     Loss,
     Receipt,
     append_losses,
@@ -235,6 +236,17 @@ class TestDeletionsThatFail:
         assert "busy" in reported["reason"]
         assert "b/b_0.mcap" not in files_in(tmp_path)
         assert size_of(tmp_path) <= 45_000
+
+    def test_are_written_down_once(self, tmp_path: Path) -> None:
+        stuck = bag(tmp_path / "a/a_0.mcap", 0)
+        recording(tmp_path, "b", 7200)
+        keeper = keeper_of(tmp_path, max_age_h=1)
+        with broken(collect, "remove_bag", errno.EBUSY, where=lambda _, path, *__: path == stuck):
+            for _ in range(3):
+                keeper.apply()
+        assert [row.files for row in DELETED.rows(tmp_path)] == [(stuck.name,)]
+        keeper.apply()
+        assert not stuck.exists()
 
     def test_the_budget_names_what_takes_it_in_the_log_and_to_who_asks(
         self, tmp_path: Path
