@@ -482,12 +482,12 @@ class CandidateRows:
 
 def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
     """Notes if long arrays at or below some fields are only summarised in messages of a window."""
-    newest = view.stream.last(topic)
-    if newest is None:
-        return
-    value = view.value(newest)
-    paths = (view.extractor.own_path(field, newest.type) for field in fields)
     try:
+        newest = view.stream.last(topic)
+        if newest is None:
+            return
+        value = view.value(newest)
+        paths = (view.extractor.own_path(field, newest.type) for field in fields)
         for condition in chain.from_iterable(summary_conditions(path, value) for path in paths):
             candidates = CandidateRows(view, [topic], condition, window).messages()
             long = next((one for one in candidates if condition.matches(view.value(one))), None)

@@ -114,6 +114,23 @@ def test_numbers_of_a_call_that_runs_out_of_time_are_of_all_that_was_counted(
     assert max(sizes) == len(CHARGES)
 
 
+def test_no_number_is_lost_where_time_runs_out_after_all_are_counted(tmp_path: Path) -> None:
+    write(tmp_path, CHARGES[:20], split=10)
+    memory = memory_of(tmp_path, limits=LATEST)
+    counted = [0]
+    for looks in range(1, 30):
+        with suppress(QueryTimeoutError):
+            call = Call(deadline=limited(looks))
+            answer = count_range(
+                memory, call, "/battery_state", span(), "hour", fields=["percentage"]
+            )
+            counted.append(int(cells(answer, "count")[-1] or 0))
+            continue
+        assert counted[-1] == 0, looks
+    assert counted == sorted(counted)
+    assert counted[-1] == 20
+
+
 def test_no_number_is_lost_where_time_runs_out_while_a_table_is_counted(tmp_path: Path) -> None:
     """The columns lack the field, so that bags are read as each table is counted."""
     write(tmp_path, CHARGES[::2], split=60)
