@@ -702,7 +702,7 @@ def load_explained(
         ConfigError: as `load_settings`.
     """
     given = given_variables(os.environ if env is None else env)
-    folder = config_dir(given)
+    folder, beside = config_dir(given), _working_dir() / "config"
     appended = {}
     if INTERFACES_VARIABLE in given:
         appended["reader.custom_msg_paths"] = INTERFACES_VARIABLE
@@ -715,9 +715,21 @@ def load_explained(
         _append_interface_folder(composed, given)
         data = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
     # The user's own files win over the shipped ones, unless the user chose a folder.
-    folders = [folder] if "MEMORY_CONFIG_DIR" in given else [Path("config").absolute(), folder]
+    folders = [folder] if "MEMORY_CONFIG_DIR" in given else [beside, folder]
     settings = validated(Settings, data, config_dirs=folders, source=sources, adapters=_NODES)
     return settings, sources
+
+
+def _working_dir() -> Path:
+    """Returns the working directory.
+
+    Raises:
+        ConfigError: it has been deleted.
+    """
+    try:
+        return Path.cwd()
+    except FileNotFoundError:
+        raise ConfigError("the working directory has been deleted; change to another") from None
 
 
 def is_deployment_chosen(overrides: Sequence[str]) -> bool:

@@ -108,7 +108,9 @@ class Sources:
 
 def quoted(value: str) -> str:
     """Returns a text as a value in Hydra's grammar, with any characters."""
-    return str(QuotedString(text=value, quote=Quote.single).with_quotes())
+    # A backslash keeps OmegaConf from expanding ${...}; those before it are then doubled.
+    literal = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
+    return str(QuotedString(text=literal, quote=Quote.single).with_quotes())
 
 
 def _whole_number(value: str) -> str:

@@ -1,6 +1,11 @@
-"""Where the programs begin: Ctrl-C while one imports its modules ends it without a traceback."""
+"""Where the programs begin: Ctrl-C while one imports its modules ends it without a traceback.
 
+Each finds stdin, stdout and stderr open, also where its caller has closed them.
+"""
+
+import os
 import signal
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from typing import cast
@@ -23,6 +28,7 @@ def server() -> int:
 
 def _load(module: str, name: str) -> Callable[[], int]:
     """Imports the main function of a program; Ctrl-C meanwhile ends the process by its signal."""
+    _open_closed_streams()
     # In background jobs of a shell the signal is ignored, and stays so.
     is_ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_ours:
@@ -31,3 +37,13 @@ def _load(module: str, name: str) -> Callable[[], int]:
     if is_ours:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     return main
+
+
+def _open_closed_streams() -> None:
+    """Opens /dev/null as stdin, stdout and stderr where these are closed, as by `2>&-`.
+
+    Python has None in their place, and the next file that is opened would get their number.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.open(os.devnull, os.O_RDWR), mode))  # noqa: PTH123, SIM115

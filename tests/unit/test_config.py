@@ -20,7 +20,7 @@ from ros2_memory.config import (
     load_settings,
     plain_values,
 )
-from ros2_memory.config_sources import Sources
+from ros2_memory.config_sources import Sources, quoted
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.reply import JsonObject
 from tests.support.examples import examples
@@ -100,6 +100,19 @@ class TestEnvironment:
         else:
             settings = load_settings((), {"MEMORY_BAG_DIR": f"/bags/{name}"})
             assert settings.recording.bag_dir == Path(f"/bags/{name}")
+
+    @given(st.lists(PATH_CHARACTERS | st.just("${b}"), min_size=1).map("".join))
+    def test_any_path_of_a_command_arrives_as_it_was_written(self, name: str) -> None:
+        settings = load_settings([f"recording.bag_dir={quoted(f'/bags/{name}')}"], {})
+        assert settings.recording.bag_dir == Path(f"/bags/{name}")
+
+    def test_a_working_directory_that_was_deleted_is_named(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "gone").mkdir()
+        monkeypatch.chdir(tmp_path / "gone")
+        (tmp_path / "gone").rmdir()
+        assert "the working directory has been deleted" in refusal()
 
     def test_an_empty_variable_counts_as_unset(self) -> None:
         names = ("MCP_PORT", "MEMORY_BAG_DIR", "MEMORY_DEPLOYMENT", "MEMORY_CONFIG_DIR")

@@ -215,7 +215,8 @@ def _is_path(word: str) -> bool:
 
 def is_folder(word: str) -> bool:
     """Returns whether a word is the path of a bag or a folder that exists, and not JSON."""
-    return "=" not in word and _exists(word)
+    key, equals, _ = word.partition("=")
+    return (not equals or "/" in key) and _exists(word)
 
 
 def _exists(word: str) -> bool:

@@ -49,6 +49,8 @@ _MAX_FLATTENED_KEYS: Final = 8
 _MAX_COLUMNS: Final = 9
 _MOST_ROWS: Final = 10
 """Rows of a list that people are shown; --json prints all."""
+_LEAST_WIDTH: Final = 20
+"""With fewer columns (COLUMNS is 0 on some serial lines) tables would be empty."""
 _ENDLESS: Final = 10_000
 """Characters of a terminal that is wide enough for any table."""
 _TIME_OF_DAY_WIDTH: Final = 15
@@ -133,6 +135,7 @@ def stdout_console() -> Console:
     console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _PIPE_WIDTH
+    console.width = max(console.width, _LEAST_WIDTH)
     return console
 
 

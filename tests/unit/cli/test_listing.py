@@ -320,6 +320,15 @@ def test_tools_take_a_path_before_them_and_times_in_words(exits: Program) -> Non
     assert reply["end"] - reply["start"] >= 23 * 3600
 
 
+def test_a_folder_whose_name_has_an_equals_sign_is_no_argument(
+    folder: Path, exits: Program
+) -> None:
+    shutil.copytree(folder / "b", folder / "robot=7" / "b")
+    asked = "ask get_position_seconds_ago seconds_ago=0 --json"
+    for path in (folder / "robot=7", "./robot=7"):
+        assert exits(0, asked, path).json["y"] == 3.0
+
+
 @pytest.mark.usefixtures("folder")
 def test_a_window_of_a_day_or_a_minute_in_words_is_all_of_it(exits: Program) -> None:
     minute = datetime.fromtimestamp(T0 / NS_PER_S + 100).astimezone().strftime("%H:%M")

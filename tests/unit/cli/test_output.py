@@ -113,3 +113,11 @@ def test_in_a_narrow_terminal_moments_are_broken_and_wide_rows_stand_one_below_t
     row: JsonValue = {f"a_key_with_a_long_name_{n}": n for n in range(6)}
     assert shown([row, row]).count("a_key_with_a_long_name_5  5") == 2
     assert shown([row, row], width=200).count("a_key_with_a_long_name_5") == 1
+
+
+def test_a_serial_line_of_no_columns_shows_tables_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "0")
+    print_reply([{"topic": "/odom", "count": 5}])
+    assert "/odom" in capsys.readouterr().out
