@@ -26,10 +26,14 @@ PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
 
 
 def environment(scratch: Path) -> dict[str, str]:
-    """Ours, with temporary folders where the test sees them, and settings that must not count."""
+    """Ours, with temporary folders where the test sees them, and settings that must not count.
+
+    The proxy is one of an office, which nobody reaches here.
+    """
     folders = {"TMPDIR": str(scratch), "XDG_CACHE_HOME": str(scratch / "cache")}
     wrong = ("MEMORY_DEPLOYMENT", "MEMORY_CONFIG_DIR", "ROS_VISION_INTERFACES_PATH")
-    return {**os.environ, **folders, **dict.fromkeys(wrong, "no-such-thing")}
+    proxies = dict.fromkeys(("HTTP_PROXY", "ALL_PROXY"), "http://127.0.0.1:9")
+    return {**os.environ, **folders, **proxies, **dict.fromkeys(wrong, "no-such-thing")}
 
 
 @contextmanager

@@ -4,6 +4,7 @@ A command's module is imported when the command is run, so that `--help` and she
 wait for the libraries of all of them.
 """
 
+import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -253,8 +254,10 @@ def demo(
     """
     # Imported here, so that no other command waits for the demo's libraries.
     from ros2_memory.cli.output import print_line  # noqa: PLC0415
-    from ros2_memory.demo.run import run_demo  # noqa: PLC0415
+    from ros2_memory.demo.run import HOST, run_demo  # noqa: PLC0415
 
+    # A proxy that the environment names would not reach the server, which is on this machine.
+    os.environ["no_proxy"] = HOST
     return run_demo(
         print_line,
         once=once,
