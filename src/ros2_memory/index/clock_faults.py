@@ -9,7 +9,7 @@ them; but the span of the memory, and its newest moment, are computed without th
     set back by a day    the side of the step with fewer bags is wrong; of equals the earlier one
 
 A clock that was set back by less is listed and leaves the span as it is. If this machine's own
-clock is before 2017, no date counts as being in the future.
+clock is before 2017, no date counts as being in the future, and a note says so.
 """
 
 from __future__ import annotations
@@ -173,6 +173,8 @@ def check_dates(
         note = "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
     elif len(ahead) + len(unset) == total:
         unset = []  # a simulated clock, or a robot that has none
+    if now < FIRST_BAGS_NS and any(segment.latest >= FIRST_BAGS_NS for segment in segments):
+        note = "the clock of this machine is not set: bags are dated years after now"
     faults = [*unset, *ahead]
     faults += _step_faults(steps, {fault.bag.file for fault in faults}, timeline)
     if len({fault.bag.file for fault in faults if fault.misleads}) == total:

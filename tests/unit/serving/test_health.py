@@ -72,6 +72,19 @@ async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) 
     ]
 
 
+async def test_a_machine_that_booted_without_its_time_says_so_until_it_has_it(
+    tmp_path: Path,
+) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    write_mcap(tmp_path / "boot" / "boot_0.mcap", [text(95 * NS_PER_S, "a")])
+    booted = await Health(memory_at(tmp_path, seconds=100 - T0 // NS_PER_S), "1")()
+    assert booted["problems"] == [
+        "the clock of this machine is not set: bags are dated years after now"
+    ]
+    assert booted["latest"] == T0 / NS_PER_S
+    assert (await Health(memory_at(tmp_path, seconds=3), "1")())["status"] == "ok"
+
+
 async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
     beat(tmp_path, T0, RecorderState.RECORDING, restarts=2, silent=("/b",), missing=("/c",))
     reply = await Health(memory_at(tmp_path, seconds=3), "1")()
