@@ -312,6 +312,11 @@ class TestRefusals:
         assert "recording.bag_dir" in message
 
 
+def test_ctrl_c_while_it_reads_its_configuration_is_an_interruption() -> None:
+    with patch("ros2_memory.recorder.__main__.load_explained", side_effect=KeyboardInterrupt):
+        assert main([]) == 130
+
+
 def test_recorder_none_says_what_set_it_touches_nothing_and_is_no_failure(site: Site) -> None:
     site.old_bag()
     site.bag_dir.chmod(0o555)

@@ -65,31 +65,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     begin; 2: the configuration or the command line is refused; 130: interrupted before it began.
     """
     overrides: list[str] = _parser().parse_args(argv).overrides
-    with exit_on_config_error(PROGRAM):
-        settings, sources = load_explained(overrides)
-        configure_logging(settings.logging.level, settings.logging.format)
-        if isinstance(settings.recorder, NullRecorderNode):
-            _, chosen_by = sources.choice("recorder")
-            _log.info(
-                "nothing_to_record",
-                reason=f"recorder=none: bags come from elsewhere (set {chosen_by})",
-            )
-            # A service manager restarts a program for ever that ends before it is ready.
-            notify(READY)
-            return 0
-        try:
-            share_one_arena()
-            return_large_at_once()
-            _record(settings)
-        except ConfigError:
-            raise
-        except EpisodicError as error:
-            _log.error("cannot_record", reason=str(error))
-            sys.stderr.write(f"{PROGRAM} cannot record: {error}\n")
-            return FAILED
-        except KeyboardInterrupt:
-            # It came before the signal handlers were set.
-            return INTERRUPTED
+    try:
+        with exit_on_config_error(PROGRAM):
+            return _run(overrides)
+    except KeyboardInterrupt:
+        pass  # it came before the signal handlers were set
+    return INTERRUPTED
+
+
+def _run(overrides: Sequence[str]) -> int:
+    """Loads the configuration, and records; returns the exit code.
+
+    Raises:
+        ConfigError: the configuration is refused.
+    """
+    settings, sources = load_explained(overrides)
+    configure_logging(settings.logging.level, settings.logging.format)
+    if isinstance(settings.recorder, NullRecorderNode):
+        _, chosen_by = sources.choice("recorder")
+        _log.info(
+            "nothing_to_record",
+            reason=f"recorder=none: bags come from elsewhere (set {chosen_by})",
+        )
+        # A service manager restarts a program for ever that ends before it is ready.
+        notify(READY)
+        return 0
+    try:
+        share_one_arena()
+        return_large_at_once()
+        _record(settings)
+    except ConfigError:
+        raise
+    except EpisodicError as error:
+        _log.error("cannot_record", reason=str(error))
+        sys.stderr.write(f"{PROGRAM} cannot record: {error}\n")
+        return FAILED
     return 0
 
 
