@@ -14,6 +14,7 @@ from unittest.mock import patch
 import pytest
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
+from ros2_memory.config_sources import quoted
 from ros2_memory.recorder.__main__ import main
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
@@ -310,6 +311,12 @@ class TestRefusals:
         code, message = site.refusal_here()
         assert code == 1
         assert "recording.bag_dir" in message
+
+    def test_a_bag_directory_whose_name_ros2_cannot_take_is_named(self, site: Site) -> None:
+        folder = quoted(os.fsdecode(os.fsencode(site.folder) + b"/S\xfcd"))
+        code, message = site.refusal_here(f"recording.bag_dir={folder}")
+        assert code == 1
+        assert "takes no path that is not UTF-8" in message
 
 
 def test_ctrl_c_while_it_reads_its_configuration_is_an_interruption() -> None:

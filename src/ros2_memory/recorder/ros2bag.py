@@ -112,8 +112,20 @@ class Ros2BagRecorder(Recorder):
         self._supervisor = Supervisor(orders, self.housekeeper)
 
     def check(self) -> None:
-        """Reads the list of topics, and finds `ros2`, its environment and its options."""
+        """Reads the list of topics, and finds `ros2`, its environment and its options.
+
+        Raises:
+            ConfigError: as `Recorder`.
+            RecorderError: as `Recorder`; or the path of the bag directory is not UTF-8.
+        """
         self._topics.load()
+        try:
+            str(self._bag_dir).encode()
+        except UnicodeEncodeError:
+            raise RecorderError(
+                f"ros2 bag record takes no path that is not UTF-8: {self._bag_dir}; rename the "
+                "folder, or choose another recording.bag_dir"
+            ) from None
         self._ros = find_installation(self.setup_files, self._bag_dir / ROS_LOG_DIR)
         services = self._topics.selection.services
         if services and SERVICES not in self._ros.options:
