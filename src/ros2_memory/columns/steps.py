@@ -35,8 +35,10 @@ class Step:
         return "relative" if self.relative else "exact"
 
     def nearest(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the nearest multiples of an absolute step."""
-        return np.rint(values * self.per_unit) / self.per_unit
+        """Returns the nearest multiples of an absolute step; a value too large for one stays."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            multiples = np.rint(values * self.per_unit) / self.per_unit
+        return np.where(np.isinf(multiples), values, multiples)
 
     @classmethod
     def parse(cls, text: str) -> Step:

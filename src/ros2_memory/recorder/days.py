@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, is_dataclass, replace
 from itertools import chain, count
@@ -206,6 +206,9 @@ class MemoryDays:
             messages += len(records)
             if records:
                 self._write_day(day, records, day_bags)
+        for topic, unwritten in selection.unwritten.items():
+            reason = selection.reasons[topic]
+            _log.warning("memory_not_written", topic=topic, messages=unwritten, reason=reason)
         _log.info(
             "memory_kept",
             days=[*days],
@@ -413,7 +416,12 @@ class MemoryDays:
                     metadata = tuple((key, value) for key, value in channel.metadata if key != _QOS)
                     channel = replace(channel, latched=False, metadata=metadata)
                 thinned = record._replace(channel=channel)
-                staying = self._without_people(thinned, rounds=not is_latched)
+                try:
+                    staying = self._without_people(thinned, rounds=not is_latched)
+                except UndecodableError as error:
+                    selection.unwritten[channel.topic] += 1
+                    selection.reasons.setdefault(channel.topic, error.reason)
+                    continue
                 if staying is not None:
                     yield staying
 
@@ -451,22 +459,22 @@ class MemoryDays:
         Args:
             record: the message.
             rounds: whether its numbers are rounded, too.
+
+        Raises:
+            UndecodableError: it cannot be decoded, or not be encoded again.
         """
         channel = record.channel
-        try:
-            whole = self.reader.decode(record)
-            message = _without_hidden(whole, self._is_hidden)
-            if message is not whole and getattr(message, "transforms", None) == []:
-                return None
-            if self._names_people(message, channel.type):
-                return None
-            if rounds:
-                message = rounded(message, self.reader.definition(channel))
-            if message is whole:
-                return record
-            return record._replace(payload=self.reader.encode(channel, message))
-        except UndecodableError:
+        whole = self.reader.decode(record)
+        message = _without_hidden(whole, self._is_hidden)
+        if message is not whole and getattr(message, "transforms", None) == []:
             return None
+        if self._names_people(message, channel.type):
+            return None
+        if rounds:
+            message = rounded(message, self.reader.definition(channel))
+        if message is whole:
+            return record
+        return record._replace(payload=self.reader.encode(channel, message))
 
     def _names_people(self, message: object, type_name: str) -> bool:
         """Whether a detection, a name or a JSON text in a message has a label that may not stay."""
@@ -585,11 +593,15 @@ class _StayingMessages:
         times: log times (ns) of the messages that stay, by topic and type.
         latched: topics whose messages all stay.
         left_out: topics whose messages all go, each with the reason.
+        unwritten: how many messages that were to stay could not be written, by topic.
+        reasons: why the first of these could not.
     """
 
     times: dict[_TopicType, set[Ns]] = field(default_factory=lambda: defaultdict(set))
     latched: set[str] = field(default_factory=set)
     left_out: dict[str, str] = field(default_factory=dict)
+    unwritten: Counter[str] = field(default_factory=Counter)
+    reasons: dict[str, str] = field(default_factory=dict)
 
 
 def _words_in(name: str) -> str:

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 
 _RELATIVE_BITS: Final = 20
 """2 to the minus 20 is a millionth."""
+_MAX_FLOAT32: Final = float(np.finfo(np.float32).max)
 
 
 def rounded(message: object, definition: Definition | None, path: str = "") -> object:
@@ -90,16 +91,22 @@ def fields_in(node: object) -> Iterator[tuple[str, object]]:
 
 
 def _rounded(numbers: Points, step: Step) -> Points:
-    """Returns multiples of a power of two, which is no coarser than the step: they compress."""
+    """Returns multiples of a power of two, which is no coarser than the step: they compress.
+
+    A number stays as it is where its multiple is too large for its type: FLT_MAX says "no limit".
+    """
     with np.errstate(invalid="ignore", over="ignore"):
         if step.per_unit:
             units = 2.0 ** ceil(log2(step.per_unit))
-            return np.rint(numbers * units) / units
-        if step.relative:
+            near = np.rint(numbers * units) / units
+        elif step.relative:
             parts, exponents = np.frexp(numbers)
-            whole = np.rint(parts * 2.0**_RELATIVE_BITS)
-            return np.asarray(np.ldexp(whole, exponents - _RELATIVE_BITS))
-    return numbers
+            near = np.ldexp(np.rint(parts * 2.0**_RELATIVE_BITS), exponents - _RELATIVE_BITS)
+        else:
+            return numbers
+    # A single number of a float32 field comes as a float64.
+    is_too_large = np.isinf(near) | ((abs(numbers) <= _MAX_FLOAT32) & (abs(near) > _MAX_FLOAT32))
+    return np.where(is_too_large, numbers, near)
 
 
 STEP_NS: Final[Ns] = NS_PER_S

@@ -31,7 +31,7 @@ from ros2_memory.bag_dir.state_files import (
     read_superseded,
     read_thinned,
 )
-from ros2_memory.core.errors import BagError, BagUnreachableError
+from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder import days as recorder_days
@@ -41,7 +41,7 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.thinning import times_near
 from ros2_memory.retention import collect
 from ros2_memory.retention.delete import remove_bag
-from ros2_memory.storage.base import BagWriter, Record
+from ros2_memory.storage.base import BagWriter, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -737,6 +737,58 @@ def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> No
     assert {*topics_in(bag_dir)} == {"/drive/_action/status"}
     assert found >= {10.0, 10.5}
     assert len(found) < 20
+
+
+def test_numbers_too_large_to_be_rounded_stay_as_they_are(bag_dir: Path) -> None:
+    """FLT_MAX and DBL_MAX say "no limit", and have no multiple that is a number of their type."""
+    most_32, most_64 = float(np.finfo(np.float32).max), float(np.finfo(np.float64).max)
+    ends = {"min_range": -most_32, "range": 1.2345678, "max_range": most_32}
+    of_sonar = {"radiation_type": 0, "field_of_view": 0.1, "variance": 0.0}
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    limits = np.array([most_32, 0.1, -most_32], np.float32)
+    bodies = {
+        "/sonar": make("sensor_msgs/msg/Range", header=header(T0, "sonar"), **ends, **of_sonar),
+        "/limit": make("std_msgs/msg/Float64", data=most_64),
+        "/limits": make("std_msgs/msg/Float32MultiArray", layout=layout, data=limits),
+        "/goal": make("geometry_msgs/msg/Point", x=1e305, y=-most_64, z=0.123456789),
+    }
+    times = range(T0, T0 + 60 * S, S)
+    messages: list[Msg] = []
+    for topic, body in bodies.items():
+        kind = type(body).__name__.replace("__", "/")
+        messages += [Msg(topic, kind, at, body) for at in times]
+    record(bag_dir, messages)
+    keep_all(bag_dir)
+    stays = {topic: messages[0] for topic, messages in decoded(bag_dir).items()}
+    assert (stays["/sonar"].min_range, stays["/sonar"].max_range) == (-most_32, most_32)
+    assert stays["/sonar"].range == pytest.approx(1.2345678)
+    assert stays["/limit"].data == most_64
+    assert stays["/limits"].data.tolist() == pytest.approx(limits.tolist(), rel=1e-6)
+    assert (stays["/goal"].x, stays["/goal"].y) == (1e305, -most_64)
+    assert stays["/goal"].z == pytest.approx(0.123456789, abs=5e-5)
+
+
+def test_messages_that_cannot_be_written_are_counted_and_named(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encode = McapReader.encode
+
+    def fail(reader: McapReader, channel: Channel, message: object) -> bytes:
+        if channel.topic == "/battery_state":
+            raise UndecodableError(channel.topic, channel.type, "too large")
+        return encode(reader, channel, message)
+
+    splits(bag_dir, range(2))
+    keep_all(bag_dir)
+    written = topics_in(bag_dir).pop("/battery_state")
+    (bag_dir / DAY_FILE).unlink()
+    monkeypatch.setattr(McapReader, "encode", fail)
+    with capture_logs() as logs:
+        keep_all(bag_dir)
+    assert "/battery_state" not in topics_in(bag_dir)
+    [lost] = [event for event in logs if event["event"] == "memory_not_written"]
+    assert (lost["topic"], lost["messages"]) == ("/battery_state", written)
+    assert lost["reason"] == "too large"
 
 
 def test_after_a_month_numbers_have_one_message_a_minute_once_and_again_with_what_is_added(

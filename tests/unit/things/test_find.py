@@ -507,3 +507,18 @@ def test_a_detector_that_repeats_one_message_looks_at_nothing(
         "crate": {"not_looked_at_since": BEGIN + 59},
     }
     assert not any("moved_times" in each or "moves" in each for each in things)
+
+
+@pytest.mark.parametrize("far", [1e12, 1.7e308])
+def test_things_farther_than_any_place_are_not_placed_and_others_are(
+    tmp_path: Path, far: float
+) -> None:
+    """A detector that says DBL_MAX where it knows no distance."""
+    messages: list[Msg] = []
+    for at in range(BEGIN * S, (BEGIN + 20) * S, S):
+        seen = [("mug", 0.9, (far, 0.0, 0.0)), ("cup", 0.9, (1.0, 0.0, 0.0))]
+        messages += [odom(at, 0.0, 0.0), tf(at, base(at, 0.0, 0.0, 0.0)), detected(at, seen)]
+    write_splits(tmp_path, messages)
+    reply = ask(tmp_path, QuerySettings())
+    assert reply["labels"] == {"cup": 1}
+    assert "could not be placed: mug (20 times" in reply["notes"][0]
