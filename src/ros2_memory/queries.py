@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
@@ -37,7 +38,6 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
-from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
     by_remark,
     describe_gaps,
@@ -87,6 +87,7 @@ from ros2_memory.history.view import (
     AtTime,
     TimeRange,
     View,
+    days_back,
     ns_argument,
     open_moment,
     open_span,
@@ -120,6 +121,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import Geodetic
     from ros2_memory.extract import Extracted
+    from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
@@ -415,9 +417,8 @@ def find_last_match(
         shown = _as_value(view, match, fields, None if is_future else counted_from)
         return results.Match(shown, notes=shown.notes)
 
-    reach = min(now, until)
     search = _Search(topic, condition_type, value, field, min_score, until)
-    return _last_match(View(memory, call, reach), reach, search, show)
+    return _last_match(View(memory, call, min(now, until)), search, show)
 
 
 def value_when(
@@ -439,32 +440,50 @@ def value_when(
     count. Detections with a score below `min_score` do not.
     """
     now, until = memory.clock.now(), _search_end(before_s)
-    view = View(memory, call, now)
-    name = resolve_topic(view, value_topic)
+    view = View(memory, call, min(now, until))
+    name = _resolve_in_days(view, value_topic)
 
-    def show(view: View, match: StoredMessage) -> results.ValueWhen:
-        _note_unsearched(view, match, until, now)
-        note_robots_near(view, match)
-        matched = _as_value(view, match, (), None)
-        until_match = TimeWindow.until(match.time)
-        stored = _newest_of_recording(view, name, until_match, match)
-        if stored is None:
-            note_unread(view, until_match, nothing=True)
-            view.notes.add(f"no message of {name} is here at or before {unix_text(match.time)}")
-            notes = (*matched.notes, *view.notes.sentences())
-            return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
-        note_unread(view, replace(until_match, start=stored.time))
-        age = match.time - stored.time
-        is_old = age > ns_from_unix(memory.limits.time_tolerance_s)
-        if is_old and not still_holds(view, stored, match.time):
-            view.notes.add(f"the value is {seconds(age)} older than the match")
-        shown = _as_value(view, stored, fields, None)
-        shown = _with_latched_age(view, shown, stored, match.time)
-        notes = (*matched.notes, *shown.notes)
-        return results.ValueWhen(matched, shown, notes=tuple(dict.fromkeys(notes)))
+    def show(days: View, match: StoredMessage) -> results.ValueWhen:
+        _note_unsearched(days, match, until, now)
+        return _value_at_match(days, name, match, fields)
 
     search = _Search(condition_topic, condition_type, value, field, min_score, until)
-    return _last_match(view, now, search, show)
+    return _last_match(view, search, show)
+
+
+def _value_at_match(
+    days: View, name: str, match: StoredMessage, fields: Sequence[str]
+) -> results.ValueWhen:
+    """Returns a match, and the value of a topic then, which may be of days before it.
+
+    Args:
+        days: shows the days of the match.
+        name: of the topic.
+        match: the message that meets the condition.
+        fields: to show of the value; all if empty.
+    """
+    note_robots_near(days, match)
+    matched = _as_value(days, match, (), None)
+    until_match = TimeWindow.until(match.time)
+    for view in days_back(days):
+        stored = _newest_of_recording(view, name, until_match, match)
+        if stored is not None:
+            break
+    if stored is None:
+        note_unread(days, until_match, nothing=True)
+        days.notes.add(f"no message of {name} is here at or before {unix_text(match.time)}")
+        notes = (*matched.notes, *days.notes.sentences())
+        return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
+    since_value = replace(until_match, start=stored.time)
+    for shown_days in dict.fromkeys((days, view)):
+        note_unread(shown_days, since_value)
+    age = match.time - stored.time
+    is_old = age > ns_from_unix(days.limits.time_tolerance_s)
+    if is_old and not still_holds(view, stored, match.time):
+        view.notes.add(f"the value is {seconds(age)} older than the match")
+    shown = _with_latched_age(view, _as_value(view, stored, fields, None), stored, match.time)
+    notes = (*matched.notes, *days.notes.sentences(), *shown.notes)
+    return results.ValueWhen(matched, shown, notes=tuple(dict.fromkeys(notes)))
 
 
 def list_recorded_topics(
@@ -690,47 +709,53 @@ class _Search(NamedTuple):
     until: Ns
 
 
+def _resolve_in_days(view: View, name: str) -> str:
+    """Returns the recorded topic with a name, be it of days before those of a view.
+
+    Raises:
+        NoDataError: as `resolve_topic` does for the view.
+    """
+    for days in days_back(view):
+        with suppress(NoDataError):
+            return resolve_topic(days, name)
+    return resolve_topic(view, name)
+
+
 def _last_match(
-    view: View, reach: Ns, search: _Search, show: Callable[[View, StoredMessage], A]
+    view: View, search: _Search, show: Callable[[View, StoredMessage], A]
 ) -> A | results.Match:
     """Returns what `show` makes of the last match, or that there is none.
 
-    An index of years shows some days at a time. If these days have no match, the days before are
-    searched, for some seconds in all. The index reports what it has not shown.
-
     Args:
-        view: shows the days before `reach`.
-        reach: a log time (ns).
+        view: shows the newest days to search.
         search: what to find.
-        show: makes an answer of the view and the match.
+        show: makes an answer of the match, and of the view that shows the days of it.
 
     Raises:
         NoDataError: no day has anything that could be searched.
         QueryTimeoutError: the call's time is over; it says how far back was searched.
     """
-    reading = view.call.partial_after(READING_S)
     missed: results.Match | NoDataError | None = None
     notes: tuple[str, ...] = ()
-    while True:
+    searched_to = MAX_NS
+    for days in days_back(view):
         try:
-            match, notes_on_days = _last_match_in(view, search)
-            if match is not None:
-                return show(view, match)
-            notes += notes_on_days
-            missed = results.Match(None, notes=tuple(dict.fromkeys(notes)))
+            match, notes_on_days = _last_match_in(days, search)
         except NoDataError as error:
             missed = missed or error
         except QueryTimeoutError as error:
             if missed is None or error.searched_back_to is not None:
                 raise
-            raise out_of_time(view, reach + 1) from error
-        older = view.snapshot.older
-        if older is None or older >= reach or reading.expired() or view.call.deadline.expired():
-            if isinstance(missed, NoDataError):
-                raise missed
-            return missed
-        reach = older
-        view = View(view.memory, view.call, reach)
+            raise out_of_time(days, searched_to + 1) from error
+        else:
+            if match is not None:
+                return show(days, match)
+            notes += notes_on_days
+            missed = results.Match(None, notes=tuple(dict.fromkeys(notes)))
+        searched_to = days.snapshot.older or searched_to
+    if isinstance(missed, NoDataError):
+        raise missed
+    return missed or results.Match(None)
 
 
 def _last_match_in(view: View, search: _Search) -> tuple[StoredMessage | None, tuple[str, ...]]:

@@ -35,7 +35,7 @@ from ros2_memory.fleet.replies import (
 )
 from ros2_memory.fleet.robots import AT_ONCE, FanOut, Robot, StoppedClock, robots_clause
 from ros2_memory.places.where import has_coordinates
-from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings
+from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings, ValueWhen
 from ros2_memory.tools.arguments import as_region, as_while
 from ros2_memory.tools.replies import ROBOT_NAME, as_json
 
@@ -249,6 +249,8 @@ class _FleetQuestion:
             return None
         if isinstance(answer, Match) and answer.found is not None:
             return lake.since(answer.found.sample.time)
+        if isinstance(answer, ValueWhen) and answer.value is not None:
+            return lake.since(answer.value.sample.time)
         begin = self._since(MIN_NS if lake.latest is None else lake.latest)
         return lake.since(MIN_NS if begin is None else begin)
 

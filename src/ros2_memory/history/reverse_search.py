@@ -138,7 +138,7 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     test = condition.test
     if condition.field != "percentage" or not isinstance(test, Beyond) or test.limit <= FULL_CHARGE:
         return
-    brief = View(view.memory, view.call.within(READING_S))
+    brief = View(view.memory, view.call.within(READING_S), view.reach)
     try:
         charged, percent = (
             ReverseSearch(brief, pattern, replace(condition, test=beyond)).newest(MAX_NS)

@@ -29,6 +29,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.clock_steps import without_steps
+from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import (
@@ -42,7 +43,7 @@ from ros2_memory.history.sessions import Sessions
 from ros2_memory.index.segment import TopicTotals
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.scan import Scan
     from ros2_memory.history.context import Call, Memory
@@ -64,6 +65,7 @@ class View:
             the index does not reach it.
 
     Attributes:
+        reach: the latest log time that the question is about.
         limits: the settings of the memory.
         extractor: reads its decoded messages.
         bag_dir: where its bags are.
@@ -78,6 +80,7 @@ class View:
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
         self.memory = memory
         self.call = call
+        self.reach = reach
         self.bags = BagAccess(memory, call, reach)
         self.stream = MergedStream(self.bags)
         self.snapshot = self.bags.snapshot
@@ -239,6 +242,22 @@ class TimeRange:
         """Returns the range of a window, at least 1 ms long: a recap needs some length."""
         start_s = unix_from_ns(window.start)
         return cls(start_s, max(unix_from_ns(window.stop - 1), start_s + 0.001))
+
+
+def days_back(view: View) -> Iterator[View]:
+    """Yields a view, then views of the days before it, as long as there is time to read them.
+
+    An index of years shows some days at a time, and reports which it has not shown.
+    """
+    reading = view.call.partial_after(READING_S)
+    reach = MAX_NS if view.reach is None else view.reach
+    while True:
+        yield view
+        older = view.snapshot.older
+        if older is None or older >= reach or reading.expired() or view.call.deadline.expired():
+            return
+        reach = older
+        view = View(view.memory, view.call, reach)
 
 
 def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, Ns | None]:

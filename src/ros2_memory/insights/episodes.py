@@ -64,7 +64,7 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
     if len(topics) != 1 or not is_text(view, topics[0]):
         return False
     # A view of its own: its notes are of values that may lie outside of the window.
-    values = HeldValues(View(view.memory, view.call), topics[0])
+    values = HeldValues(View(view.memory, view.call, view.reach), topics[0])
     newest = takewhile(lambda held: len(held.word) <= _LONGEST_STATE, values.back(MAX_NS))
     try:
         return any(held.is_blank for held in islice(newest, _MOST_LOOKED_AT))

@@ -12,7 +12,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import dotted, listed
 from ros2_memory.counts.numbers import GREATEST, LEAST, PieceNumbers, TooManyError
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.view import View, open_view
+from ros2_memory.history.view import View, days_back, open_view
 from ros2_memory.results import Extremes, TypeFields
 
 if TYPE_CHECKING:
@@ -35,11 +35,9 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     Raises:
         NoDataError: no topic was recorded under the type, or none of its messages can be decoded.
     """
-    view = open_view(memory, call, memory.clock.now())
-    types = view.timeline.types
-    topics = [topic for topic, types_of_topic in types.items() if type_name in types_of_topic]
+    view, topics = _view_with(open_view(memory, call, memory.clock.now()), type_name)
     if not topics:
-        recorded = sorted(set(chain.from_iterable(types.values())))
+        recorded = sorted(set(chain.from_iterable(view.timeline.types.values())))
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
             "no topic was recorded under this type; there are "
@@ -63,6 +61,18 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     raise NoDataError(
         NoDataReason.UNDECODABLE, f"no newest message of this type can be read: {failure}"
     )
+
+
+def _view_with(view: View, type_name: str) -> tuple[View, list[str]]:
+    """Returns a view of the newest days that have topics of a type, and these topics.
+
+    Where there are none: the view that was given.
+    """
+    for days in days_back(view):
+        topics = [topic for topic, types in days.timeline.types.items() if type_name in types]
+        if topics:
+            return days, topics
+    return view, []
 
 
 def _newest_of_type(view: View, topic: str, type_name: str) -> StoredMessage | None:

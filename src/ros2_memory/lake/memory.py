@@ -148,7 +148,7 @@ class LakeIndex:
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
         """Returns the newest days as of at most `refresh_s` ago.
 
-        If `reach` is before the newest days, it has the days up to `reach` instead.
+        If `reach` is before the newest days, it has the days up to `reach`, and the next one.
 
         Raises:
             RefusedError: the lake cannot be read.
@@ -160,15 +160,15 @@ class LakeIndex:
             if not 0 <= age <= ns_from_unix(self.refresh_s):
                 current = None
         current = current or self.refresh()
-        if reach is None or current.older is None or reach > current.older:
+        if reach is None or current.older is None or reach >= (current.earliest or reach):
             return current
-        day = day_of(reach)
         with self._lock:
-            # With the next day that has bags: what lies across midnight goes on there, and a gap
-            # up to it is no end of the memory.
-            days = self.lake.days("bags").get(self.robot, {})
-            until = next((later for later in days if later > day), day)
-            window = self._window(until, (until - day).days + 1)
+            # The last day with bags, and the next one: what lies across midnight goes on there, and
+            # a gap up to it is no end of the memory.
+            days = [*self.lake.days("bags").get(self.robot, {})]
+            later = bisect_right(days, day_of(reach))
+            first, until = days[max(later - 1, 0)], days[min(later, len(days) - 1)]
+            window = self._window(until, (until - first).days + 1)
         return replace(current, timeline=window.timeline, older=window.older)
 
     def refresh(self) -> Snapshot:

@@ -17,13 +17,14 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.insights.fields import describe_type
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.memory import LakeIndex, newest_days
 from ros2_memory.lake.tables import day_of
 from ros2_memory.lake.warehouse import Days, LakeFile
 from ros2_memory.queries import find_last_match
-from ros2_memory.results import Match
-from tests.support.bags import Msg, detections, text, write_mcap
+from ros2_memory.results import Match, TypeFields
+from tests.support.bags import Msg, battery, boolean, detections, text, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
 from tests.support.lakes import lake_in, lake_robot, lake_robots, robot_bags, ship
@@ -301,7 +302,7 @@ def test_days_before_are_named_only_where_the_answer_is_of_them(robot: Robot) ->
 def test_where_the_time_is_short_it_says_how_far_it_looked(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ros2_memory.queries.READING_S", 0.0)
+    monkeypatch.setattr("ros2_memory.history.view.READING_S", 0.0)
 
     def ask(topic: str, memory: Memory, call: Call) -> Match:
         return find_last_match(memory, call, topic, "contains", "mug")
@@ -314,3 +315,73 @@ def test_where_the_time_is_short_it_says_how_far_it_looked(
     assert note.startswith("the lake has days before ")
     with pytest.raises(NoDataError, match=r"/none.*; the lake has days before "):
         robot.ask(partial(ask, "/none"), Call(Deadline.after(60)))
+
+
+LONG_AGO_S = START_S - 100 * DAY_S
+
+
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    """A robot of which one day at a time is looked at, and that has changed since `LONG_AGO_S`.
+
+    Then its bumper was pressed, it spoke and docked, and its battery stated percent, which states
+    fractions since. The day before it named its map.
+    """
+    folder = tmp_path_factory.mktemp("changed")
+    for ago in (101, 100, 2, 1, 0):
+        at = (START_S - ago * DAY_S) * NS_PER_S
+        messages: list[Msg] = [boolean(at + 60 * NS_PER_S, ago == 100)]
+        messages.append(battery(at + 61 * NS_PER_S, 80.0 if ago == 100 else 0.8))
+        if ago == 100:
+            docks = ((2, "docking"), (4, "docking"), (6, ""))
+            said = [text(at + after * NS_PER_S, word, "/dock") for after, word in docks]
+            messages = [text(at, "ouch"), *said, *messages]
+        if ago == 101:
+            messages.insert(0, text(at, "the map", "/map_name"))
+        write_mcap(folder / "bags" / f"rec_{ago}" / f"rec_{ago}_0.mcap", messages)
+    topics = ("/chatter", "/dock", "/bumper", "/battery_state", "/map_name")
+    ship(folder / "lake", [robot_bags("hall", folder / "bags", messages=topics)], most_bags=9)
+    memory = lake_robot(folder / "lake", days=1, most_bags=1)
+    return Robot("hall", Path("/hall"), memory, in_lake=True)
+
+
+def asked_alone(of: Robot, tool: str, **given: object) -> Any:
+    return reply(Fleet([of], FixedClock(NOW)), tool, {"robot": "hall", **given})
+
+
+@pytest.mark.parametrize("before", [{}, {"before": LONG_AGO_S + DAY_S}], ids=["ever", "before"])
+@pytest.mark.parametrize(("topic", "said"), [("/chatter", "ouch"), ("/map_name", "the map")])
+def test_a_value_is_of_the_days_of_the_match_or_before_them(
+    changed: Robot, topic: str, said: str, before: dict[str, Any]
+) -> None:
+    pressed = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
+    found = asked_alone(changed, "get_value_when", value_topic=topic, **pressed, **before)
+    assert found["timestamp"] == LONG_AGO_S + 60
+    assert found["value"]["value"] == said
+    assert "not looked at" not in str(found)
+
+
+def test_a_topic_that_no_day_has_is_not_recorded(changed: Robot) -> None:
+    pressed = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
+    found = asked_alone(changed, "get_value_when", value_topic="/none", **pressed)
+    assert found["reason"] == "topic_not_recorded"
+    assert "not looked at" not in str(found)
+
+
+def test_what_a_topic_is_follows_from_the_days_that_are_searched(changed: Robot) -> None:
+    until = {"end": LONG_AGO_S + DAY_S}
+    docked = {"topic": "/dock", "condition_type": "contains", "value": "docking"}
+    [episode] = asked_alone(changed, "find_matches", **docked, **until)["episodes"]
+    assert (episode["start"], episode["end"]) == (LONG_AGO_S + 2, LONG_AGO_S + 6)
+    full = {"topic": "/battery_state", "condition_type": "above", "value": 50}
+    [match] = asked_alone(changed, "find_matches", **full, field="percentage", **until)["sightings"]
+    assert match["first_seen"] == LONG_AGO_S + 61
+
+
+def test_a_type_of_days_before_is_described(changed: Robot) -> None:
+    def describe(type_name: str) -> TypeFields:
+        return describe_type(changed.memory, Call(), type_name)
+
+    assert describe("std_msgs/msg/String").topics == ("/chatter", "/dock")
+    with pytest.raises(NoDataError, match=r"BatteryState, std_msgs/msg/Bool$"):
+        describe("std_msgs/msg/Int8")
