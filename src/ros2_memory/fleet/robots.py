@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
     BusyError,
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Deadline
     from ros2_memory.lake.engine import Lake
 
 T = TypeVar("T")
@@ -263,68 +262,6 @@ def robots_clause(robots: Iterable[Robot]) -> str:
     return f"there {'is' if len(names) == 1 else 'are'} {listed(names, at_most=_MOST_NAMED)}"
 
 
-@dataclass(frozen=True, slots=True)
-class _Question(Generic[T]):
-    """One question to robots, each of which is asked in a thread of its own.
-
-    Attributes:
-        work: asks one robot.
-        call: the call, with the limits of all robots together.
-        is_of_several: whether it is about several robots.
-        left_s: the time that was left of the call at first.
-        until: the deadline of all robots.
-        context: the context variables of the call.
-    """
-
-    work: Callable[[Robot, Call], T]
-    call: Call
-    is_of_several: bool
-    left_s: float
-    until: Deadline
-    context: contextvars.Context
-
-    @classmethod
-    def of(cls, call: Call, work: Callable[[Robot, Call], T], robots: int) -> _Question[T]:
-        """Returns the question of a call to so many robots."""
-        left_s = call.deadline.left_s()
-        until = call.deadline.within(left_s * _OF_ALL)
-        return cls(work, call, robots > 1, left_s, until, contextvars.copy_context())
-
-    def own_call(self) -> Call:
-        """Returns the call to a robot that is asked now, with its part of the time."""
-        most_s = self.left_s * (_OF_ONE if self.is_of_several else _OF_ALL)
-        own = self.call.within(min(most_s, self.until.left_s()))
-        return replace(own, stages=Stages(), used_active=False, used_thinned=False)
-
-    def start(self, robot: Robot, own: Call) -> Future[T | EpisodicError]:
-        """Asks a robot in a thread of its own; returns the future answer."""
-        answer: Future[T | EpisodicError] = Future()
-
-        def run() -> None:
-            try:
-                answer.set_result(self.work(robot, own))
-            except EpisodicError as error:
-                answer.set_result(error)
-            except Exception:
-                log.exception("robot_failed", robot=robot.name)
-                fault = "failed through a fault in this server; its log has the cause"
-                answer.set_result(EpisodicError(fault))
-
-        # A daemon: one that hangs must not keep the program from ending.
-        ask = partial(self.context.copy().run, run)
-        threading.Thread(target=ask, name=f"robot-{robot.name}", daemon=True).start()
-        return answer
-
-    def wait(self, answer: Future[T | EpisodicError], own: Call) -> T | EpisodicError:
-        """Returns the answer of a robot, or an error if it does not come in time."""
-        own_s = own.deadline.budget_s
-        try:
-            return answer.result(min(own_s + self.left_s * _GRACE, threading.TIMEOUT_MAX))
-        except TimeoutError:
-            do = "ask about it alone, or about" if self.is_of_several else "ask about"
-            return QueryTimeoutError(f"no answer in {own_s:.3g} s; {do} a shorter window")
-
-
 class FanOut:
     """Asks robots in threads, a few at a time, each with a time limit. Thread-safe.
 
@@ -346,31 +283,43 @@ class FanOut:
 
         It takes at most `_OF_ALL` plus `_GRACE` of the time that is left of the call.
         """
-        question = _Question.of(call, work, len(robots))
+        left_s, is_of_several = call.deadline.left_s(), len(robots) > 1
+        until = call.deadline.within(left_s * _OF_ALL)
+        most_s = left_s * (_OF_ONE if is_of_several else _OF_ALL)
+        context = contextvars.copy_context()
+
+        def ask_one(robot: Robot) -> tuple[T | EpisodicError, Call]:
+            """Returns the answer of a robot, or the error, and the call that it was asked in."""
+            own = replace(
+                call.within(min(most_s, until.left_s())),
+                stages=Stages(),
+                used_active=False,
+                used_thinned=False,
+            )
+            if self._is_stuck(robot):
+                late = "still busy with an earlier question that it did not finish in time"
+                return BusyError(f"{late}: is its disk reachable?"), own
+            if own.deadline.expired():
+                do = "ask about fewer robots, or a shorter time"
+                return QueryTimeoutError(f"not asked: the time of the call was up; {do}"), own
+            answer = _start(context.copy(), robot, partial(work, robot, own))
+            own_s = own.deadline.budget_s
+            try:
+                return answer.result(min(own_s + left_s * _GRACE, threading.TIMEOUT_MAX)), own
+            except TimeoutError:
+                with self._lock:
+                    self._late.setdefault(robot.name, []).append(answer.done)
+                do = "ask about it alone, or about" if is_of_several else "ask about"
+                return QueryTimeoutError(f"no answer in {own_s:.3g} s; {do} a shorter window"), own
+
         with ThreadPoolExecutor(self._at_once) as threads:
-            answers = [*threads.map(partial(self._ask_one, question), robots)]
+            answers = [*threads.map(ask_one, robots)]
         for _, own in answers:
             for stage, spent in [*own.stages.spent.items()]:
                 call.stages.add(stage, spent)
             call.used_active |= own.used_active
             call.used_thinned |= own.used_thinned
         return {robot.name: answer for robot, (answer, _) in zip(robots, answers, strict=True)}
-
-    def _ask_one(self, question: _Question[T], robot: Robot) -> tuple[T | EpisodicError, Call]:
-        """Returns the answer of a robot, or the error, and the call that it was asked in."""
-        own = question.own_call()
-        if self._is_stuck(robot):
-            late = "still busy with an earlier question that it did not finish in time"
-            return BusyError(f"{late}: is its disk reachable?"), own
-        if own.deadline.expired():
-            do = "ask about fewer robots, or a shorter time"
-            return QueryTimeoutError(f"not asked: the time of the call was up; {do}"), own
-        future = question.start(robot, own)
-        answer = question.wait(future, own)
-        if not future.done():
-            with self._lock:
-                self._late.setdefault(robot.name, []).append(future.done)
-        return answer, own
 
     def _is_stuck(self, robot: Robot) -> bool:
         """Returns whether some question is not done that the robot did not answer in time."""
@@ -379,3 +328,25 @@ class FanOut:
             if late:
                 self._late[robot.name] = late
             return bool(late)
+
+
+def _start(
+    context: contextvars.Context, robot: Robot, ask: Callable[[], T]
+) -> Future[T | EpisodicError]:
+    """Asks a robot in a thread of its own; returns the future answer."""
+    answer: Future[T | EpisodicError] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(ask())
+        except EpisodicError as error:
+            answer.set_result(error)
+        except Exception:
+            log.exception("robot_failed", robot=robot.name)
+            fault = "failed through a fault in this server; its log has the cause"
+            answer.set_result(EpisodicError(fault))
+
+    # A daemon: one that hangs must not keep the program from ending.
+    name = f"robot-{robot.name}"
+    threading.Thread(target=partial(context.run, run), name=name, daemon=True).start()
+    return answer
