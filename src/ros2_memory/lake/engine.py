@@ -17,6 +17,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import pyarrow as pa
+from pyarrow import fs
 from pyarrow.dataset import ParquetFragmentScanOptions
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
@@ -194,16 +195,16 @@ class Lake:
                 yield from chain.from_iterable(days.values())
 
     def _files_of(self, name: str, files: Iterable[LakeFile]) -> TableFiles:
-        """Returns files of a table, with the settings of their store."""
+        """Returns files of a table, with their store."""
         locations = [PyArrowFileIO.parse_location(file.location) for file in files]
         paths, schema = [path for _, _, path in locations], TABLES[name].arrow_schema
-        if all(scheme == "file" for scheme, _, _ in locations):
-            return TableFiles(schema, paths)
-        scheme, host, _ = locations[0]
+        scheme, host, _ = next(iter(locations), ("file", "", ""))
+        if scheme == "file":
+            return TableFiles(schema, paths, fs.LocalFileSystem())
         with self._looking():
             table = self._loaded_table(name)
-        properties = {} if table is None else dict(table.io.properties)
-        return TableFiles(schema, paths, scheme, host, properties)
+            properties = {} if table is None else {**table.io.properties}
+            return TableFiles(schema, paths, PyArrowFileIO(properties).fs_by_scheme(scheme, host))
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

@@ -105,27 +105,16 @@ class TableFiles(NamedTuple):
     Attributes:
         schema: the columns of the table; a column that a file lacks is null in its rows.
         paths: the paths of the files in their store.
-        scheme: the scheme of the store.
-        host: the host of the store, or its bucket.
-        properties: the settings of the store, as pyiceberg names them.
+        store: where the files are.
     """
 
     schema: pa.Schema
     paths: Sequence[str]
-    scheme: str = "file"
-    host: str = ""
-    properties: Mapping[str, str] | None = None
+    store: fs.FileSystem
 
     def dataset(self) -> dataset.Dataset:
         """Returns the rows as a dataset, which reads the files when rows are taken."""
-        store: fs.FileSystem = fs.LocalFileSystem()
-        if self.scheme != "file":
-            # A server with a lake has imported all of this; the process of a statement has not.
-            from pyiceberg.io.pyarrow import PyArrowFileIO  # noqa: PLC0415
-
-            properties = {**(self.properties or {})}
-            store = PyArrowFileIO(properties).fs_by_scheme(self.scheme, self.host)
-        return dataset.dataset([*self.paths], self.schema, format="parquet", filesystem=store)
+        return dataset.dataset([*self.paths], self.schema, format="parquet", filesystem=self.store)
 
 
 @dataclass(frozen=True, slots=True)
