@@ -227,7 +227,7 @@ class Shipper:
         self.before_commit(is_full)
         to_ship = [to_ship for prepared in batch for to_ship in prepared.bags]
         bags = [bag for one in to_ship for bag in (one.bag, *one.replaced)]
-        condition = bags_condition((bag.robot, bag.day, bag.bag_id) for bag in bags)
+        condition = bags_condition({(bag.robot, bag.day, bag.bag_id) for bag in bags})
         rows = 0
         try:
             for name in TABLES:

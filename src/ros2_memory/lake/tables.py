@@ -230,30 +230,29 @@ def robots_condition(robots: Collection[str], day: date) -> ex.BooleanExpression
     return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
 
 
-def ids_condition(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
-    """Returns the condition for the rows of a robot's bags, on any day.
+def ids_condition(robots: Collection[str], ids: Collection[str]) -> ex.BooleanExpression:
+    """Returns the condition for the rows of robots' bags, on any day.
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
     return ex.And(
-        _is(ex.EqualTo, "robot", robot),
+        _is(ex.In, "robot", robots),
         _is(ex.GreaterThanOrEqual, "bag_id", min(ids)),
         _is(ex.LessThanOrEqual, "bag_id", max(ids)),
         _is(ex.In, "bag_id", ids),
     )
 
 
-def bags_condition(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
-    """Returns the condition for the rows of bags, given by robot, day and id."""
-    ids: dict[tuple[str, date], set[str]] = {}
-    for robot, day, bag_id in bags:
-        ids.setdefault((robot, day), set()).add(bag_id)
-    days = [
-        ex.And(robots_condition([robot], day), ids_condition(robot, bag_ids))
-        for (robot, day), bag_ids in ids.items()
-    ]
-    # One flat condition: nested ones would be deeper than Python allows after some years of days.
-    return ex.Or(ex.AlwaysFalse(), ex.AlwaysFalse(), *days)
+def bags_condition(bags: Collection[tuple[str, date, str]]) -> ex.BooleanExpression:
+    """Returns the condition for the rows of bags, given by robot, day and id.
+
+    No two bags have one id, so their robots and days only let Iceberg pass over other files.
+    """
+    if not bags:
+        return ex.AlwaysFalse()
+    days = {day.isoformat() for _, day, _ in bags}
+    ids = {bag_id for _, _, bag_id in bags}
+    return ex.And(ids_condition({robot for robot, _, _ in bags}, ids), _is(ex.In, "day", days))
 
 
 def window_condition(

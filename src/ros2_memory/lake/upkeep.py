@@ -117,16 +117,14 @@ def expire(lake: LakeTables, until: Ns) -> int:
             _drop_versions(table, until)
         recorded = WRITTEN.rows(state_dir)
         outdated = [written.file for written in recorded if written.at < until]
-        try:
-            for table in tables:
-                for file in _unreferenced(table, outdated):
-                    with suppress(FileNotFoundError):  # as after a kill
-                        table.io.delete(file)
-                    gone.add(file)
-        finally:
-            if gone:
-                left = [written for written in recorded if written.file not in gone]
-                WRITTEN.replace(state_dir, left)
+        for table in tables:
+            for file in _unreferenced(table, outdated):
+                with suppress(FileNotFoundError):  # as after a kill
+                    table.io.delete(file)
+                gone.add(file)
+        if gone:
+            left = [written for written in recorded if written.file not in gone]
+            WRITTEN.replace(state_dir, left)
     if gone:
         log.info("old_files_deleted", files=len(gone))
     return len(gone)
@@ -193,7 +191,7 @@ class Tombstone:
     def rows(self, first: str, last: str) -> BooleanExpression:
         """Returns the condition for the rows to delete; `first` and `last` are columns of times."""
         if self.bags:
-            return ids_condition(self.robot, self.bags)
+            return ids_condition([self.robot], self.bags)
         return window_condition(self.robot, (first, last), self.window, self.topics)
 
     def forbids(self, reader: BagReader, bag: BagFile, bag_id: str) -> bool:
@@ -286,7 +284,7 @@ def _bags_to_forget(lake: LakeTables, tombstone: Tombstone) -> set[tuple[str, da
     of_any_topic = replace(tombstone, topics=())
     listed = _bags_where(lake, "bags", of_any_topic.rows("start_ns", "end_ns"))
     if tombstone.topics and listed:
-        ids = ids_condition(tombstone.robot, {bag_id for _, _, bag_id in listed})
+        ids = ids_condition([tombstone.robot], {bag_id for _, _, bag_id in listed})
         listed -= _bags_where(lake, "channels", ids)
     return bags | listed
 

@@ -72,7 +72,8 @@ def test_bags_of_years_are_deleted_at_once(catalog: SqlCatalog) -> None:
     days = [DAY + timedelta(days=nth) for nth in (0, 1, 599, 600)]
     rows = [{**KEYS, "day": day, "topic": "/odom", "first_ns": 0} for day in days]
     table.append(TABLES["events"].to_arrow(rows))
-    table.delete(bags_condition(("hall", days[0] + timedelta(days=nth), "a") for nth in range(600)))
+    bags = [("hall", DAY + timedelta(days=nth), "a") for nth in range(600)]
+    table.delete(bags_condition(bags))
     assert table.scan().to_arrow()["day"].to_pylist() == [days[-1]]
 
 
