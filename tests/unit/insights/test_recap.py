@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -66,6 +67,21 @@ def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
     for end, goes_on in ((15, True), (40, False), (60, False)):
         events = over(memory_of(tmp_path), 0, end).events
         assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
+
+
+def test_one_pose_that_noise_throws_off_cuts_nothing_off_a_stop(tmp_path: Path) -> None:
+    draw = Random(1)
+    thrown = {5 * 50 + 25, 13 * 50 - 25}
+    messages: list[Msg] = []
+    for tick in range(18 * 50):
+        x = 0.5 * (min(tick / 50, 5) + max(tick / 50 - 13, 0)) + draw.gauss(0, 0.005)
+        y = 0.024 if tick in thrown else draw.gauss(0, 0.005)
+        messages.append(odom(BEGIN + tick * S // 50, x, y))
+    write_splits(tmp_path, messages)
+    [stop] = [each for each in over(memory_of(tmp_path), 0, 20).events if each.kind == "stop"]
+    assert stop.end is not None
+    assert (stop.start - BEGIN) / S == pytest.approx(5, abs=0.1)
+    assert (stop.end - BEGIN) / S == pytest.approx(13, abs=0.1)
 
 
 PLACES = (

@@ -13,8 +13,8 @@ It begins with the first pose at its place and ends with the last one.
   creeps. What takes longer is drift, as of a camera's odometry while the robot is at its dock. A
   standstill that drifts out of `DRIFTED_M` ends there, and the next one begins.
 - **Ends.** The ends of a row of still blocks are found pose by pose. Some slots just inside give
-  the place and its noise. From there poses are followed outwards until one is elsewhere. The last
-  pose before it that is clearly at the place is the end.
+  the place and its noise. From there poses are followed outwards until two in a row are elsewhere,
+  or one that noise does not explain. The last pose before that is clearly at the place is the end.
 
 All this depends on poses a few slots around, and slots and blocks are counted from the epoch. The
 `Blocks` of a stretch of time follow from its poses and those `BESIDE_NS` beside it. So a standstill
@@ -90,7 +90,9 @@ _BOX_NOISE_FACTOR: Final = 4.5
 _NEAREST_M: Final = 0.0003
 """Poses without noise are at one place if they are no farther apart than this."""
 _ELSEWHERE: Final = 3.0
-"""Poses more than so many standard deviations from a place are elsewhere."""
+"""Two poses in a row more than so many standard deviations from a place are elsewhere."""
+_SURELY: Final = 6.0
+"""A single pose so many standard deviations from a place is elsewhere, whatever the next one is."""
 _CLEARLY: Final = 2.0
 """Poses that are so many standard deviations nearer are clearly there."""
 _OWN_BENDS: Final = 4
@@ -417,7 +419,10 @@ class _Slots:
         away = _lengths(self.positions[outwards] - place)
         # Poses beyond a silence are elsewhere.
         away[1:][np.abs(np.diff(self.times[outwards])) > SILENCE_NS] = np.inf
-        elsewhere = np.flatnonzero(away > reach)
+        is_beyond = away > reach
+        # Noise alone takes one pose of some hundreds so far, but hardly two in a row.
+        is_next_beyond = np.append(is_beyond[1:], True)
+        elsewhere = np.flatnonzero(is_beyond & (is_next_beyond | (away > _SURELY * noise)))
         if not elsewhere.size:
             return int(self.times[outwards[-1]])
         clearly_there = np.flatnonzero(away[: elsewhere[0]] <= reach - _CLEARLY * noise)
