@@ -303,9 +303,10 @@ class Visit:
         arrived: log time of its first pose there; None if it was there before the searched time.
         departed: log time of its last pose there; None if it is still there, by a recent pose.
         duration: from the first to the last known pose there.
-        closest_m: distance (m, in the plane) of the nearest recorded pose; the robot may have been
-            nearer between two messages. None if the place is no circle.
-        closest_at: log time of the nearest pose; None if the place is no circle.
+        closest_m: distance (m, in the plane) of a recorded pose, of noisy poses of the nearest one
+            to about 5 cm; the robot may have been nearer between two messages. None if the place
+            is no circle.
+        closest_at: log time of this pose; None if the place is no circle.
         restarts: how often odometry was reset since.
         already_inside: it was not seen to enter: `arrived` is when the window, or its poses, begin.
         still_inside: it was not seen to leave: `departed` is when the window, or its poses, end.
