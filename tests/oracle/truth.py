@@ -5,8 +5,9 @@ checked, `sqlite3` reads the table of messages row by row, `rosbags` decodes, nu
 calculate. Times are nanoseconds since the Unix epoch, lengths metres.
 """
 
+import math
 import sqlite3
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,14 +24,19 @@ from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyp
 
 SLACK_NS: Final = 1_000
 """A time in float seconds lies up to half a microsecond beside its nanoseconds."""
+EARLY_NS: Final = 2 * SLACK_NS
+"""A message may lie so far before the start of a window that has it.
+
+Replies round the time of a message up to whole microseconds. A window from that time on has this
+message, which is up to a microsecond older, as well as what the float of seconds adds.
+"""
 
 STATIC: Final = ("/tf_static",)
 SELDOM_NS: Final = 5 * 10**9
-CONVERTED: Final = (
-    "builtin_interfaces/msg/Duration",
-    "builtin_interfaces/msg/Time",
-    "geometry_msgs/msg/Quaternion",
-)
+TIMES: Final = ("builtin_interfaces/msg/Duration", "builtin_interfaces/msg/Time")
+QUATERNION: Final = "geometry_msgs/msg/Quaternion"
+ANGLES: Final = ("roll_deg", "pitch_deg", "yaw_deg")
+"""As which replies show a quaternion: rotations about the fixed axes x, y and z, one by one."""
 ADDED: Final = ("__msgtype__", "structure_needs_at_least_one_member")
 """What rosbags and the generator of empty messages add."""
 
@@ -79,6 +85,11 @@ class Topic:
         """The messages of `[start, end]`."""
         first, after = np.searchsorted(self.times, [start, end + 1])
         return self.rows[int(first) : int(after)]
+
+    def bounds(self, start: int, end: int) -> tuple[list[Row], list[Row]]:
+        """The messages that every answer about `[start, end]` has, and those that it may have."""
+        surely = self.within(start + SLACK_NS, end - SLACK_NS)
+        return surely, self.within(start - EARLY_NS, end + SLACK_NS)
 
 
 @dataclass
@@ -225,10 +236,10 @@ class History:
     def scalars(self, topic: str, *, as_shown: bool = False) -> dict[str, type]:
         """The paths of a topic's booleans, numbers and texts that are not inside a list.
 
-        `as_shown`: without the parts of times and quaternions, which replies convert.
+        `as_shown`: as replies convert them, a time to seconds and a quaternion to angles.
         """
         found: dict[str, type] = {}
-        _walk(self.topics[topic].rows[0].body, "", found, CONVERTED if as_shown else ())
+        _walk(self.topics[topic].rows[0].body, "", found, as_shown=as_shown)
         return found
 
     def edges(self, topics: Sequence[tuple[str, bool]]) -> dict[str, Edge]:
@@ -252,10 +263,30 @@ class History:
 
 
 def path_of(body: Any, path: str) -> Any:
-    """The part of a decoded message at a dot-path."""
+    """The part of a decoded message at a dot-path of `History.scalars`."""
     for name in path.split("."):
-        body = getattr(body, name)
-    return body
+        body = _angle(body, name) if name in ANGLES else getattr(body, name)
+    return _seconds(body) if getattr(body, "__msgtype__", None) in TIMES else body
+
+
+def _angle(turn: Any, name: str) -> float:
+    """One of the angles (degrees) whose rotations about fixed x, y and z make up a quaternion.
+
+    NaN where it is none, as of a message that nobody filled in.
+    """
+    length = math.hypot(turn.x, turn.y, turn.z, turn.w)
+    if not 0 < length < math.inf:
+        return math.nan
+    x, y, z, w = turn.x / length, turn.y / length, turn.z / length, turn.w / length
+    if name == "roll_deg":
+        return math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
+    if name == "pitch_deg":
+        return math.degrees(math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0)))
+    return math.degrees(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def _seconds(time: Any) -> float:
+    return float(time.sec + time.nanosec / 1e9)
 
 
 def planar(rows: Sequence[Row]) -> NDArray[np.float64]:
@@ -264,14 +295,20 @@ def planar(rows: Sequence[Row]) -> NDArray[np.float64]:
     return np.array([[each.x, each.y] for each in where]).reshape(-1, 2)
 
 
-def _walk(body: Any, path: str, found: dict[str, type], skipped: Collection[str]) -> None:
+def _walk(body: Any, path: str, found: dict[str, type], *, as_shown: bool) -> None:
+    kind = getattr(body, "__msgtype__", None)
+    if as_shown and kind == QUATERNION:
+        found.update((f"{path}{angle}", float) for angle in ANGLES)
+        return
+    if as_shown and kind in TIMES:
+        found[path.removesuffix(".")] = float
+        return
     for each in fields(body):
         if each.name.isupper() or each.name in ADDED:
             continue  # a constant, or nothing of the message's own
         name, value = f"{path}{each.name}", getattr(body, each.name)
         if is_dataclass(value):
-            if getattr(value, "__msgtype__", None) not in skipped:
-                _walk(value, f"{name}.", found, skipped)
+            _walk(value, f"{name}.", found, as_shown=as_shown)
         elif isinstance(value, bool | int | float | str):
             found[name] = type(value)
 
