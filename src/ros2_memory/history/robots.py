@@ -59,8 +59,6 @@ _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = 
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
 _OWN: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings that the recorder of the bag directory made."""
-_MINGLED: Final[Key[Mapping[str, str]]] = Key()
-"""Of a call: by path, the recording of each loose bag beside bags of another recording."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: by path of a closed recording, the parent of each static frame."""
 SET_BACK: Final = "the clock was set back between recordings"
@@ -438,7 +436,7 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
     spans = [_TopicSpan(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
     steps = _steps_back(view)
     loose_files: dict[str, list[str]] = defaultdict(list)
-    for file, recording in _mingled(view).items():
+    for file, recording in mingled_bags(view.snapshot).items():
         loose_files[recording].append(file)
     going_on: list[_TopicSpan] = []
     for later in sorted(spans):
@@ -461,23 +459,19 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
 
 def _recordings_with(view: View, topic: str) -> dict[Path, Span]:
     """Returns the recordings that hold a topic, with its first and last log time in each."""
-    if not _mingled(view):
+    mingled = mingled_bags(view.snapshot)
+    if not mingled:
         return dict(view.timeline.recordings(topic))
     recordings: dict[Path, Span] = {}
     for bag, first, last in view.timeline.extents(topic, TimeWindow.everything()):
-        path = _recording_of(view, bag)
+        path = _recording_of(bag, mingled)
         recordings[path] = wider(recordings.get(path), (first, last))
     return recordings
 
 
-def _recording_of(view: View, bag: BagFile) -> Path:
-    """Returns the recording of a bag: its folder, or its own name if it is loose beside others."""
-    name = _mingled(view).get(bag.file)
-    return bag.recording if name is None else Path(name)
-
-
-def _mingled(view: View) -> Mapping[str, str]:
-    return view.memo.of(_MINGLED, lambda: mingled_bags(view.snapshot))
+def _recording_of(bag: BagFile, mingled: Mapping[str, str]) -> Path:
+    """Returns the recording of a bag: its folder, unless it is among the `mingled_bags`."""
+    return Path(mingled[bag.file]) if bag.file in mingled else bag.recording
 
 
 def _has_bags_near(view: View, topic: str, recording: Path, span: TimeWindow) -> bool:
@@ -528,7 +522,7 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
     steps: dict[Path, Ns] = defaultdict(int)
     for fault in view.snapshot.dating.faults:
         if fault.kind is FaultyClock.SET_BACK:
-            recording = _recording_of(view, fault.bag)
+            recording = _recording_of(fault.bag, mingled_bags(view.snapshot))
             steps[recording] = max(fault.by, steps[recording])
     return steps
 
@@ -542,8 +536,9 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
         return False
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
+    mingled = mingled_bags(view.snapshot)
     first, other = (
-        [extent for extent in near if _recording_of(view, extent.bag) == path] for path in pair
+        [extent for extent in near if _recording_of(extent.bag, mingled) == path] for path in pair
     )
     differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
