@@ -19,7 +19,7 @@ import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.facts import has_errors
 from ros2_memory.analysis.sights import Spot
@@ -72,6 +72,17 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
 
+_Kind: TypeAlias = Literal[
+    "appeared",
+    "more_or_fewer",
+    "moved",
+    "not_comparable",
+    "not_looked_at",
+    "not_seen_where_expected",
+    "same",
+]
+"""The lists of `ComparedThings`, or "same"."""
+
 _SHARE: Final = 0.1
 _LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}
 _LEAST_APART_M: Final = 0.5
@@ -109,89 +120,159 @@ def compare(
         other = TimeWindow.from_unix(with_start_s, with_end_s)
     except InvalidArgumentsError as error:
         raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
-    view = open_view(memory, call, min(max(asked.stop, other.stop), memory.clock.now()))
-    unlisted: list[float | None] = [0.0, 0.0]
-    for nth, window in enumerate((asked, other)):
-        if gap_around(view, window) is not None:
-            # An error that is not listed there is unknown, rather than 0.
-            note_unrecorded(view, window)
-            unlisted[nth] = None
-    windows = call.asked = clamped(view, asked), clamped(view, other)
-    frame, things = _compare_things(view, windows, region)
-    drives = [drive_in(view, window) for window in windows]
-    way = [
-        _path_numbers(view, drive, window) for drive, window in zip(drives, windows, strict=True)
-    ]
-    placement = known_placement(view)
-    minutes = _minutes_in_places(view, placement, windows, region, drives)
-    paths = _compare_paths(view, placement, drives, windows, region)
-    errors = [_error_counts(view, window) for window in windows]
-    silences = [_silent_seconds(view, window) for window in windows]
-    note_unread(view, windows[0], of="from start to end: ", gaps=False)
-    note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
-    lengths, recorded = [], []
-    for window, drive in zip(windows, drives, strict=True):
-        lengths.append(unix_from_ns(drive.elapsed.between(*window.asked())))
-        recorded.append(_recorded_seconds(view, window, drive.elapsed))
-    if differ(recorded[0], recorded[1], _LEAST_RECORDED_S):
-        view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
-    view.notes.retract_outside(*windows)
+    views = _views_of(memory, call, (asked, other))
+    windows = clamped(views[0], asked), clamped(views[1], other)
+    call.asked = windows
+    this, that = sides = _side_of(views[0], windows[0]), _side_of(views[1], windows[1])
+    frame, things = _compare_things(sides, region)
+    minutes = _minutes_in_places(sides, region)
+    paths = _compare_paths(sides, region)
+    note_unread(this.view, this.window, of="from start to end: ", gaps=False)
+    note_unread(that.view, that.window, of="from with_start to with_end: ", gaps=False)
+    notes = this.view.notes
+    if differ(this.recorded_s, that.recorded_s, _LEAST_RECORDED_S):
+        notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
+    for side in sides:
+        side.view.notes.retract_outside(*windows)
     if region is not None:
-        view.notes.add("way, errors and silent_s are not only of that place")
+        notes.add("way, errors and silent_s are not only of that place")
+    unlisted = this.unlisted, that.unlisted
     return Comparison(
         oldest=min(window.start for window in windows),
         newest=max(window.stop for window in windows),
-        lengths=Pair(*lengths),
-        recorded=Pair(*recorded),
+        lengths=Pair(this.length_s, that.length_s),
+        recorded=Pair(this.recorded_s, that.recorded_s),
         frame_id=frame,
         things=things,
-        way=_differing(*way, least=_LEAST),
+        way=_differing(this.way, that.way, least=_LEAST),
         places=_differing(*minutes, least=_LEAST_MINUTES),
-        errors=_differing(*errors, least=_LEAST_COUNT, unlisted=unlisted),
-        silences=_differing(*silences, least=_LEAST_SILENT_S, unlisted=unlisted),
+        errors=_differing(this.errors, that.errors, least=_LEAST_COUNT, unlisted=unlisted),
+        silences=_differing(this.silences, that.silences, least=_LEAST_SILENT_S, unlisted=unlisted),
         way_frame_id=paths.frame_id,
         stood=paths.stood,
         farthest=paths.farthest,
-        notes=view.notes.sentences(),
+        notes=tuple(dict.fromkeys([*notes.sentences(), *that.view.notes.sentences()])),
     )
 
 
-def _compare_things(
-    view: View, windows: tuple[TimeWindow, TimeWindow], where: Where | None
-) -> tuple[str, ComparedThings]:
+def _views_of(
+    memory: Memory, call: Call, windows: tuple[TimeWindow, TimeWindow]
+) -> tuple[View, View]:
+    """Returns the view for each window: one for both, unless it does not show the earlier one.
+
+    Raises:
+        NoDataError: nothing is recorded.
+    """
+    now = memory.clock.now()
+    view = open_view(memory, call, min(max(window.stop for window in windows), now))
+
+    def view_of(window: TimeWindow) -> View:
+        older = view.snapshot.older
+        if older is None or window.start > older:
+            return view
+        return open_view(memory, call, min(window.stop, now))
+
+    return view_of(windows[0]), view_of(windows[1])
+
+
+class _Side(NamedTuple):
+    """One of the two windows, and what is compared of it.
+
+    Attributes:
+        view: shows the days of the window.
+        is_recorded: whether anything was recorded in it.
+        placement: the frames of the robot's poses and of places; None without poses.
+        way: the numbers of the path by the names in `_LEAST`; None for an unknown number.
+        errors: how often each error was reported, by its text.
+        silences: for how many seconds each topic was silent while the robot was on.
+        length_s: how long the window is.
+        recorded_s: how much of it was recorded.
+    """
+
+    view: View
+    window: TimeWindow
+    is_recorded: bool
+    drive: Drive
+    placement: MapPlacement | None
+    way: Mapping[str, float | None]
+    errors: Mapping[str, float]
+    silences: Mapping[str, float]
+    length_s: float
+    recorded_s: float
+
+    @property
+    def unlisted(self) -> float | None:
+        """The number of an error that is not listed: 0, or None as nothing was recorded."""
+        return 0.0 if self.is_recorded else None
+
+
+def _side_of(view: View, window: TimeWindow) -> _Side:
+    is_recorded = gap_around(view, window) is None
+    if not is_recorded:
+        note_unrecorded(view, window)
+    drive = drive_in(view, window)
+    return _Side(
+        view,
+        window,
+        is_recorded,
+        drive,
+        known_placement(view),
+        _path_numbers(view, drive, window),
+        _error_counts(view, window),
+        _silent_seconds(view, window),
+        unix_from_ns(drive.elapsed.between(*window.asked())),
+        _recorded_seconds(view, window, drive.elapsed),
+    )
+
+
+def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[str, ComparedThings]:
     """Returns the frame of things, and what became of them from the earlier window to the later."""
+    first, second = sorted(sides, key=lambda side: (side.window.start, side.window.stop))
+    view, earlier, later = second.view, first.window, second.window
     limits = view.limits
-    for window in windows:
-        note_undecoded(view, window)
-        view.notes.add(*describe_hung(view, window))
-    both = TimeWindow(
-        min(window.start for window in windows), max(window.stop for window in windows)
+    for side in sides:
+        note_undecoded(side.view, side.window)
+        side.view.notes.add(*describe_hung(side.view, side.window))
+    if first.view is not view:
+        view.notes.add(
+            "things are not compared: so many bags lie between the two times that they are not "
+            "looked at together; find_things answers about each"
+        )
+        return "", ComparedThings()
+    things = known_things(
+        view, limits.min_score, TimeWindow(earlier.start, max(earlier.stop, later.stop))
     )
-    things = known_things(view, limits.min_score, both)
     note_other_frames(view, things, where)
     epochs = [instance.epoch for instance in things.estimate.instances]
     frame = things.frames[epochs[0] if epochs else 0]
-    first, second = sorted(windows, key=lambda window: (window.start, window.stop))
-    if any(gap_around(view, window) is not None for window in windows):
+    if not (first.is_recorded and second.is_recorded):
         view.notes.add("things are not compared: there is nothing to compare them with")
         return frame, ComparedThings()
-    if first.start == second.start:
+    if earlier.start == later.start:
         view.notes.add("things are not compared: the two times begin together")
         return frame, ComparedThings()
-    if second.stop < first.stop:
+    if later.stop < earlier.stop:
         view.notes.add(
-            f"things are not compared after {unix_text(second.asked()[1])}, where one of the two "
+            f"things are not compared after {unix_text(later.asked()[1])}, where one of the two "
             "times ends within the other"
         )
     has_runs = len({*epochs}) > 1 and not things.has_map
-    if has_runs and not is_one_run(view, resolve_path_topic(view), windows):
+    if has_runs and not _are_of_one_run(sides):
         view.notes.add(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, (first, second)))
+    windows = earlier, later
+    view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, windows))
     places = places_asked(limits, where, things.frames)
-    return frame, _ThingsBetween(things, first, second, where, places).compare()
+    return frame, _ThingsBetween(things, earlier, later, where, places).compare()
+
+
+def _are_of_one_run(sides: tuple[_Side, _Side]) -> bool:
+    """Returns whether all poses of two windows are known to be of one run of odometry."""
+    this, that = sides
+    topic = resolve_path_topic(this.view)
+    return this.view is that.view and is_one_run(this.view, topic, (this.window, that.window))
 
 
 class _StayInWindow(NamedTuple):
@@ -232,7 +313,7 @@ class _ThingsBetween:
 
     def compare(self) -> ComparedThings:
         """Returns what differs, each list with the things seen last first."""
-        lists: dict[str, list[ComparedThing]] = defaultdict(list)
+        lists: dict[_Kind, list[ComparedThing]] = defaultdict(list)
         not_looked_at: list[tuple[Instance, ComparedThing]] = []
         same = 0
         for instance in self.known.estimate.instances:
@@ -264,7 +345,7 @@ class _ThingsBetween:
 
     def _difference(
         self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None
-    ) -> tuple[str, ComparedThing]:
+    ) -> tuple[_Kind, ComparedThing]:
         """Returns which list of `ComparedThings` a thing is in, or "same", and the thing."""
         thing = ComparedThing(
             label=instance.label,
@@ -407,20 +488,16 @@ class _PathDifferences(NamedTuple):
     farthest: tuple[FarFromOther | None, FarFromOther | None] = None, None
 
 
-def _compare_paths(
-    view: View,
-    placement: MapPlacement | None,
-    drives: Sequence[Drive],
-    windows: tuple[TimeWindow, TimeWindow],
-    where: Where | None,
-) -> _PathDifferences:
+def _compare_paths(sides: tuple[_Side, _Side], where: Where | None) -> _PathDifferences:
     """Returns where the robot stood, and where it drove, in one window and not in the other."""
-    if placement is None or any(drive.path is None for drive in drives):
+    view = sides[0].view
+    placement, *others = {side.placement for side in sides}
+    if placement is None or others or any(side.drive.path is None for side in sides):
         return _PathDifferences()
     frame = placement.frame_id
     if where is not None and where.frame_id not in {None, frame}:
         return _PathDifferences()
-    if not placement.is_map and not is_one_run(view, resolve_path_topic(view), windows):
+    if not placement.is_map and not _are_of_one_run(sides):
         view.notes.add(
             f"standstills and paths are not compared: {changing_origin(frame)}, and no transforms "
             "lead to a map"
@@ -428,17 +505,18 @@ def _compare_paths(
         return _PathDifferences()
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
-    first, second = (known_track(view, frame, window).track for window in windows)
-    stands = []
-    for track, drive in zip((first, second), drives, strict=True):
-        spans = (stop.span for stop in drive.standstills)
+    stands, tracks = [], []
+    for side in sides:
+        track = known_track(side.view, frame, side.window).track
+        spans = (stop.span for stop in side.drive.standstills)
         stands.append([*placed_standstills(track, spans, region)])
+        tracks.append((track, side.window))
     stood = [
         at._replace(inside=places_at(places, frame, *at.place))
         for at in _standstill_differences(stood_at(*stands))
     ]
     farthest: list[FarFromOther | None] = []
-    for point in farthest_apart((first, windows[0]), (second, windows[1]), region):
+    for point in farthest_apart(*tracks, region):
         if point is None or point.away_m < _LEAST_APART_M:
             farthest.append(None)
         else:
@@ -459,39 +537,37 @@ def _standstill_differences(places: Iterable[StandstillPlace]) -> list[Standstil
 
 
 def _minutes_in_places(
-    view: View,
-    placement: MapPlacement | None,
-    windows: tuple[TimeWindow, TimeWindow],
-    where: Where | None,
-    drives: Sequence[Drive],
+    sides: tuple[_Side, _Side], where: Where | None
 ) -> list[dict[str, float | None]]:
     """Returns for each window the minutes in each named place, or in a region.
 
     A number is None if it is unknown at all times of the window where the robot was. Places where
     the robot was in neither window are left out.
     """
-    places = view.limits.places
-    if placement is None or (where is None and not places):
-        return [{}, {}]
     minutes_of_windows: list[dict[str, float | None]] = []
-    visited = set[str]()
-    for window, drive in zip(windows, drives, strict=True):
-        if where is None:
-            tracks = places_in(view, places, placement, window)
-        else:
-            asked = where.places(placement.frame_id)
-            tracks = [(place, known_track(view, place.frame_id, window)) for place in asked]
-        minutes: dict[str, float | None] = {}
-        for place, track in tracks:
-            lasted = drive.elapsed.among(stay.span for stay in track.inside(place.region, window))
-            minutes[place.name] = unix_from_ns(lasted) / 60 if track.reaches(window) else None
-            if minutes[place.name]:
-                visited.add(place.name)
-        minutes_of_windows.append(minutes)
-    return [
-        {name: lasted for name, lasted in minutes.items() if name in visited}
-        for minutes in minutes_of_windows
-    ]
+    for side in sides:
+        if side.placement is None:
+            return [{}, {}]
+        minutes_of_windows.append(_minutes_of(side, side.placement, where))
+    visited = {name for minutes in minutes_of_windows for name, lasted in minutes.items() if lasted}
+    return [{name: minutes.get(name) for name in visited} for minutes in minutes_of_windows]
+
+
+def _minutes_of(
+    side: _Side, placement: MapPlacement, where: Where | None
+) -> dict[str, float | None]:
+    """Returns the minutes in each named place, or in each place of a region, in a window."""
+    view, window = side.view, side.window
+    if where is None:
+        tracks = places_in(view, view.limits.places, placement, window)
+    else:
+        places = where.places(placement.frame_id)
+        tracks = [(place, known_track(view, place.frame_id, window)) for place in places]
+    minutes: dict[str, float | None] = {}
+    for place, track in tracks:
+        lasted = side.drive.elapsed.among(stay.span for stay in track.inside(place.region, window))
+        minutes[place.name] = unix_from_ns(lasted) / 60 if track.reaches(window) else None
+    return minutes
 
 
 def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:

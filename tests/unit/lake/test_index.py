@@ -385,3 +385,15 @@ def test_a_type_of_days_before_is_described(changed: Robot) -> None:
     assert describe("std_msgs/msg/String").topics == ("/chatter", "/dock")
     with pytest.raises(NoDataError, match=r"BatteryState, std_msgs/msg/Bool$"):
         describe("std_msgs/msg/Int8")
+
+
+def test_each_of_two_windows_is_compared_by_its_own_days(changed: Robot) -> None:
+    today, then = (START_S, START_S + 70), (LONG_AGO_S, LONG_AGO_S + 70)
+    for (start, end), (with_start, with_end) in ((today, then), (then, today)):
+        spans = {"start": start, "end": end, "with_start": with_start, "with_end": with_end}
+        found = asked_alone(changed, "compare", **spans)
+        recorded = [found["recorded_s"][name] for name in ("this", "with")]
+        assert sorted(recorded) == [1.0, 61.0]
+        assert (found["recorded_s"]["this"] == 61.0) is (start == LONG_AGO_S)
+        assert "nothing was recorded between" not in str(found)
+        assert "find_things answers about each" in str(found["notes"])
