@@ -142,8 +142,9 @@ def _http_endpoint(settings: Settings) -> _HttpEndpoint:
 
     host = settings.server.host
     address = resolve(host, settings.server.port)
-    limited = limited_tokens(settings.fleet.tokens)
-    token = take_token(os.environ, host=host, loopback=address.is_loopback, limited=bool(limited))
+    files = settings.fleet.tokens
+    token = take_token(os.environ, host=host, loopback=address.is_loopback, limited=bool(files))
+    limited = limited_tokens(files, token)
     return _HttpEndpoint(address, token.get_secret_value() if token else None, limited)
 
 

@@ -313,11 +313,18 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
     return None
 
 
-def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[str]]:
+def limited_tokens(
+    robots: Mapping[Path, Sequence[str]], for_all: SecretStr | None
+) -> dict[str, frozenset[str]]:
     """Reads the tokens in files, and returns each with the robots that it is for.
 
+    Args:
+        robots: by file, the robots that its token is for.
+        for_all: the API token, which is for everything.
+
     Raises:
-        ConfigError: a file cannot be read, its token cannot be used, or two have the same one.
+        ConfigError: a file cannot be read, its token cannot be used, or two have the same one, or
+            one has the API token.
     """
     tokens: dict[str, frozenset[str]] = {}
     for path, names in robots.items():
@@ -325,6 +332,8 @@ def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[
         text = _read_token(path, source)
         if text in tokens:
             raise ConfigError(f"{source}: another file has the same token; {_HOW}")
+        if for_all is not None and text == for_all.get_secret_value():
+            raise ConfigError(f"{source}: it is the API token, which is for everything; {_HOW}")
         tokens[text] = frozenset(names)
     return tokens
 

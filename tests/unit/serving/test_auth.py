@@ -11,6 +11,7 @@ import httpx2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import SecretStr
 from starlette.responses import PlainTextResponse
 from structlog.testing import capture_logs
 
@@ -24,6 +25,7 @@ from ros2_memory.serving.auth import (
     TokenGate,
     api_token,
     is_admitted,
+    limited_tokens,
     take_token,
 )
 from ros2_memory.serving.listen import CannotListenError, listen, resolve
@@ -241,6 +243,18 @@ def test_a_server_on_the_loopback_address_may_have_one_which_what_it_starts_has_
     assert take_token(env, host="127.0.0.1", loopback=True)
     assert env == {"PATH": "/bin"}
     assert "MEMORY_API_TOKEN" not in without_ours({"MEMORY_API_TOKEN": GOOD})
+
+
+def test_a_limited_one_that_is_also_for_everything_is_refused(tmp_path: Path) -> None:
+    """Whoever shows it would be answered about all robots."""
+    site, other = tmp_path / "site", tmp_path / "other"
+    site.write_text(f"{GOOD}\n")
+    other.write_text("another-0123456789")
+    with pytest.raises(ConfigError, match="site: it is the API token") as refusal:
+        limited_tokens({other: ["r2"], site: ["r1"]}, SecretStr(GOOD))
+    assert GOOD not in str(refusal.value)
+    tokens = limited_tokens({site: ["r1"]}, SecretStr(f"{GOOD[:-1]}0"))
+    assert tokens == limited_tokens({site: ["r1"]}, None) == {GOOD: frozenset({"r1"})}
 
 
 def test_in_a_file_of_the_configuration_it_is_refused_and_not_repeated(tmp_path: Path) -> None:
