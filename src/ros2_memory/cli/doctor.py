@@ -5,6 +5,7 @@ One function for each concern; each yields findings, and changes nothing.
 
 import http.client
 import os
+import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -339,7 +340,7 @@ def _remedy(file: SetAside, memory: Memory) -> str:
         return _READ
     with suppress(BagError):
         if file.path.suffix == ".mcap" and memory.reader.closing(file.path) is Closing.OPEN:
-            return f"ros2-memory recover {memory.index.bag_dir}"
+            return f"ros2-memory recover {shlex.quote(str(memory.index.bag_dir))}"
     return "copy them again from their source; what is so there, too, cannot be read"
 
 

@@ -21,6 +21,7 @@ from mcp import Client, MCPError
 from mcp.client.sse import sse_client
 from mcp.types import TextContent
 
+from ros2_memory.config_sources import quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Ns, WallClock, ns_from_unix
 from ros2_memory.demo.messages import MessageSchedule
@@ -123,7 +124,7 @@ def server_environment(
         "MEMORY_CONFIG_OVERRIDES": (
             f"recorder=none storage=mcap reader.index_refresh_s=1 "
             f"recording.split_duration_s={SPLIT_DURATION_S:g} "
-            f"{shlex.quote(f'data.places_file={bag_dir / PLACES_NAME}')}"
+            f"{shlex.quote(f'data.places_file={quoted(str(bag_dir / PLACES_NAME))}')}"
         ),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import threading
 import time
 from contextlib import suppress
@@ -447,7 +448,7 @@ class Housekeeping:
             else:
                 reason = (
                     f"{size} bytes are too many to repair while recording: "
-                    f"run ros2-memory recover {path}"
+                    f"run ros2-memory recover {shlex.quote(str(path))}"
                 )
                 _log.error("bag_not_repaired", path=str(path), reason=reason)
         return repaired

@@ -7,6 +7,7 @@ Messages of some topics, or from when the robot was in a place, are taken out of
 (`retention.eraser`).
 """
 
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -351,7 +352,7 @@ class _Forget:
                 "`ros2-memory adopt` take that"
             )
             if folder := self._own.name_of(bag.path.parent):
-                adopt = f"`ros2-memory adopt {folder}` first"
+                adopt = f"`ros2-memory adopt {shlex.quote(folder)}` first"
             return f"this recorder did not make it; to forget it, {adopt}"
         if bag.state is BagState.INCOMPLETE:
             closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
