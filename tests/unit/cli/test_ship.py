@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,7 @@ from ros2_memory import bootstrap, bootstrap_fleet, cli
 from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
+from ros2_memory.lake.shipper import Shipper
 from ros2_memory.lake.upkeep import TOMBSTONES_FILE
 from ros2_memory.lake.warehouse import LakeLocation, writing_alone
 from tests.support.fleets import START_S, seeded, write_robot
@@ -118,6 +120,25 @@ def test_full_batches_do_not_wait_for_each_other(
     ship: Ship, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
+    waited: list[float] = []
+    monkeypatch.setattr(ship_module, "_wait", waited.append)
+    ship(0, "lake.commit_interval_s=3600")
+    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
+    assert waited == []
+
+
+def test_one_pass_does_not_wait_before_its_last_batch(
+    ship: Ship, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No more bags come while it waits."""
+    commit, are_full = Shipper._commit, iter([True])
+
+    def commit_batch(shipper: Shipper, batch: Any, *, is_full: bool) -> None:
+        assert is_full
+        commit(shipper, batch, is_full=next(are_full, False))
+
+    monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
+    monkeypatch.setattr(Shipper, "_commit", commit_batch)
     waited: list[float] = []
     monkeypatch.setattr(ship_module, "_wait", waited.append)
     ship(0, "lake.commit_interval_s=3600")

@@ -64,7 +64,7 @@ def ship(
     level = settings.logging.level if verbose or goes_on else "warning"
     configure_logging(level, settings.logging.format)
     with writing_alone(location.state_dir):
-        service = _ShippingService(overrides, shared, settings, location, robots)
+        service = _ShippingService(overrides, shared, settings, location, robots, goes_on)
         if goes_on:
             service.run()
         location.claim()
@@ -164,6 +164,7 @@ class _ShippingService:
     """Ships the bags of robots into a lake.
 
     Attributes:
+        goes_on: whether it ships until it is stopped, and waits for more bags before a commit.
         committed_s: when it last began a commit, by the monotonic clock.
         kept_up_s: when it last tidied the lake, by the monotonic clock.
         reported: the problems of the last pass, which were logged.
@@ -174,6 +175,7 @@ class _ShippingService:
     settings: Settings
     location: "LakeLocation"
     robots: "Sequence[RobotBags]"
+    goes_on: bool
     committed_s: float = -math.inf
     kept_up_s: float = -math.inf
     reported: "Sequence[str]" = ()
@@ -206,9 +208,10 @@ class _ShippingService:
     def _before_commit(self, is_full: bool) -> None:
         """Waits until `lake.commit_interval_s` has passed since the last commit.
 
-        Not before the commit of a full batch: more than a batch may come in that time.
+        Not before the commit of a full batch: more than a batch may come in that time. Nor in a
+        single pass, for which no more bags come.
         """
-        if not is_full:
+        if self.goes_on and not is_full:
             _wait(self.committed_s + self.settings.lake.commit_interval_s - time.monotonic())
         self.committed_s = time.monotonic()
         self.location.claim()
