@@ -329,12 +329,13 @@ def zones_of(leaf: Leaf, of_column: ZonesOf[str]) -> Zones | None:
         leaf: the leaf.
         of_column: returns the zones of a column by its path.
     """
-    if leaf.conversion in _ANGLES:
-        most = (90.0 if leaf.conversion is Conversion.PITCH else 180.0) + _ROUNDING_DEG
-        return Zones.of([0], [Zone(-most, most)])  # the same for all parts
     zones = of_column(leaf.level.full(leaf.sources[0]))
     if zones is None:
         return None
+    if leaf.conversion in _ANGLES:
+        most = (90.0 if leaf.conversion is Conversion.PITCH else 180.0) + _ROUNDING_DEG
+        bounds = np.full(zones.parts.size, most)
+        return zones._replace(low=-bounds, high=bounds)
     if leaf.is_of_array and leaf.level.parent is not None:
         lengths = of_column(leaf.level.parent.full(f"{leaf.level.name}.length"))
         if lengths is None:

@@ -145,8 +145,8 @@ def count_visits(
     if place is not None and by != "place":
         stays = _stays(view, placement.frame_id, place.region, window)
         if not stays:
-            ask = f'ask with frame_id "{placement.pose_frame}"'
-            note_other_frame(view, place, placement, binned.window, ask)
+            advice = f'ask with frame_id "{placement.pose_frame}"'
+            note_other_frame(view, place, placement, binned.window, advice)
         _add_visits(binned, stays)
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)

@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
-from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree
+from ros2_memory.index.scan import BAG_DIR_SETTING, ScanResult, Stamp, Tree
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
@@ -247,7 +247,7 @@ class BagTable:
             and notes.trusted
             # A compressed bag may lie beside the file it was made from.
             and notes.kind in PLAIN_KINDS
-            and notes.stamp.mtime_ns < context.now - max(context.three_splits, YOUNG_NS)
+            and notes.stamp.mtime_ns < context.settled_before
             and path not in self._watched
             and other_form(path) not in self._files
         )
@@ -257,7 +257,6 @@ class BagTable:
 
         Returns by path the other known bags whose files are unchanged.
         """
-        last = context.now - max(context.three_splits, YOUNG_NS)
         kinds = tuple(kind for kind in PLAIN_KINDS if self._reader.reads(Path(f"bag{kind}")))
         compressed = {path for path in stamps if path.endswith(COMPRESSED)}
         others: dict[str, BagFile] = {}
@@ -272,7 +271,7 @@ class BagTable:
                     are_settled[row] = False
                 elif (
                     not are_settled[row]
-                    or stamp.mtime_ns >= last
+                    or stamp.mtime_ns >= context.settled_before
                     or not path.endswith(kinds)
                     or (compressed and other_form(path) in compressed)
                 ):

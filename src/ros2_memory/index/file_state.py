@@ -114,6 +114,11 @@ class ScanContext:
     trusts_mtime: bool = True
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
 
+    @property
+    def settled_before(self) -> Ns:
+        """The time before which a closed file changed last, if it does not change any more."""
+        return self.now - max(self.three_splits, YOUNG_NS)
+
     @cached_property
     def withheld(self) -> Withheld:
         """What the recorder has not released yet.

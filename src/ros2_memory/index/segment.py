@@ -352,17 +352,25 @@ class Segment:
     @cached_property
     def pacings(self) -> dict[str, Pacing]:
         """By topic, how often the bags hold it."""
-        numbers, lengths = self._parts_between_absences()
-        counts = numbers[:, :, 0]
-        spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
-        rows = zip(spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
-        return {topic: Pacing(*row) for topic, row in zip(sorted(self.types), rows, strict=True)}
+        pacings, _ = self._pacings_and_runs
+        return pacings
 
     @cached_property
     def runs(self) -> dict[str, tuple[Span, ...]]:
         """By topic, when the bags hold it; see `analysis.silences`."""
-        numbers, _ = self._parts_between_absences()
-        return dict(zip(sorted(self.types), _runs(numbers), strict=True))
+        _, runs = self._pacings_and_runs
+        return runs
+
+    @cached_property
+    def _pacings_and_runs(self) -> tuple[dict[str, Pacing], dict[str, tuple[Span, ...]]]:
+        # Both at once: the numbers of all parts take too much memory to be kept.
+        numbers, lengths = self._parts_between_absences()
+        counts = numbers[:, :, 0]
+        spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
+        rows = zip(spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
+        topics = sorted(self.types)
+        pacings = {topic: Pacing(*row) for topic, row in zip(topics, rows, strict=True)}
+        return pacings, dict(zip(topics, _runs(numbers), strict=True))
 
     def _parts_between_absences(self) -> tuple[Ints, Ints]:
         """Cuts bags at the absences that their summaries state.
@@ -371,30 +379,38 @@ class Segment:
         first part of every bag, then all later parts. And for each topic the length (ns) of the
         bags that hold it, without its absences.
         """
-        headers, topics = sorted(self._headers, key=attrgetter("topic")), sorted(self.types)
-        numbers = self._numbers(headers)
-        if len(headers) > len(topics):
-            names = [header.topic for header in headers]
-            numbers = _sum_groups(numbers, [*map(names.index, topics)], axis=0)
+        numbers = self._numbers_by_topic()
         lengths = (numbers[:, :, 0] > 0) @ (self.bags.ends - self.bags.starts)[self._order]
+        row_of = {topic: row for row, topic in enumerate(sorted(self.types))}
         later_parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
         has_absences = self.bags.with_schema(attrgetter("absences"))[self._order]
-        for row in np.flatnonzero(has_absences).tolist():
-            for topic, absences in self.bags[int(self._order[row])].summary.schema.absences:
-                topic_row = topics.index(topic)
-                count, _, last = numbers[topic_row, row].tolist()
-                for start, end, count_before in reversed(absences):
-                    later_parts.append((topic_row, (count - count_before, end, last)))
-                    count, last = count_before, start
-                    lengths[topic_row] -= end - start
-                numbers[topic_row, row, [0, 2]] = count, last
-        if later_parts:
-            more = np.empty((len(topics), len(later_parts), 3), np.int64)
-            more[:] = _NO_MESSAGES
-            for column, (topic_row, part) in enumerate(later_parts):
-                more[topic_row, column] = part
-            numbers = np.concatenate((numbers, more), axis=1)
-        return numbers, lengths
+        for column in np.flatnonzero(has_absences).tolist():
+            bag = self.bags[int(self._order[column])]
+            for topic, absences in bag.summary.schema.absences:
+                row = row_of[topic]
+                first_part, *others = _cut_at(absences, *numbers[row, column].tolist())
+                numbers[row, column] = first_part
+                later_parts += [(row, part) for part in others]
+                lengths[row] -= sum(end - start for start, end, _ in absences)
+        if not later_parts:
+            return numbers, lengths
+        more = np.empty((len(row_of), len(later_parts), 3), np.int64)
+        more[:] = _NO_MESSAGES
+        for column, (row, part) in enumerate(later_parts):
+            more[row, column] = part
+        return np.concatenate((numbers, more), axis=1), lengths
+
+    def _numbers_by_topic(self) -> Ints:
+        """Returns count, first and last log time of each topic (sorted) in each bag.
+
+        The bags are in the order of `_order`.
+        """
+        headers, topics = sorted(self._headers, key=attrgetter("topic")), sorted(self.types)
+        numbers = self._numbers(headers)
+        if len(headers) == len(topics):
+            return numbers
+        names = [header.topic for header in headers]
+        return _sum_groups(numbers, [*map(names.index, topics)], axis=0)
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
@@ -432,6 +448,25 @@ def wider(span: Span | None, other: Span) -> Span:
         return other
     (first, last), (other_first, other_last) = span, other
     return min(first, other_first), max(last, other_last)
+
+
+def _cut_at(
+    absences: Iterable[tuple[Ns, Ns, int]], count: int, first: Ns, last: Ns
+) -> list[tuple[int, Ns, Ns]]:
+    """Returns count, first and last log time of each part of a topic in a bag, in order.
+
+    Args:
+        absences: when the topic was absent, and how many messages came before.
+        count: of all messages of the topic in the bag.
+        first: their first log time.
+        last: their last log time.
+    """
+    parts: list[tuple[int, Ns, Ns]] = []
+    sent = 0
+    for start, end, count_before in absences:
+        parts.append((count_before - sent, first, start))
+        sent, first = count_before, end
+    return [*parts, (count - sent, first, last)]
 
 
 def _sum_groups(numbers: Ints, begins: Sequence[int] | NDArray[np.intp], axis: int) -> Ints:

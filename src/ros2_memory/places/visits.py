@@ -110,8 +110,8 @@ def visits(
     if not placement.is_map:
         shown = _with_restarts(view, topic, shown, now)
     if not confirmed.visits:
-        ask = f'ask with frame_id "{placement.pose_frame}"'
-        note_other_frame(view, place, placement, window, ask)
+        advice = f'ask with frame_id "{placement.pose_frame}"'
+        note_other_frame(view, place, placement, window, advice)
     view.notes.retract_outside(window)
     _note_shown(view, window, shown, newest)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None

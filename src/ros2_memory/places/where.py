@@ -246,12 +246,12 @@ def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
 
 
 def note_other_frame(
-    view: View, where: Where, placement: MapPlacement, window: TimeWindow, ask: str
+    view: View, where: Where, placement: MapPlacement, window: TimeWindow, advice: str
 ) -> None:
     """Notes that the robot was in the region if its coordinates are taken in the poses' frame.
 
     Planners copy coordinates from replies of get_position_*, which may be in that frame, not in the
-    map. Does nothing if the region names a frame. `ask` says how to ask in the poses' frame.
+    map. Does nothing if the region names a frame. `advice` says how to ask in the poses' frame.
     """
     pose_frame = placement.pose_frame
     if where.frame_id is not None or pose_frame == placement.frame_id:
@@ -260,7 +260,7 @@ def note_other_frame(
         if known_track(view, pose_frame, window).inside(where.region, window):
             view.notes.add(
                 f"x and y were taken in {placement.frame_id}; the robot was at those in "
-                f"{pose_frame}, the frame of get_position_*: {ask}"
+                f"{pose_frame}, the frame of get_position_*: {advice}"
             )
 
 
@@ -389,8 +389,8 @@ def known_track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
     placement = map_placement(view, topic, where.frame_id)
     known = known_track(view, where.frame_id or placement.frame_id, window)
     if not known.inside(where.region, window):
-        ask = f'ask it with frame_id "{placement.frame_id}"'
-        note_other_frame(view, where, placement, window, ask)
+        advice = f'ask it with frame_id "{placement.pose_frame}"'
+        note_other_frame(view, where, placement, window, advice)
     return known
 
 

@@ -101,8 +101,6 @@ class OpenFile:
             piece = os.pread(self._descriptor, missing, offset)
             if not piece:
                 raise UnreadableError("it became shorter while it was being read")
-            if len(piece) == length:
-                return piece
             pieces.append(piece)
             offset += len(piece)
             missing -= len(piece)

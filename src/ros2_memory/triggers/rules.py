@@ -239,10 +239,9 @@ def horizons(ends: Mapping[str, Ns], live: Mapping[str, Ns | None], split_ns: Ns
     near = max(LEAST_NEAR_NS, _SPLITS_NEAR * split_ns)
     limits: dict[str, Ns] = {}
     for name, end in ends.items():
-        limits[name] = MAX_NS
-        for other, until in reached.items():
-            if other == name or abs(until - end) <= near:
-                limits[name] = min(limits[name], until)
+        others = reached.items()
+        untils = (until for other, until in others if other == name or abs(until - end) <= near)
+        limits[name] = min(untils, default=MAX_NS)
     return limits
 
 

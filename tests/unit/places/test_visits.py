@@ -119,6 +119,7 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
         ),
     ]
     assert [str(each).count("x and y were taken in map") for each in replies] == [1] * 4, replies
+    assert all('with frame_id "odom"' in str(each) for each in replies)
     for other in ({"frame_id": "odom"}, {"frame_id": "map", "x": 900.0}, {"x": 50.0, "y": 1.0}):
         found = visits(memory, Call(), **pasted | other)
         assert not any("were taken in" in note for note in found.notes)
