@@ -34,6 +34,11 @@ _DEADLINE_CHECK_INTERVAL: Final = 256
 _DELETED: Final = Reason(
     "was deleted before it could be read", "bag", many="were deleted before they could be read"
 )
+_AWAY: Final = Reason(
+    "could not be read, as its disk has been unmounted",
+    "bag",
+    many="could not be read, as their disk has been unmounted",
+)
 _CONTRADICTS_ITSELF: Final = Reason("contradicts itself", "bag", many="contradict themselves")
 _NOT_WHOLE: Final = Reason("could not be read whole", "bag")
 _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
@@ -159,7 +164,8 @@ class BagAccess:
         lost = error.lost or (bag.start, bag.end)
         kind, reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE, error.reason
         if isinstance(error, BagVanishedError):
-            kind, reason = _DELETED, ""
+            is_away = any(aside.path in bag.path.parents for aside in self.snapshot.damaged)
+            kind, reason = _AWAY if is_away else _DELETED, ""
         elif isinstance(error, BagContradictionError):
             kind, lost = _CONTRADICTS_ITSELF, (bag.start, bag.end)
         if window.overlaps(*lost):

@@ -46,6 +46,7 @@ _OTHER_DISK = (
     "the bag directory is on another disk than before, and contains no bags: the disk of the bags "
     "has been unmounted; mount it again, and the bags are found again"
 )
+_AWAY = "its disk has been unmounted; mount it again, and its bags are found again"
 _LINK = "a symbolic link, which is not followed: move or mount the bags into the bag directory"
 
 
@@ -139,6 +140,7 @@ class _Folder:
         odd: names of bags that are no files, or cannot be read.
         sidecar_ns: as in `Stamp`.
         has_metadata: whether it has a metadata.yaml.
+        is_away: whether its disk has been unmounted: its bags are not gone, but cannot be read.
     """
 
     path: str
@@ -154,6 +156,7 @@ class _Folder:
     odd: list[SetAside] = field(default_factory=list)
     sidecar_ns: Ns = 0
     has_metadata: bool = False
+    is_away: bool = False
 
     @property
     def stamps(self) -> dict[str, Stamp]:
@@ -410,7 +413,31 @@ class Tree:
                 for link in folder.links
                 if bag_kind(link.name) or _is_folder(link)
             )
+        self._keep_unmounted(before, result)
         return None
+
+    def _keep_unmounted(self, before: dict[str, _Folder], result: ScanResult) -> None:
+        """Keeps the folders on disks that have been unmounted below the root, with their bags."""
+        for path, folder in before.items():
+            above, after = before.get(_folder_of(path)), self._folders.get(path)
+            if above is None or above.device == folder.device:
+                continue  # no disk was mounted there
+            if after is not None and after.device == folder.device and not after.is_away:
+                continue  # it still is
+            below = [other for other in before if other == path or other.startswith(f"{path}/")]
+            has_bags = any(before[other].names for other in below)
+            if has_bags and not (after and (after.names or after.folders)):
+                result.damaged.append(SetAside(Path(path), _AWAY))
+                for other in below:
+                    self._folders[other] = replace(before[other], trusted=False, is_away=True)
+                result.metadata_folders.extend(
+                    other for other in below if before[other].has_metadata
+                )
+
+    def is_away(self, path: str) -> bool:
+        """Returns whether the disk of a file has been unmounted."""
+        folder = self._folders.get(_folder_of(path))
+        return folder is not None and folder.is_away
 
     def _visit(self, path: str, known: _Folder | None, now: Ns, result: ScanResult) -> _Folder:
         """Returns the known folder if nothing came or went, else lists it anew.
@@ -452,6 +479,8 @@ class Tree:
         """Adds the current stamps of files; with `settled_at`, only if they may have changed."""
         for folder_path, files in groupby(sorted(paths, key=_folder_of), _folder_of):
             folder, in_folder = self._folders.get(folder_path), [*files]
+            if folder is not None and folder.is_away:
+                continue
             stamps = {} if folder is None else folder.stamps_of(in_folder)
             for path in in_folder:
                 if path not in result.stamps and path not in result.gone:

@@ -160,7 +160,8 @@ class Inventory:
         """Returns the bags that may be deleted, and the size of everything else.
 
         A bag that is being written must not be deleted, nor one that cannot be read: its age is
-        unknown. A bag that a crash left open may, unless the recorder named it last.
+        unknown. A bag that a crash left open may, unless the recorder named it last. Bags whose
+        disk has been unmounted are left out.
 
         Raises:
             OSError: the bag directory or the list of the recorder's own recordings cannot be read.
@@ -221,6 +222,8 @@ class Inventory:
     def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the few bags that may still change: the index has a note on each."""
         for path, classification in known.counted.items():
+            if known.tree.is_away(path):
+                continue
             bag = self._stored(path, classification.bag, known.files[path].stamp, known.now)
             other = other_form(path)
             if other in known.hidden:
@@ -233,7 +236,7 @@ class Inventory:
         before, self._settled_bags = self._settled_bags, {}
         new: dict[str, Stamp] = {}
         for path, stamp in known.tree.stamps:
-            if path in known.files:
+            if path in known.files or known.tree.is_away(path):
                 continue
             stored = before.get(path)
             of_file = (stamp.inode, stamp.size, stamp.mtime_ns)
