@@ -170,7 +170,8 @@ def _views_of(
         older = view.snapshot.older
         if older is None or window.start > older:
             return view
-        return open_view(memory, call, min(window.stop, now))
+        own = open_view(memory, call, min(window.stop, now))
+        return view if own.timeline is view.timeline else own
 
     return view_of(windows[0]), view_of(windows[1])
 
