@@ -110,17 +110,6 @@ FAULTS: tuple[Callable[[Path], None], ...] = (
 )
 
 
-@pytest.fixture(autouse=True)
-def _few_cached_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a connection has read before hides no damage."""
-    pragmas = tuple(
-        "cache_size = -64" if pragma.startswith("cache_size") else pragma
-        for pragma in database.PRAGMAS
-    )
-    assert pragmas != database.PRAGMAS
-    monkeypatch.setattr(database, "PRAGMAS", pragmas)
-
-
 def warned(logs: Sequence[Mapping[str, object]]) -> list[object]:
     return [each["event"] for each in logs if each["log_level"] in {"warning", "error"}]
 
