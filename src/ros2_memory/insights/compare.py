@@ -517,7 +517,7 @@ def _compare_paths(sides: tuple[_Side, _Side], where: Where | None) -> _PathDiff
         for at in _standstill_differences(stood_at(*stands))
     ]
     farthest: list[FarFromOther | None] = []
-    for point in farthest_apart(*tracks, region):
+    for point in farthest_apart(tracks[0], tracks[1], region):
         if point is None or point.away_m < _LEAST_APART_M:
             farthest.append(None)
         else:
