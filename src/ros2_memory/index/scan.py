@@ -344,6 +344,11 @@ class Tree:
         folder = self._folders.get(_folder_of(path))
         return _UNSEEN if folder is None else folder.stamps_of([path]).get(path, _UNSEEN)
 
+    def is_away(self, path: str) -> bool:
+        """Returns whether the disk of a file has been unmounted."""
+        folder = self._folders.get(_folder_of(path))
+        return folder is not None and folder.is_away
+
     def lose(self, path: str) -> None:
         """Makes the next scan report a file as new if it is there."""
         folder = self._folders.get(_folder_of(path))
@@ -422,7 +427,7 @@ class Tree:
             above, after = before.get(_folder_of(path)), self._folders.get(path)
             if above is None or above.device == folder.device:
                 continue  # no disk was mounted there
-            if after is not None and after.device == folder.device and not after.is_away:
+            if after is not None and after.device == folder.device:
                 continue  # it still is
             below = [other for other in before if other == path or other.startswith(f"{path}/")]
             has_bags = any(before[other].names for other in below)
@@ -433,11 +438,6 @@ class Tree:
                 result.metadata_folders.extend(
                     other for other in below if before[other].has_metadata
                 )
-
-    def is_away(self, path: str) -> bool:
-        """Returns whether the disk of a file has been unmounted."""
-        folder = self._folders.get(_folder_of(path))
-        return folder is not None and folder.is_away
 
     def _visit(self, path: str, known: _Folder | None, now: Ns, result: ScanResult) -> _Folder:
         """Returns the known folder if nothing came or went, else lists it anew.

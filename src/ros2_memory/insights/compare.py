@@ -272,8 +272,9 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
 def _are_of_one_run(sides: tuple[_Side, _Side]) -> bool:
     """Returns whether all poses of two windows are known to be of one run of odometry."""
     this, that = sides
-    topic = resolve_path_topic(this.view)
-    return this.view is that.view and is_one_run(this.view, topic, (this.window, that.window))
+    if this.view is not that.view:
+        return False
+    return is_one_run(this.view, resolve_path_topic(this.view), (this.window, that.window))
 
 
 class _StayInWindow(NamedTuple):
