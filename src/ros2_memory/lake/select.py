@@ -57,7 +57,6 @@ ALLOCATORS: Final = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": 
 """The default allocators of Arrow and of C reserve 2 GB of addresses for the threads."""
 _WITHOUT_MEMORY: Final = (signal.SIGABRT, signal.SIGBUS, signal.SIGKILL, signal.SIGSEGV)
 """Signals that end C code which gets no memory, or come from a system that has none left."""
-_DEADLINE_CHECK_S: Final = 0.1
 _LONGEST_S: Final = 86_400.0
 """How long a statement without a time limit may take."""
 _BATCH_ROWS: Final = 256
@@ -144,22 +143,25 @@ class Select:
             RefusedError: a file cannot be read, or the statement needs more memory.
         """
         left_s = min(deadline.left_s(), _LONGEST_S)
-        request = pickle.dumps((self, tables, left_s))
-        command = [sys.executable, "-P", "-c", _PROGRAM]
-        process = subprocess.Popen(  # noqa: S603 - this program
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **ALLOCATORS}
-        )
-        with process:
-            try:
-                text = _output_of(process, request, deadline)
-            finally:
-                process.kill()
+        try:
+            process = subprocess.run(  # noqa: S603 - this program
+                [sys.executable, "-P", "-c", _PROGRAM],
+                input=pickle.dumps((self, tables, left_s)),
+                stdout=subprocess.PIPE,
+                env={**os.environ, **ALLOCATORS},
+                timeout=left_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            do = "ask about fewer robots, days or columns"
+            reason = f"the select needs more than {deadline.budget_s:.3g} s: {do}"
+            raise QueryTimeoutError(reason) from None
         if process.returncode:
             log.warning("lake_select_failed", reason=f"exit code {process.returncode}")
             lacks_memory = -process.returncode in _WITHOUT_MEMORY
             reason = _memory_sentence(self.memory_mb) if lacks_memory else f"it failed; {_LOGGED}"
             raise RefusedError(reason)
-        answer = json.loads(text)
+        answer = json.loads(process.stdout)
         if "error" not in answer:
             return Selected(**answer)
         if cause := answer["cause"]:
@@ -222,24 +224,6 @@ class Select:
                 return Selected(reader.schema.names, rows, is_cut=True)
             rows.append(json.loads(text))
         return Selected(reader.schema.names, rows)
-
-
-def _output_of(process: subprocess.Popen[bytes], request: bytes, deadline: Deadline) -> bytes:
-    """Sends a request to a process, and returns what it prints.
-
-    Raises:
-        QueryTimeoutError: the process has not ended at the deadline.
-    """
-    unsent: bytes | None = request
-    while not deadline.expired():
-        try:
-            output, _ = process.communicate(unsent, timeout=_DEADLINE_CHECK_S)
-        except subprocess.TimeoutExpired:
-            unsent = None  # the next call goes on sending
-        else:
-            return output
-    do = "ask about fewer robots, days or columns"
-    raise QueryTimeoutError(f"the select needs more than {deadline.budget_s:.3g} s: {do}")
 
 
 def _rows_in(batch: pa.RecordBatch) -> Iterator[tuple[object, ...]]:
