@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from typing import TYPE_CHECKING, Final
-
-import numpy as np
 
 from ros2_memory.bag_dir.layout import is_derived, is_thinned
 from ros2_memory.bag_dir.state_files import deleted_spans
@@ -126,20 +123,17 @@ class JoinedIndex:
 
 
 def _bags_not_in_lake(shipped: Snapshot, own: Timeline, until: Ns) -> list[BagFile]:
-    """Returns the own bags of the days that are shown whose first message is in no shipped bag."""
+    """Returns the own bags of the days that are shown whose first message is in no shipped bag.
+
+    A derived bag begins with a message of a recorded one, and is new all the same.
+    """
     after = MIN_NS if shipped.older is None else shipped.older
-    in_lake = shipped.timeline.starts
-    bags: list[BagFile] = []
-    for segment in own.segments:
-        starts = segment.bags.starts
-        # Both are in order, so equal ones are found without a hash of them all.
-        is_new = np.searchsorted(in_lake, starts) == np.searchsorted(in_lake, starts, "right")
-        if segment.unthinned is not segment or segment.recorded is not segment:
-            # A derived bag begins with a message of a recorded one, and is new all the same.
-            is_new |= [*map(is_derived, segment.bags.files())]
-        is_own = is_new & (starts > after) & (starts <= until)
-        bags += segment.bags.at(np.flatnonzero(is_own))
-    return bags
+    in_lake = {*shipped.timeline.starts.tolist()}
+    return [
+        bag
+        for bag in own.bags
+        if after < bag.start <= until and (bag.start not in in_lake or is_derived(bag.file))
+    ]
 
 
 def _without_shipped_days(
@@ -149,10 +143,8 @@ def _without_shipped_days(
 
     Days before the oldest of the `deleted` spans stay: whether the lake has their bags is unknown.
     """
-    tables = [segment.bags for segment in shipped.segments]
-    starts = chain.from_iterable(table.starts.tolist() for table in tables)
-    stops = chain.from_iterable((table.ends + 1).tolist() for table in tables)
-    lost = without(deleted, united(zip(starts, stops, strict=True), NS_PER_S))
+    spans = zip(shipped.starts.tolist(), (shipped.ends + 1).tolist(), strict=True)
+    lost = without(deleted, united(spans, NS_PER_S))
     return [
         bag
         for bag in bags
