@@ -129,9 +129,15 @@ def fleet_memory(bag_dir: Path, limits: QuerySettings | None = None) -> Memory:
     return memory_of(bag_dir, clock=FixedClock(NOW), limits=limits, setting="fleet.robots")
 
 
-def fleet_over(folder: Path, names: tuple[str, ...], *, shared_map: bool = False) -> Fleet:
+def fleet_over(
+    folder: Path,
+    names: tuple[str, ...],
+    *,
+    shared_map: bool = False,
+    limits: QuerySettings | None = None,
+) -> Fleet:
     """The fleet of `folder/<name>`, asked at `NOW`."""
-    robots = [Robot(name, folder / name, fleet_memory(folder / name)) for name in names]
+    robots = [Robot(name, folder / name, fleet_memory(folder / name, limits)) for name in names]
     return Fleet(robots, FixedClock(NOW), shared_map=shared_map)
 
 

@@ -78,9 +78,7 @@ def test_a_robot_that_is_named_answers_as_alone_with_its_name(
 def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
     folder: Path,
 ) -> None:
-    limits = QuerySettings(now="latest")
-    robots = [Robot(name, folder / name, fleet_memory(folder / name, limits)) for name in NAMES]
-    fleet = Fleet(robots, FixedClock(NOW))
+    fleet = fleet_over(folder, NAMES, limits=QuerySettings(now="latest"))
     nows = {name: float(seeded(name).end_s) for name in NAMES}
     assert len({*nows.values()}) > 1
     last: dict[str, object] = {"last_s": LENGTH_S}
@@ -102,26 +100,11 @@ def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
         assert {name: rest[name]["now"] for name in NAMES} == nows, tool
     for row in reply(fleet, "find_last_match", MUG)["matches"]:
         assert row["now"] - row["age_s"] == pytest.approx(row["timestamp"])
+        assert row == reply(fleet, "find_last_match", {**MUG, "robot": row["robot_name"]})
     short = tools_of(fleet, max_chars=300)
     for tool, given in (("recap", last), ("memory_status", {})):
         for value in (reply_of(short[tool], given), reply(fleet, tool, given)):
             assert {row["robot_name"]: row["now"] for row in value["robots"]} == nows, tool
-
-
-def test_which_robot_last_saw_it_is_the_newest_of_the_answers_of_each(
-    folder: Path, fleet: Fleet
-) -> None:
-    found = reply(fleet, "find_last_match", MUG)
-    own = alone(folder, "find_last_match", MUG)
-    expected = [{"robot_name": name, **row} for name, row in own.items() if row is not None]
-    expected.sort(key=lambda row: -row["timestamp"])
-    assert found["matches"] == expected
-    assert found.get("never", []) == [name for name, row in own.items() if row is None]
-    # Never of a robot that is named is an object.
-    never = MUG | {"value": "elephant"}
-    assert alone(folder, "find_last_match", never)["r1"] is None
-    found = reply(fleet, "find_last_match", {**never, "robot": "r1"})
-    assert found == {"robot_name": "r1", "timestamp": None, "value": None}
 
 
 @pytest.mark.parametrize(
@@ -154,8 +137,7 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
         assert row in one[rows]
 
 
-@pytest.mark.parametrize("first", [True, False])
-@pytest.mark.parametrize("limit", [1, 2, 3, 10])
+@pytest.mark.parametrize(("limit", "first"), [(1, True), (2, False), (3, True), (10, False)])
 def test_episodes_of_one_robot_and_sightings_of_another_are_on_one_page(
     tmp_path: Path, limit: int, first: bool
 ) -> None:
@@ -201,8 +183,7 @@ def test_a_topic_has_one_row_with_the_robots_that_record_it(folder: Path, fleet:
         }
 
 
-@pytest.mark.parametrize("oldest_first", [False, True])
-@pytest.mark.parametrize("limit", [1, 3])
+@pytest.mark.parametrize(("limit", "oldest_first"), [(1, False), (3, True)])
 def test_rows_that_have_no_place_are_left_out_but_count(
     folder: Path, fleet: Fleet, limit: int, oldest_first: bool
 ) -> None:
@@ -264,6 +245,9 @@ def test_one_robot_of_those_that_may_be_asked_is_named_where_a_tool_is_about_one
     assert found["error"] == "invalid_arguments"
     assert "pass robot, e.g. robot=r1" in found["detail"]
     assert "r1, r2, r3" in found["detail"]
+    never: Any = MUG | {"value": "elephant", "robot": "r1"}
+    found = reply(fleet, "find_last_match", never)
+    assert found == {"robot_name": "r1", "timestamp": None, "value": None}
     # The only one need not be named.
     assert reply(fleet_over(folder, ("r3",)), "list_frames", {})["robot_name"] == "r3"
     nobody = reply(fleet, "memory_status", {}, Call(robots=frozenset()))
@@ -345,8 +329,7 @@ def test_names_and_texts_without_coordinates_are_asked_of_all(
     folder: Path, name: str, given: dict[str, object]
 ) -> None:
     limits = QuerySettings(places=(Place("dock", "map", Circle(1.0, 2.0, 2.0)),))
-    robots = [Robot(name, folder / name, fleet_memory(folder / name, limits)) for name in NAMES]
-    found = reply(Fleet(robots, FixedClock(NOW)), name, given)
+    found = reply(fleet_over(folder, NAMES, limits=limits), name, given)
     assert "has coordinates" not in found.get("detail", "")
     assert found.get("reason", "topic_not_recorded") == "topic_not_recorded"
 
@@ -366,11 +349,7 @@ def test_a_place_is_that_of_each_robots_own_map(folder: Path) -> None:
 
 def test_every_named_place_of_every_robot_is_listed(folder: Path) -> None:
     places = tuple(Place(f"place {n}", "map", Circle(n, 2.0, 1.0)) for n in range(6))
-    robots = [
-        Robot(name, folder / name, fleet_memory(folder / name, QuerySettings(places=places)))
-        for name in NAMES
-    ]
-    found = reply(Fleet(robots, FixedClock(NOW)), "visits", {})
+    found = reply(fleet_over(folder, NAMES, limits=QuerySettings(places=places)), "visits", {})
     assert len(found["places"]) == len(places) * len(NAMES)
     assert "more" not in found
 
