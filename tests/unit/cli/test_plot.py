@@ -8,10 +8,8 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from ros2_memory.core.model import Geodetic, TimeWindow
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import battery, boolean, odom, text, write_mcap
 from tests.support.memories import memory_of
@@ -22,7 +20,6 @@ pytest.importorskip("matplotlib", reason="needs the extra plot")
 from matplotlib.figure import Figure
 
 from ros2_memory.cli import plot
-from ros2_memory.places.local_map import east_north
 
 T0 = 1_700_000_000 * NS_PER_S
 S = NS_PER_S
@@ -69,24 +66,6 @@ def test_where_no_cache_can_be_written_a_plot_leaves_nothing_in_the_temporary_fo
     subprocess.run([*program, "--out", str(out)], env=env, check=True, capture_output=True)
     assert out.is_file()
     assert [*(tmp_path / "temporary").iterdir()] == []
-
-
-@given(
-    latitude=st.floats(-80, 80),
-    longitude=st.floats(-180, 180),
-    metres=st.tuples(st.floats(-5000, 5000), st.floats(-5000, 5000)),
-)
-def test_metres_east_and_north_lead_back_to_the_fix(
-    latitude: float, longitude: float, metres: tuple[float, float]
-) -> None:
-    """By the distance along the great circle, of a sphere that is off by 0.6 % at most."""
-    origin = Geodetic(latitude, longitude, 0.0)
-    radius = 6_371_000.0
-    north = latitude + math.degrees(metres[1] / radius)
-    east = longitude + math.degrees(metres[0] / radius / math.cos(math.radians(latitude)))
-    wrapped = (east + 180) % 360 - 180
-    found = east_north(origin, Geodetic(north, wrapped, 0.0))
-    assert math.dist(found, metres) <= 0.007 * math.hypot(*metres) + 1e-3
 
 
 def whole_memory(bags: Path) -> plot.PlotWindow:

@@ -37,7 +37,6 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.parser import text_string_to_metric_families
 
 from ros2_memory.observability.opentelemetry import (
-    SERVICE,
     Traces,
     provider_to,
     traces_from_environment,
@@ -250,23 +249,6 @@ async def test_whatever_a_client_sends_spans_stay_small(spans: InMemorySpanExpor
     sizes = [len(each.to_json()) for each in spans.get_finished_spans()]
     assert len(sizes) >= 3
     assert max(sizes) < 4000
-
-
-@pytest.mark.parametrize(
-    ("variable", "text", "name"),
-    [
-        ("OTEL_NOTHING", "", SERVICE),
-        ("OTEL_SERVICE_NAME", "r2", "r2"),
-        ("OTEL_RESOURCE_ATTRIBUTES", "service.name=r3", "r3"),
-    ],
-)
-def test_the_service_has_the_name_that_the_environment_gives_or_its_own(
-    monkeypatch: pytest.MonkeyPatch, variable: str, text: str, name: str
-) -> None:
-    monkeypatch.setenv(variable, text)
-    provider = provider_to(SimpleSpanProcessor(InMemorySpanExporter()))
-    assert provider.resource.attributes["service.name"] == name
-    provider.shutdown()
 
 
 def test_an_environment_that_cannot_be_used_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,10 +20,7 @@ from structlog.testing import LogCapture
 from ros2_memory import results
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
-    EpisodicError,
     InvalidArgumentsError,
-    NoDataError,
-    NoDataReason,
     QueryTimeoutError,
 )
 from ros2_memory.core.large_reads import LargeReads
@@ -34,7 +31,7 @@ from ros2_memory.serving.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispat
 from ros2_memory.serving.fair_queue import MOST_WAITING, FairQueue
 from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.tools.declaration import Tool
-from ros2_memory.tools.replies import Replies, Reply
+from ros2_memory.tools.replies import Replies
 
 NOBODY = cast("Memory", SimpleNamespace(large=LargeReads()))
 """The tools of these tests ask nothing of a memory."""
@@ -111,46 +108,6 @@ async def test_a_fault_is_logged_and_told_without_its_inside(
     assert failed["exc_info"] is True
     assert failed["correlation_id"] == called["correlation_id"]
     assert failed["correlation_id"] in sent(result)["detail"]
-
-
-class BrokenReplies(Replies):
-    def error(self, error: EpisodicError) -> Reply:
-        raise KeyError("secret")
-
-
-@pytest.mark.parametrize("given", [{}, {"bad": 1}])
-async def test_a_fault_in_telling_an_error_is_told_as_any_other(
-    given: dict[str, Any], log: LogCapture
-) -> None:
-    tools = [tool("none", raising(NoDataError(NoDataReason.GAP, "a hole")))]
-    replies = BrokenReplies(Path("bags"), 24_000)
-    reply = await Dispatcher(NOBODY, tools, replies, call_timeout_s=25).answer("none", given)
-    assert reply.is_error
-    assert json.loads(reply.text)["error"] == "internal"
-    assert "secret" not in reply.text
-    assert [entry["event"] for entry in log.entries] == ["tool_failed", "tool_call"]
-
-
-async def test_each_call_is_logged_once_with_its_outcome_and_times(log: LogCapture) -> None:
-    def ask(call: Call) -> Answer:
-        call.stages.add("read", 2_500_000)
-        return value(1)
-
-    tools = (tool("ask", ask), tool("none", raising(NoDataError(NoDataReason.GAP, "a hole"))))
-    async with Client(served(*tools)) as client:
-        await client.call_tool("ask", {"topic": "/a" * 1000})
-        await client.call_tool("none", {})
-        await client.call_tool("ask", {"bad": 1})
-    asked, none, bad = log.entries
-    assert asked["event"] == "tool_call"
-    assert asked["tool"] == "ask"
-    assert asked["outcome"] == "ok"
-    assert asked["stages_ms"] == {"read": 2.5}
-    assert asked["duration_ms"] > 0
-    assert 0 < len(asked["arguments"]) <= 300
-    assert none["outcome"] == "no_data: gap"
-    assert bad["outcome"] == "invalid_arguments"
-    assert len({entry["correlation_id"] for entry in log.entries}) == 3
 
 
 @pytest.mark.parametrize(("losses", "answer"), [(1, "value"), (2, "error")])
@@ -370,15 +327,3 @@ async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn:
     assert [await first, await last] == [1, 2]
     assert leaving.cancelled()
     await until(lambda: (queue.running, queue.waiting) == (0, 0))
-
-
-async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -> None:
-    queue, held = FairQueue("test", 1), Held()
-    stuck, following = (asyncio.create_task(queue.run("a", held.wait)) for _ in range(2))
-    await until(lambda: held.begun == 1)
-    stuck.cancel()
-    await until(stuck.done)
-    assert (queue.running, queue.waiting) == (1, 1)
-    held.released.set()
-    assert await following == 2
-    await until(lambda: queue.running == 0)
