@@ -327,3 +327,15 @@ async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn:
     assert [await first, await last] == [1, 2]
     assert leaving.cancelled()
     await until(lambda: (queue.running, queue.waiting) == (0, 0))
+
+
+async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -> None:
+    queue, held = FairQueue("test", 1), Held()
+    stuck, following = (asyncio.create_task(queue.run("a", held.wait)) for _ in range(2))
+    await until(lambda: held.begun == 1)
+    stuck.cancel()
+    await until(stuck.done)
+    assert (queue.running, queue.waiting) == (1, 1)
+    held.released.set()
+    assert await following == 2
+    await until(lambda: queue.running == 0)
