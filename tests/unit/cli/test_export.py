@@ -194,27 +194,6 @@ def test_an_interrupted_export_leaves_nothing(bag_dir: Path, tmp_path: Path) -> 
     assert [*folder.iterdir()] == []
 
 
-def test_duckdb_computes_the_way_that_trajectory_summary_reports(
-    bag_dir: Path, tmp_path: Path, exits: Program
-) -> None:
-    window = f"start={T0 / NS_PER_S} end={T0 / NS_PER_S + 60}"
-    told = exits(0, f"ask trajectory_summary {window} --json").json["distance_m"]
-    exits(0, f"export --parquet {tmp_path}/rows")
-    ((length,),) = queried(
-        tmp_path / "rows",
-        """
-        SELECT sum(sqrt((x - px)^2 + (y - py)^2 + (z - pz)^2)) FROM (
-          SELECT x, y, z, lag(x) OVER way AS px, lag(y) OVER way AS py, lag(z) OVER way AS pz
-          FROM memory
-          WHERE topic = '/odom' AND recording = 'rec_0'
-          WINDOW way AS (PARTITION BY recording ORDER BY log_time)
-        )
-        """,
-    )
-    assert length == pytest.approx(told, abs=1e-3)
-    assert told > 4
-
-
 def test_a_dataset_has_robots_or_has_none(bag_dir: Path, tmp_path: Path, exits: Program) -> None:
     for first, then in (("--robot r1", ""), ("", "--robot r1")):
         rows = tmp_path / f"rows{first}"

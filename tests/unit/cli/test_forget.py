@@ -20,7 +20,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.housekeepers import described, embedding, made_moment, own_all
+from tests.support.housekeepers import described, made_moment, own_all
 from tests.support.program import Program
 from tests.unit.cli.conftest import Forget, columns_in, left, locked
 
@@ -119,15 +119,11 @@ def all_bytes(folder: Path) -> bytes:
     return b"".join(path.read_bytes() for path in folder.rglob("*") if path.is_file())
 
 
-@pytest.mark.parametrize("deployment", ["query_only", "replay"])
-def test_bags_that_others_record_are_refused(
-    bag_dir: Path, forget: Forget, deployment: str
+def test_bags_that_others_record_and_no_window_are_refused(
+    bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
-    assert "recorder=none" in forget(2, 0, 100, f"--yes deployment={deployment}").err
-    assert len(bags(bag_dir)) == 4
-
-
-def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) -> None:
+    for deployment in ("query_only", "replay"):
+        assert "recorder=none" in forget(2, 0, 100, f"--yes deployment={deployment}").err
     exits(2, "forget --yes")
     assert "--last" in exits(2, "forget --yes --start 0").err
     assert len(bags(bag_dir)) == 4
@@ -146,22 +142,6 @@ def test_foreign_bags_are_kept_and_named_with_what_to_do_and_with_delete_they_go
     assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in shown
     forget(0, 40, 100, "--yes retention.foreign=delete")
     assert not (bag_dir / "session").exists()
-
-
-def test_without_a_list_nothing_goes_before_it_is_adopted(
-    bag_dir: Path, exits: Program, forget: Forget
-) -> None:
-    # What a recorder embeds, a copy without its list embeds as well.
-    shutil.rmtree(bag_dir / ".episodic")
-    name = "rec_20231114T221320Z"
-    path = embedding(bag_dir / name / f"{name}_0.mcap", start=T0 + 200 * NS_PER_S)
-    left(path)
-    shown = forget(1, 190, 300).out
-    assert path.exists()
-    assert f"`ros2-memory adopt {name}` first" in shown
-    exits(0, f"adopt {name}")
-    forget(0, 190, 300)
-    assert not path.exists()
 
 
 @pytest.mark.parametrize("more", ["", "--topic /odom"])
@@ -204,15 +184,6 @@ def test_a_bag_that_took_the_place_of_another_while_it_was_asked_is_kept(
     assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
 
 
-def test_a_bag_that_was_compressed_while_it_was_asked_is_said_to_stay(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
-) -> None:
-    bag = bag_dir / "rec_1" / "rec_2.mcap"
-    monkeypatch.setattr("typer.confirm", lambda *_, **__: bag.rename(f"{bag}.zstd"))
-    said = forget(1, 39, 55, "").out
-    assert "stays: rec_1/rec_2.mcap: it has changed meanwhile; forget again" in said
-
-
 def test_a_file_that_cannot_be_read_is_named_wherever_its_mtime_allows_messages(
     bag_dir: Path, forget: Forget
 ) -> None:
@@ -223,16 +194,6 @@ def test_a_file_that_cannot_be_read_is_named_wherever_its_mtime_allows_messages(
     path.write_bytes(data)
     os.utime(path, (T0 / NS_PER_S + 2 * 86400,) * 2)
     assert "stays: session/session_0.mcap: " in forget(1, -5, 0.5).out
-
-
-def test_the_other_form_of_a_bag_goes_with_it_and_is_not_said_to_stay(
-    bag_dir: Path, forget: Forget
-) -> None:
-    other = bag_dir / "rec_1" / "rec_2.mcap.zstd"
-    other.write_bytes(b"compressed")
-    left(other)
-    assert "stays" not in forget(0, 39, 55, "--yes storage=mcap").out
-    assert not other.exists()
 
 
 def test_a_form_that_cannot_be_deleted_stays_alone(

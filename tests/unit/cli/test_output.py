@@ -66,18 +66,6 @@ def test_long_times_are_in_a_unit_that_suits_them(shown: Shown) -> None:
     assert output[-3:] == ["days", "/b", "12.25"]
 
 
-def test_the_rows_of_a_table_have_the_names_of_its_columns(shown: Shown) -> None:
-    reply: JsonValue = {
-        "total": 2,
-        "fields": ["timestamp", "percentage"],
-        "rows": [[T0, 80.5], [T0 + 1.0, None]],
-    }
-    lines = [line.split() for line in shown(reply).splitlines() if line]
-    assert lines[:3] == [["total", "2"], ["rows"], ["timestamp", "percentage"]]
-    assert [line[-1] for line in lines[-2:]] == ["80.5", "-"]
-    assert lines[-1][0] == format_time(T0 + 1.0)
-
-
 def test_a_list_of_tools_stays_one_and_a_tool_to_ask_becomes_a_command() -> None:
     assert with_commands("the tools are: list_recorded_topics, visits").endswith(
         "list_recorded_topics, visits"

@@ -116,17 +116,6 @@ def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
 
 
-def test_full_batches_do_not_wait_for_each_other(
-    ship: Ship, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
-    waited: list[float] = []
-    monkeypatch.setattr(ship_module, "_wait", waited.append)
-    ship(0, "lake.commit_interval_s=3600")
-    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
-    assert waited == []
-
-
 def test_one_pass_does_not_wait_before_its_last_batch(
     ship: Ship, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
