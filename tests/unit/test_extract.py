@@ -10,7 +10,6 @@ from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys import get_types_from_msg
 
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
-from ros2_memory.core.model import Pose, Twist
 from ros2_memory.extract import SchemaExtractor
 from tests.support import bags
 from tests.support.memories import shipped_extractor, shipped_schemas
@@ -151,23 +150,6 @@ def quaternion(x: float, y: float, z: float, w: float) -> object:
     return bags.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> None:
-    vector = {"x": 1, "y": 0, "z": 0}
-    message = {
-        "header": {"frame_id": "odom", "stamp": {"sec": 1, "nanosec": 2}},
-        "child_frame_id": "base_link",
-        "pose": {"pose": {"position": vector, "orientation": {"x": 0, "y": 0, "z": 0, "w": 2}}},
-        "twist": {"twist": {"linear": vector, "angular": vector}},
-    }
-    for type_name in (ODOMETRY, "json"):
-        assert EXTRACTOR.pose(message, type_name) == Pose(
-            (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "odom"
-        )
-        assert EXTRACTOR.twist(message, type_name) == Twist(
-            (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), "base_link"
-        )
-
-
 def test_transforms_that_tf_refuses_are_left_out() -> None:
     edges = [("same", "/same"), ("", "b"), ("a", ""), ("odom", "base_link")]
     moved = [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0)]
@@ -180,21 +162,6 @@ def test_transforms_that_tf_refuses_are_left_out() -> None:
     left = EXTRACTOR.transforms(decoded(bags.tf(NS, *made)), NS, static=False)
     # an edge without a parent is part of what was recorded, though no lookup goes through it
     assert [edge.child for edge in left] == ["b", "base_link"]
-
-
-@pytest.mark.parametrize(
-    ("kind", "path", "own"),
-    [
-        ("nav_msgs/msg/Path", "poses.pose.position.x", "poses.position.x"),
-        ("nav_msgs/msg/Path", "poses.position.x", "poses.position.x"),
-        (ODOMETRY, "pose.pose.position.x", "position.x"),
-        (ODOMETRY, "position.x", "position.x"),
-    ],
-)
-def test_a_full_path_is_found_in_the_extracted_value_also_below_its_own_name(
-    kind: str, path: str, own: str
-) -> None:
-    assert EXTRACTOR.own_path(path, kind) == own
 
 
 SPEC = {

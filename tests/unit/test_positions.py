@@ -14,7 +14,6 @@ from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
-from ros2_memory.serving.page.drawn_path import Box, line_in_box
 from tests.support.bags import (
     Msg,
     boolean,
@@ -214,32 +213,6 @@ def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_pa
     assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
 
 
-@each_way
-def test_transforms_place_the_robot_where_the_setting_chooses_them(
-    tmp_path: Path, recalls: bool
-) -> None:
-    """Though a topic has poses, as of wheels that slip."""
-    slipping = [odom(T0 + n * S // 10, n / 5, 0.0, 0.0) for n in range(100)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*moved(range(100)), *slipping])
-    memory = memory_of(tmp_path, limits=QuerySettings(pose_topic="/tf"), recalls=recalls)
-    whole = {"start": T0_S, "end": T0_S + 10}
-    for tool, given in (
-        ("visits", {"x": 4.0, "y": 0.0, "radius_m": 1.0}),
-        ("recap", whole),
-        ("trajectory_summary", {**whole, "frame_id": "map"}),
-        ("get_position_at", {"timestamp": T0_S + 5, "frame_id": "map"}),
-    ):
-        reply = asked(memory, tool, **given)
-        assert reply["frame_id"] == "map"
-        assert "by transforms, of base_link" in reply["notes"]
-        assert reply.get("distance_m", 9.9) == pytest.approx(9.9)
-        assert reply.get("x") in {None, 4.0, 6.0}
-        assert reply.get("minutes", 0.03) == 0.03
-    everywhere = Box(-math.inf, -math.inf, math.inf, math.inf, 0.001)
-    _, line, _ = line_in_box(memory, Call(), TimeWindow(T0, T0 + 10 * S), everywhere)
-    assert (line.x[0], line.x[-1]) == pytest.approx((1.0, 10.9))
-
-
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     messages = [
         tf(T0 + n * S, *(transform(T0 + n * S, *pair, (x, 0.0, 0.0)) for pair, x in edges))
@@ -256,24 +229,6 @@ def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     notes = ask(tmp_path, False, "visits", x=5.0, y=0.0)["notes"]
     assert "by transforms, of one/base_link: no topic has the robot's poses" in notes
     assert "not of two/base_link, as of other robots" in notes
-
-
-def test_a_path_by_transforms_goes_on_from_hour_to_hour(tmp_path: Path) -> None:
-    """Bags of 100 s, of which one lies in two of the hours that are read at once."""
-    for nth in range(13):
-        at = T0 + (nth * 100 + 3000) * S
-        moved = [
-            tf(
-                at + n * S,
-                transform(at + n * S, "odom", "base_link", (0.1 * (nth * 100 + n), 0, 0)),
-            )
-            for n in range(100)
-        ]
-        write_mcap(tmp_path / "rec_0" / f"rec_0_{nth}.mcap", moved)
-    whole = {"start": T0_S + 3000, "end": T0_S + 4300}
-    path = ask(tmp_path, False, "trajectory_summary", **whole)
-    assert (path["distance_m"], path["poses"]) == (pytest.approx(129.9), 1300)
-    assert ask(tmp_path, False, "visits", x=0.0, y=0.0)["total"] == 1
 
 
 def test_a_position_is_in_places_of_several_frames_the_smallest_first(tmp_path: Path) -> None:

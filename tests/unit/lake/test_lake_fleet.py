@@ -146,8 +146,7 @@ def test_a_bag_that_lost_its_first_message_since_it_was_shipped_is_not_another_o
     assert reply(fleet, "find_last_match", CUP | {"value": "tree"})["never"] == ["hall"]
 
 
-@pytest.mark.parametrize("shipped", [3, 2])
-@pytest.mark.parametrize("has_first", [True, False])
+@pytest.mark.parametrize(("shipped", "has_first"), [(3, True), (3, False), (2, False)])
 def test_what_stayed_of_a_day_counts_only_where_a_bag_of_it_was_not_shipped(
     tmp_path: Path, shipped: int, *, has_first: bool
 ) -> None:

@@ -23,7 +23,6 @@ from ros2_memory.history.context import Memory
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.memory import LakeReader
 from ros2_memory.lake.shipper import Shipped
-from tests.support.bags import text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
 from tests.support.lake_questions import Question, every_question
@@ -195,13 +194,6 @@ def answers_of_the_page(folder: Path) -> list[list[tuple[Any, ...]]]:
     lake = Lake(lake_in(folder))
     found = map(lake.query, re.findall(r"```sql\n(.*?);\n```", page, re.DOTALL))
     return [[tuple(row) for row in selected.rows] for selected in found]
-
-
-def test_statements_of_the_page_find_nothing_in_tables_without_rows(tmp_path: Path) -> None:
-    """As without `lake.messages`, and of robots that have neither poses nor detections."""
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [text(BEGIN, "here")])
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=())])
-    assert [*map(len, answers_of_the_page(tmp_path / "lake"))] == [1, 0, 0, 0, 0, 0]
 
 
 def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: World) -> None:
