@@ -13,7 +13,6 @@ from ros2_memory.triggers.exclusion import (
     Cut,
     ExclusionRule,
     RecordingConditions,
-    add_excluded,
     add_message,
     excluded_intervals,
 )
@@ -167,18 +166,6 @@ def test_a_value_out_of_order_only_adds() -> None:
     assert excluded_intervals(rule(), [recording]) == [Excluded(4, 6, True), Excluded(0, 1, False)]
 
 
-def test_nothing_is_known_across_a_clock_that_was_set_back() -> None:
-    pasts = Past(20, 30, ((20, False),)), Past(10, 28, ())
-    found = excluded_intervals(rule(), [heard_by(each, latched=True) for each in pasts])
-    assert Excluded(10, 29, False) in found
-    # What a recording knew whose clock was set back tells another one nothing.
-    jumped = RecordingConditions(5, 30, [ConditionInterval(5, 30, False, True)], [(5, 8)])
-    found = excluded_intervals(rule(), [jumped, RecordingConditions(6, 20, [])])
-    assert found == [Excluded(5, 21, False)]
-    unclear = RecordingConditions(0, 9, [ConditionInterval(0, 9, False, True)], [(3, 5)])
-    assert excluded_intervals(rule(excludes_unknown=False), [unclear]) == [Excluded(3, 5, False)]
-
-
 def test_latched_messages_go_by_when_they_were_published() -> None:
     held, unknown, older = Excluded(10, 20), Excluded(30, 40, False), Excluded(1, 3)
     cut = Cut([held, unknown], [older, Excluded(5, 7, False)], {"/map"})
@@ -208,12 +195,3 @@ def test_spans_are_sets_of_moments(
     one, other = united(spans), united(others)
     assert moments(one) == moments(spans) == {at for at in range(50) if lies_inside(one, at)}
     assert moments(without(one, other)) == moments(spans) - moments(others)
-
-
-def test_what_was_excluded_is_joined_over_splits() -> None:
-    s = 10**9
-    held = Excluded(3 * s, 30 * s)
-    known = add_excluded([], [held], 0, 10 * s)
-    assert known == [Excluded(3 * s, 11 * s + 1)]
-    known = add_excluded(known, [held, Excluded(28 * s, 35 * s, False)], 11 * s, 40 * s)
-    assert known == [held, Excluded(28 * s, 35 * s, False)]

@@ -195,21 +195,3 @@ def test_the_field_of_a_rule_may_be_a_full_path(tmp_path: Path) -> None:
     robot.split([flag(0, False), flag(1, True)])
     robot.close_all()
     assert robot.fired_at() == [T0 + S]
-
-
-def test_a_recording_waits_for_the_end_of_the_one_that_it_took_over_from(tmp_path: Path) -> None:
-    robot = WatchedBags(tmp_path / "bags", [rule(hold=S * 3 // 2)])
-    old = robot.begin(T0)
-    robot.split([flag(n, False) for n in range(8)], old)
-    new = robot.begin(T0 + 8 * S)
-    robot.beat(old, new)
-    robot.hand_over(old, new, T0 + 11 * S, f"{old}_1.mcap")
-    robot.split([flag(n, n < 14) for n in range(11, 16)])
-    robot.look()
-    assert robot.fired_at() == []
-    robot.beat(new)
-    robot.split([flag(n, n >= 10) for n in range(8, 11)], old)
-    robot.look()
-    robot.split([flag(n, False) for n in range(16, 20)])
-    robot.close_all()
-    assert robot.fired_at() == [T0 + 11 * S + S // 2]

@@ -175,20 +175,6 @@ def test_a_rule_that_fires_too_often_says_so_once(tmp_path: Path) -> None:
     assert "max_per_hour: 3" in said["reason"]
 
 
-def test_a_full_share_is_said_once_whatever_each_moment_would_take(tmp_path: Path) -> None:
-    robot = watched(tmp_path, rule(before=0, after=0, max_bytes=1))
-    robot.begin(T0)
-    for number, begin in enumerate(range(0, 90, 30)):
-        padding = "x" * 50_000 * number
-        robot.split([*seconds(begin, begin + 9, {begin + 5}), text(T0 + (begin + 9) * S, padding)])
-        robot.look()
-    robot.close_all()
-    record = robot.record()
-    assert (record.fired, record.moments, record.refused) == (3, 0, 3)
-    [said] = robot.logged("trigger_not_kept")
-    assert said["reason"] != record.problem
-
-
 def test_a_rule_that_matches_all_the_time_says_so_once(robot: WatchedBags) -> None:
     robot.begin(T0)
     for begin in range(0, 4000, 1000):
